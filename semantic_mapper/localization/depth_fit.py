@@ -19,9 +19,9 @@ _WIDTH = 160  # of both depth images
 _POINTS = 5000  # of the frame that are aligned, at most
 _ROUNDS, _STEPS = 3, 6  # ray casts, and steps on each
 _REACH_M = (0.15, 0.08, 0.05)  # in each round: points further from the map's surface do not pull
-_POINTS_A_VOTE = 40  # neighbouring points have the same error: that many tell as much as one
+_POINTS_A_VOTE = 10  # neighbouring points have the same error: that many tell as much as one
 _DEPTH_SIGMA_M = 0.01
-_FEATURE_SIGMA_PX = 3.0
+_FEATURE_SIGMA_PX = 8.0
 _HUBER = 2.0  # in sigmas
 _EDGE = 0.05  # neighbours whose depths differ by more than this fraction are of two surfaces
 _TOLERANCE_M, _TOLERANCE = 0.04, 0.025  # depths agree within the sum of both, the second as a fraction of the depth
@@ -31,13 +31,24 @@ class MapView(Protocol):
     """The map seen from a pose; see ``mapping.map_types.MapView``."""
 
     @property
-    def depth_m(self) -> Float32: ...
+    def depth_m(self) -> Float32:
+        """(H, W) z-depth, 0 where there is nothing."""
+        ...
+
     @property
-    def rgb(self) -> UInt8: ...
+    def rgb(self) -> UInt8:
+        """(H, W, 3)."""
+        ...
+
     @property
-    def label(self) -> UInt8: ...
+    def label(self) -> UInt8:
+        """(H, W) class ids."""
+        ...
+
     @property
-    def confidence(self) -> Float32: ...
+    def confidence(self) -> Float32:
+        """(H, W) 0..1."""
+        ...
 
 
 class MapSurface(Protocol):
@@ -111,7 +122,7 @@ def align_depth(
         for _ in range(_STEPS):
             change = _step(points, target, normals, T_world_view, intrinsics, pose, _REACH_M[number])
             change += _landmark_step(landmarks, frame_intrinsics, pose)
-            twist = np.linalg.solve(change.normal + 1e-6 * np.eye(6), -change.gradient)
+            twist = np.linalg.solve(change.normal + 1e-6 * np.eye(6), -change.gradient).astype(np.float64)
             pose = _moved(pose, twist)
             if np.abs(twist).max() < 1e-4:
                 break

@@ -115,7 +115,7 @@ def pose_from_points(
     )
     if not found or inliers is None or len(inliers) < min_inliers:
         return None
-    chosen = np.ravel(inliers)
+    chosen = np.ravel(inliers).astype(np.int64)
     turn, shift = cv2.solvePnPRefineLM(
         np.ascontiguousarray(points[chosen], np.float64),
         np.ascontiguousarray(pixels[chosen], np.float64),
@@ -129,7 +129,7 @@ def pose_from_points(
     T_camera_points[:3, 3] = np.ravel(shift)
     if not np.isfinite(T_camera_points).all():
         return None
-    return invert_pose(T_camera_points), chosen.astype(np.int64)
+    return invert_pose(T_camera_points), chosen
 
 
 def pose_from_features(

@@ -14,9 +14,10 @@ import numpy as np
 from semantic_mapper.localization.features import Features, match_features
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
+DESCRIPTOR_BYTES = 128
 MAX_PLACES = 300  # that a map keeps
 MAX_FEATURES = 400  # of each: 140 bytes a feature
-_SPACING_M, _SPACING_RAD = 0.25, np.deg2rad(15.0)  # a view this far from all places is a new one
+_SPACING_M, _SPACING_RAD = 0.2, np.deg2rad(12.0)  # a view this far from all places is a new one
 
 
 class PlaceIndex:
@@ -96,6 +97,11 @@ def make_place(
     deep = np.flatnonzero(features.depth_m > 0)[:MAX_FEATURES]
     points = features.points(intrinsics)[deep].astype(np.float32)
     return Place(camera_id, stamp_ns, T_world_camera.copy(), points, features.descriptors[deep])
+
+
+def moved_place(place: Place, T_other_world: Float64) -> Place:
+    """A place in another world."""
+    return replace(place, T_world_camera=T_other_world @ place.T_world_camera)
 
 
 class PlaceStore:

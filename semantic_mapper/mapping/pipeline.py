@@ -23,6 +23,8 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.localization.features import find_place_features
+from semantic_mapper.localization.places import MAX_FEATURES, make_place
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction.corrected_map import CorrectedPoses, CorrectionStatus, MapCorrector
 from semantic_mapper.mapping.correction.history import FusedFrame
@@ -294,6 +296,7 @@ class MappingPipeline:
                 if is_measured(frame):  # computed depth follows from the poses and cannot contradict them
                     self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
                 self.keyframes.add(keyframe)
+            self._keep_place(frame)
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
         label, confidence = self._at_rows(view.probabilities.reshape(-1, len(self.label_set)), rows)
@@ -324,6 +327,16 @@ class MappingPipeline:
             stage_ms=self._stage_ms,
             moving=moving,
         )
+
+    def _keep_place(self, frame: PosedFrame) -> None:
+        """Note what the map can be found again by, where a view with measured depth shows a new place."""
+        places = self.voxel_map.places
+        if not self.config.keyframes.save_places or frame.depth_m is None or not is_measured(frame):
+            return
+        if places.wants(frame.T_world_camera):
+            found = find_place_features(frame.rgb, frame.depth_m, MAX_FEATURES)
+            pose = frame.T_world_camera
+            places.add(make_place(frame.camera_id, frame.stamp_ns, pose, found, frame.intrinsics))
 
     def _moving(self, frame: PosedFrame, view: RenderedView, rows: NDArray[np.int32]) -> Bool | None:
         """Pixels (H, W) of what moves, of a frame whose depth was measured; None where nobody asks."""
