@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from benchmarks.ghosts import map_frame
-from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.config import VoxelMapConfig, convert_config
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.localization.features import find_place_features
@@ -153,21 +153,24 @@ def mirrored(frame: PosedFrame) -> PosedFrame:
     )
 
 
-def rooms(count: int) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
+def rooms(count: int, out: Path | None) -> dict[str, Any]:
     """All rooms; a wrong room is the next one, furnished from the same template."""
     rows: dict[str, list[dict[str, Any]]] = {"same room": [], "other room": [], "mirrored": []}
     for seed in TEST_SEEDS[:count]:
         scene = make_room(seed, RoomConfig())
         mapped = map_frames(room_frames(seed, MAPPED, CAMERA, noise=NOISE))
         asked = queries(scene, seed, camera_path(scene, MAPPED, seed), PLACES)
-        other = make_room(seed + 777, RoomConfig(template=scene.template))
+        like_it = convert_config({"template": scene.template}, RoomConfig, "the other room")
+        other = make_room(seed + 777, like_it)
         other_way = camera_path(other, MAPPED, seed + 777)
         rows["same room"] += [look_for(mapped, f, f.T_world_camera) for f in asked]
         rows["other room"] += [look_for(mapped, f, None) for f in queries(other, seed + 777, other_way, PLACES)]
         rows["mirrored"] += [look_for(mapped, mirrored(f), None) for f in asked]
         told = {name: f"{sum(r['found'] for r in some[-PLACES:])}/{PLACES}" for name, some in rows.items()}
         print(seed, len(mapped.places), told, flush=True)
-    return {name: summary(some) for name, some in rows.items()}, rows
+        if out is not None:
+            out.write_text(json.dumps(rows))
+    return {name: summary(some) for name, some in rows.items()}
 
 
 def main() -> None:
@@ -183,10 +186,8 @@ def main() -> None:
     if args.command == "kitchen":
         print(json.dumps(kitchen(args.log), indent=1))
         return
-    found, rows = rooms(args.rooms)
+    found = rooms(args.rooms, args.out)
     print(json.dumps(found, indent=1))
-    if args.out:
-        args.out.write_text(json.dumps(rows))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ _POINTS_A_VOTE = 10  # neighbouring points have the same error: that many tell a
 _DEPTH_SIGMA_M = 0.01
 _FEATURE_SIGMA_PX = 8.0
 _HUBER = 2.0  # in sigmas
+_AWAY_M = 0.5  # further from the first guess the alignment has lost it
 _EDGE = 0.05  # neighbours whose depths differ by more than this fraction are of two surfaces
 _TOLERANCE_M, _TOLERANCE = 0.04, 0.025  # depths agree within the sum of both, the second as a fraction of the depth
 
@@ -109,8 +110,11 @@ def align_depth(
     landmarks: Landmarks,
     frame_intrinsics: CameraIntrinsics,
     T_world_camera: Float64,
-) -> Float64:
-    """The pose near a first guess at which depth (of ``small_depth``) and landmarks fit the map best, (4, 4)."""
+) -> Float64 | None:
+    """The pose near a first guess at which depth (of ``small_depth``) and landmarks fit the map best, (4, 4).
+
+    None where that leads away from the guess.
+    """
     points = unproject(depth_m, intrinsics).reshape(-1, 3)
     points = points[points[:, 2] > 0]
     points = points[:: max(1, len(points) // _POINTS)]
@@ -124,6 +128,9 @@ def align_depth(
             change += _landmark_step(landmarks, frame_intrinsics, pose)
             twist = np.linalg.solve(change.normal + 1e-6 * np.eye(6), -change.gradient).astype(np.float64)
             pose = _moved(pose, twist)
+            away = np.linalg.norm(pose[:3, 3] - T_world_camera[:3, 3])
+            if not away < _AWAY_M:  # NaN, too
+                return None
             if np.abs(twist).max() < 1e-4:
                 break
     return pose

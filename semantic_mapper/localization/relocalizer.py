@@ -7,7 +7,7 @@ may still be wrong; ``Relocalization`` waits for several that agree with each ot
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -35,6 +35,7 @@ _REPROJECTION = 4.0 / 525.0  # of the focal length
 _SUPPORT = 8.0 / 525.0  # how far a feature may be from where the aligned pose has it: that fits the depth first
 _LEAST_DEPTH = 0.1  # fraction of the pixels
 _TRIED = 3  # poses that the map is asked about
+_FAR_M = 10.0  # from the place that it is about, no pose is believed
 _REACH_M = 1.5  # places whose views are this near may show what the frame shows; a radian counts like a metre
 _DEPTH_M, _DEPTH = 0.06, 0.04  # by which the depths of a feature may differ
 _ALIKE = 0.75 * 512.0  # distance of descriptors
@@ -157,13 +158,22 @@ class Relocalizer:
             return NotFound("no-places", "the map has nothing to find oneself by")
         if depth_m is None or float((depth_m > 0).mean()) < _LEAST_DEPTH:
             return NotFound("no-depth", "the frame has hardly any measured depth, and a picture alone proves no place")
-        features = find_place_features(rgb, depth_m, MAX_FEATURES)
+        return self.find_features(find_place_features(rgb, depth_m, MAX_FEATURES), rgb, depth_m, intrinsics, label)
+
+    def find_features(
+        self, features: Features, rgb: UInt8, depth_m: Float32, intrinsics: CameraIntrinsics, label: UInt8 | None = None
+    ) -> Relocalized | NotFound:
+        """As ``find``, where the features of the frame are known."""
+        if not self._places:
+            return NotFound("no-places", "the map has nothing to find oneself by")
         depth, small = small_depth(depth_m, intrinsics)
         tried: list[_Tried] = []
         for guess in self._guesses(features, intrinsics):
             if any(_same(guess.pose, t.guess.pose) or _same(guess.pose, t.pose) for t in tried):
                 continue
             pose = align_depth(self._surface, depth, small, guess.landmarks, intrinsics, guess.pose)
+            if pose is None:
+                continue
             fit = compare_depth(self._surface, depth, small, rgb, pose, label, self._ignore_id)
             tried.append(_Tried(guess, pose, fit, self._support(features, pose, intrinsics)))
             if len(tried) == _TRIED:
@@ -177,6 +187,16 @@ class Relocalizer:
         if refusal is not None:
             return NotFound(refusal[0], refusal[1], best.pose, count, best.fit)
         return Relocalized(best.pose, count, best.fit)
+
+    def check_classes(
+        self, found: Relocalized, rgb: UInt8, depth_m: Float32, intrinsics: CameraIntrinsics, label: UInt8
+    ) -> Relocalized | NotFound:
+        """Doubt a frame that was found, where its classes are not the map's; arguments as of ``find``."""
+        depth, small = small_depth(depth_m, intrinsics)
+        fit = compare_depth(self._surface, depth, small, rgb, found.T_map_camera, label, self._ignore_id)
+        if fit.classes < self._limits.min_classes:  # false for NaN
+            return NotFound("classes", _other_classes(fit), found.T_map_camera, found.inliers, fit)
+        return replace(found, fit=fit)
 
     def _refusal(self, best: _Tried, tried: list[_Tried], intrinsics: CameraIntrinsics) -> tuple[Reason, str] | None:
         limits, fit, count = self._limits, best.fit, len(best.support.points)
@@ -194,7 +214,7 @@ class Relocalizer:
         if fit.likeness < (limits.min_likeness if sure else limits.sure_likeness):
             return "looks-different", f"brightness of frame and map correlate by {fit.likeness:.2f} only"
         if fit.classes < limits.min_classes:  # false for NaN
-            return "classes", f"{fit.classes:.0%} of the pixels are of the map's class"
+            return "classes", _other_classes(fit)
         rival = max((len(t.support.points) for t in tried[1:] if not _same(t.pose, best.pose)), default=0)
         if rival > limits.max_rival * count:
             return "ambiguous", f"another pose has {rival} features for it, this one {count}"
@@ -237,6 +257,8 @@ class Relocalizer:
             if found is None:
                 continue
             pose, inliers = found
+            if np.linalg.norm(pose[:3, 3] - self._places[key].T_world_camera[:3, 3]) > _FAR_M:
+                continue
             _, first = np.unique(np.rint(pixels[inliers]), axis=0, return_index=True)  # one pixel is one feature
             chosen = inliers[first]
             guesses.append(_Guess(pose, Landmarks(points[chosen], pixels[chosen])))
@@ -249,6 +271,10 @@ class Relocalizer:
     def _world_points(self, key: int, which: np.ndarray) -> Float64:
         place = self._places[key]
         return transform(place.T_world_camera, place.points[which].astype(np.float64))
+
+
+def _other_classes(fit: DepthFit) -> str:
+    return f"{fit.classes:.0%} of the pixels are of the map's class"
 
 
 def _within(a: Float64, b: Float64, way_m: float, turn_rad: float) -> bool:

@@ -40,6 +40,7 @@ from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.mapping.worlds import Whereabouts
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
 _log = get_logger(__name__)
@@ -86,6 +87,7 @@ class MappingPipeline:
         self._moving_ids = label_set.moving_ids() if config.moving.classes else ()
         self.moving_pixels = 0  # left out of the map so far
         self.moving_space = MovingSpace()
+        self.whereabouts = Whereabouts()  # of the last frame of a session
         self._viewpoints = ViewpointChooser(config.virtual, config.seed)
         self._steps = 0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
@@ -231,6 +233,13 @@ class MappingPipeline:
         sure = view.known & (seen.confidence >= SURE) & (seen.label != self.label_set.ignore_id)
         same = self.label_set.to_ids(view.probabilities.argmax(axis=2)) == seen.label
         return int((same & sure).sum()), int(sure.sum())
+
+    def classify(self, frame: PosedFrame) -> UInt8:
+        """Class ids (h, w) of a frame as it shows them by itself, wherever it was taken; coarse. Changes nothing."""
+        resized = FrameViews(frame)
+        view = self._render(resized, [self._encode(resized)], self.config.render.scale)
+        label = self.label_set.to_ids(view.probabilities.argmax(axis=2))
+        return np.where(view.known, label, np.uint8(self.label_set.ignore_id)).astype(np.uint8)
 
     def _look_once(self) -> VirtualLook | None:
         known = [k for k in self.keyframes.keyframes if k.camera_id in self._intrinsics]

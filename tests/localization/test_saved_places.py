@@ -15,8 +15,10 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 
 from .test_places import walk
 
+DEFAULTS = MapperConfig()
 
-def mapped(config: MapperConfig = MapperConfig()) -> VoxelMap:
+
+def mapped(config: MapperConfig = DEFAULTS) -> VoxelMap:
     mapper = Mapper.load(None, with_settings(config, voxel_map=with_settings(config.voxel_map, voxel_size_m=0.05)))
     for frame in walk()[:3]:
         mapper.step(frame)

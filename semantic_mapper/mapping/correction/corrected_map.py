@@ -151,6 +151,11 @@ class MapCorrector:
             failure=self._failure,
         )
 
+    @property
+    def motion(self) -> Float64:
+        """By how much frames that come are moved, (4, 4); see ``place``."""
+        return self._motion
+
     def poses(self) -> dict[tuple[str, int], Float64]:
         """(camera_id, stamp_ns) -> T_world_camera (4, 4) of the frames that can be corrected, as the map has them."""
         entries = [] if self._history is None else self._history.entries()
