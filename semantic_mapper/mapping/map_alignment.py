@@ -13,6 +13,8 @@ from semantic_mapper.localization.consensus import AGREEING, agreed, agreeing_wi
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import Place
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.mapping.files.merge import check_fit
+from semantic_mapper.mapping.map_scale import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float64
 
@@ -42,8 +44,10 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     """Where another map lies in this one.
 
     Raises:
-        MapError: nothing can be told, or not for sure; says why.
+        MapError: the maps do not fit each other, nothing can be told, or not for sure; says why.
     """
+    check_fit(voxel_map.config, voxel_map.label_set, other.config, other.label_set)
+    require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
         if not len(one.places):
             raise MapError(
