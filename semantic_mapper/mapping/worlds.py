@@ -126,6 +126,8 @@ class MapWorlds:
             self.known[frame.world] = np.eye(4)
         if frame.world in self.known:
             return Taken(ready=(self._at(frame),))
+        if not self._held:
+            _log.info("world_sought", camera=frame.camera_id, seq=frame.seq, places=len(self._map.places))
         self._held.append(frame)
         given_up = ((self._held.popleft(), self._why()),) if len(self._held) > HELD else ()
         if not self._look(frame):
