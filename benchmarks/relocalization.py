@@ -31,7 +31,15 @@ from semantic_mapper.localization.places import MAX_FEATURES, PlaceStore, make_p
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.scenes import TEST_SEEDS, NoiseConfig, RoomConfig, camera_path, make_room, room_frames
+from semantic_mapper.scenes import (
+    TEST_SEEDS,
+    VALIDATION_SEEDS,
+    NoiseConfig,
+    RoomConfig,
+    camera_path,
+    make_room,
+    room_frames,
+)
 from semantic_mapper.scenes.camera import clearance
 from semantic_mapper.scenes.render import render_view
 from semantic_mapper.scenes.scene import Scene
@@ -153,10 +161,10 @@ def mirrored(frame: PosedFrame) -> PosedFrame:
     )
 
 
-def rooms(count: int, out: Path | None) -> dict[str, Any]:
+def rooms(seeds: range, out: Path | None) -> dict[str, Any]:
     """All rooms; a wrong room is the next one, furnished from the same template."""
     rows: dict[str, list[dict[str, Any]]] = {"same room": [], "other room": [], "mirrored": []}
-    for seed in TEST_SEEDS[:count]:
+    for seed in seeds:
         scene = make_room(seed, RoomConfig())
         mapped = map_frames(room_frames(seed, MAPPED, CAMERA, noise=NOISE))
         asked = queries(scene, seed, camera_path(scene, MAPPED, seed), PLACES)
@@ -181,12 +189,13 @@ def main() -> None:
     of_kitchen.add_argument("log", type=Path)
     of_rooms = commands.add_parser("rooms", help="test rooms in other light, other rooms, mirrored rooms")
     of_rooms.add_argument("--rooms", type=int, default=len(TEST_SEEDS))
+    of_rooms.add_argument("--split", choices=("test", "validation"), default="test")
     of_rooms.add_argument("--out", type=Path, help="write every query there (JSON)")
     args = parser.parse_args()
     if args.command == "kitchen":
         print(json.dumps(kitchen(args.log), indent=1))
         return
-    found = rooms(args.rooms, args.out)
+    found = rooms((TEST_SEEDS if args.split == "test" else VALIDATION_SEEDS)[: args.rooms], args.out)
     print(json.dumps(found, indent=1))
 
 

@@ -47,8 +47,8 @@ class Limits:
     """What a pose must show to be believed.
 
     Set by 1,200 views of 20 test rooms (``benchmarks.relocalization``): in the mirrored room a symmetric shelf or bath
-    has up to 141 features for it, but at most 0.87 of the depth agrees, with a likeness of 0.55; in the room itself 0.88
-    with 0.86, or 0.99 with 0.58.
+    has up to 141 features for it, but at most 0.87 of the depth agrees, with a likeness of 0.55; in the room itself
+    0.88 with 0.86, or 0.99 with 0.58.
 
     Args:
         min_inliers: Features that agree on the pose.
