@@ -24,10 +24,10 @@ SETTINGS = with_settings(MapperConfig(), voxel_map=with_settings(MapperConfig().
 
 
 @cache
-def walk(seed: int = TRAIN_SEEDS[7]) -> tuple[PosedFrame, ...]:
-    """Thirty frames of 160x120 through a furnished room."""
+def walk(seed: int = TRAIN_SEEDS[7], count: int = 16) -> tuple[PosedFrame, ...]:
+    """Sixteen frames of 160x120 through a furnished room."""
     path = CameraPathConfig(step_m=0.06)
-    return tuple(room_frames(seed, 30, INTRINSICS, path=path, noise=NoiseConfig()))
+    return tuple(room_frames(seed, count, INTRINSICS, path=path, noise=NoiseConfig()))
 
 
 def other_world() -> Float64:
@@ -67,10 +67,10 @@ def even_map() -> VoxelMap:
 def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
     mapper = Mapper.load(None, SETTINGS)
     session = MapSession(mapper, stream_labels=None)
-    for frame in walk()[:20:2]:
+    for frame in walk()[:12:2]:
         assert session.process(replace(frame, world=3))
     held = 0
-    for frame in walk()[1:20:2]:
+    for frame in walk()[1:12:2]:
         results = session.process(abroad(frame))
         last = session.pipeline.whereabouts.last
         assert last is not None and last.stamp_ns == frame.stamp_ns
@@ -83,11 +83,11 @@ def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
     assert held >= 2 and session.worlds.found == 1 and not session.worlds.held
     moved, turned = off(session.worlds.known[7], invert_pose(other_world()))
     assert moved < 0.1 and turned < 1.0  # where the map's origin lies, metres away
-    assert session.fused == 20 and not len(session.refusals.first)
+    assert session.fused == 12 and not len(session.refusals.first)
 
 
 def test_the_same_room_mirrored_and_another_room_are_refused_with_the_reason() -> None:
-    for frames in ([mirrored(f) for f in walk()[1::4]], list(walk(TRAIN_SEEDS[19])[1::4])):
+    for frames in ([mirrored(f) for f in walk()[1::5]], list(walk(TRAIN_SEEDS[19], 8)[1::3])):
         worlds = MapWorlds(even_map(), own_first=False)
         for frame in frames:
             taken = worlds.take(abroad(frame))
@@ -115,7 +115,7 @@ def test_a_picture_without_measured_depth_proves_no_place() -> None:
 def test_classes_that_are_not_the_maps_are_refused() -> None:
     ids = even_map().label_set.ids
     worlds = MapWorlds(even_map(), lambda frame: np.full((30, 40), ids[-1], np.uint8), own_first=False)
-    for frame in walk()[1:12:2]:
+    for frame in walk()[1:8:2]:
         assert not worlds.take(abroad(frame)).ready
     assert worlds.refused["classes"] >= 3
 
@@ -123,20 +123,20 @@ def test_classes_that_are_not_the_maps_are_refused() -> None:
 def test_frames_are_found_where_a_correction_has_moved_the_map() -> None:
     settings = with_settings(SETTINGS, history=with_settings(SETTINGS.history, max_frames=50))
     session = MapSession(Mapper.load(None, settings), stream_labels=None)
-    for frame in walk()[:12:2]:
+    for frame in walk()[:8:2]:
         session.process(frame)
     shift = np.eye(4)
     shift[:3, 3] = 0.0, 0.5, 0.0
-    poses = {f.stamp_ns: shift @ f.T_world_camera for f in walk()[:12:2]}
+    poses = {f.stamp_ns: shift @ f.T_world_camera for f in walk()[:8:2]}
     session.pipeline.correct_poses(poses, until_ns=ALWAYS)
     while session.pipeline.advance_correction(8):
         pass
     results: list[MapUpdate | Refusal] = []
-    for frame in walk()[1:12:2]:
+    for frame in walk()[1:8:2]:
         results += session.process(abroad(frame))
     last = session.pipeline.whereabouts.last
     assert results and last is not None and last.T_map_camera is not None
-    assert off(last.T_map_camera, shift @ walk()[11].T_world_camera)[0] < 0.05
+    assert off(last.T_map_camera, shift @ walk()[7].T_world_camera)[0] < 0.05
 
 
 def test_two_maps_of_a_room_find_each_other_and_others_do_not() -> None:
@@ -147,7 +147,7 @@ def test_two_maps_of_a_room_find_each_other_and_others_do_not() -> None:
     moved, turned = off(found.T_map_other @ other_world(), np.eye(4))
     assert found.agreeing >= 3 and moved < 0.04 and turned < 1.0
     elsewhere = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)
-    for frame in walk(TRAIN_SEEDS[19])[::6]:
+    for frame in walk(TRAIN_SEEDS[19], 8)[::3]:
         elsewhere.process(frame)
     with pytest.raises(MapError, match="of the second are at one"):
         find_alignment(even_map(), elsewhere.pipeline.voxel_map)
