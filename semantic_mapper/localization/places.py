@@ -1,6 +1,6 @@
 """Places seen so far: which of them an image shows, and what a map keeps of its own.
 
-Matches are counted with each place in turn (2 ms each), which is exact and needs no vocabulary; a few hundred places
+Matches are counted with each place in turn (1 ms each), which is exact and needs no vocabulary; a few hundred places
 are as many as a map keeps.
 """
 
