@@ -3,7 +3,7 @@
 Nodes are killed and frozen in a long launch (launch/replay-live.toml: a log in the time of its recording, with camera,
 mapper and recorder), a finetuner in another (launch/replay-learning.toml); the clock is stepped in a third; each kill
 of the launcher has one of its own; floods of garbage hit a mapper node; a small disk is filled; camera and frames are
-spoiled in process.
+spoiled in process; a camera comes back in another world in launches of its own.
 
 Example: python -m benchmarks.faults --rounds 20 --out runs/faults
 """
@@ -19,12 +19,12 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from benchmarks import fault_disk, fault_finetuner, fault_frames, fault_inputs, fault_nodes, fault_table
+from benchmarks import fault_disk, fault_finetuner, fault_frames, fault_inputs, fault_nodes, fault_table, fault_worlds
 from benchmarks.long_log import write_long_log
 
 HZ = 15.0
 LOG_S = 2400.0
-CASES = ("nodes", "finetuner", "launcher", "clock", "disk", "floods", "keys", "unplugged", "frames")
+CASES = ("nodes", "finetuner", "launcher", "clock", "disk", "floods", "keys", "unplugged", "frames", "worlds")
 
 
 def main() -> None:
@@ -77,6 +77,7 @@ def _run(case: str, arguments: argparse.Namespace, folder: Path) -> Iterable[fau
         "floods": lambda: fault_inputs.floods(weights, config, rounds, arguments.messages),
         "keys": lambda: fault_inputs.wrong_keys(rounds),
         "unplugged": lambda: fault_frames.unplugged_cameras(rounds),
+        "worlds": lambda: fault_worlds.other_worlds(folder / "worlds", rounds),
         "frames": lambda: fault_frames.scrambled_streams(weights, config, rounds),
     }
     return cases[case]()

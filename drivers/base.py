@@ -47,11 +47,13 @@ class PoseEstimate:
         T_world_camera: (4, 4) float64; of sources that tell where a rig is (``tells_of_rig``), T_world_rig.
         source: What says so ("odometry", "board", "vio", ...); becomes ``PosedFrame.pose_source``.
         sigma: One-sigma position uncertainty in metres; 0 = not known.
+        world: Which world the pose is in, where that begins with the source; becomes ``PosedFrame.world``.
     """
 
     T_world_camera: Float64
     source: str
     sigma: float = 0.0
+    world: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -103,6 +103,9 @@ class MapperOptions(Config, frozen=True):
     config: str = ""  # TOML file with settings of the mapper; empty = defaults
     voxel_size_m: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0  # 0 = what the config says
     depth: Literal["", "auto", "sensor", "computed", "off"] = ""  # where depth comes from; empty = what the config says
+    # A saved map, or a folder with one, to go on in, with its settings: frames are held until their place in it is
+    # known (30 at most); empty = a new map.
+    map: str = ""
     eval_exclude: str = ""  # weights whose finetuning frames are left out of the scores, too
     rerun: str = ""  # write a Rerun recording there; empty = none
     # Also write the map of the moment to ``map.npz`` in ``out`` every n seconds, beside mapping: what a killed

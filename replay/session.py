@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from semantic_mapper.errors import FrameError, LabelError, SemanticMapperError
+from semantic_mapper.errors import FrameError, LabelError, PoseError, SemanticMapperError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.worlds import MapWorlds, Taken
 from semantic_mapper.replay.artifacts import MAX_LISTED, write_artifacts
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.stats import BoundedLog, LatencyHistogram
@@ -55,6 +56,7 @@ class MapSession:
         source: Name of the log or stream, for the summary.
         scale_known: Whether its lengths are metres.
         rerun: Gets every frame, what was rendered for it, and the map at the end; see ``open_recording``.
+        own_first: See ``MapWorlds``; False where the map was there before the stream.
     """
 
     def __init__(
@@ -66,11 +68,19 @@ class MapSession:
         source: str = "",
         scale_known: bool = True,
         rerun: RerunLog | None = None,
+        own_first: bool = True,
     ) -> None:
         self.bundle = bundle
         self.pipeline = bundle.pipeline
         self.pipeline.voxel_map.note_scale(scale_known)
         self.source = source
+        self.worlds = MapWorlds(
+            self.pipeline.voxel_map,
+            self.pipeline.classify,
+            own_first=own_first,
+            whereabouts=self.pipeline.whereabouts,
+            motion=lambda: self.pipeline.corrector.motion,
+        )
         self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
         self.published = 0
         self.fused = 0
@@ -105,12 +115,20 @@ class MapSession:
             rerun.note_scale(scale_known)
 
     def process(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
-        """Take one frame and map what is ready: the frame itself, unless its depth waits for later ones.
+        """Take one frame and map what is ready: the frame itself, unless its depth waits for later ones, or its world
+        has to be found in the map first (``worlds``).
 
         Returns:
             What became of each: the update, or why it was refused (counted and logged, the map unchanged).
         """
         self.published += 1
+        taken = self.worlds.take(frame)
+        return [*self._give_up(taken), *(done for item in taken.ready for done in self._prepare(item))]
+
+    def _give_up(self, taken: Taken) -> list[MapUpdate | Refusal]:
+        return [self._refuse(frame, PoseError(reason)) for frame, reason in taken.given_up]
+
+    def _prepare(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
         began = time.perf_counter()
         try:
             ready = self.pipeline.prepare(frame)
@@ -121,7 +139,8 @@ class MapSession:
 
     def process_rest(self) -> list[MapUpdate | Refusal]:
         """Map the frames that still wait for later ones, which do not come any more."""
-        return [self._map(item, 0.0) for item in self.pipeline.prepare_rest()]
+        left = self._give_up(self.worlds.take_rest())
+        return [*left, *(self._map(item, 0.0) for item in self.pipeline.prepare_rest())]
 
     def _refuse(self, frame: PosedFrame, error: FrameError) -> Refusal:
         self.refusals.append(refusal := Refusal(frame.seq, frame.stamp_ns, str(error), frame.camera_id))
@@ -226,7 +245,14 @@ class MapSession:
             self.process_rest()
         except SemanticMapperError as error:  # the map is full, for one: what is in it is worth keeping
             _log.error("last_frames_not_mapped", reason=str(error))
-        return {**write_artifacts(self, out, self._rerun), **self._scene_summary()}
+        return {**write_artifacts(self, out, self._rerun), **self._scene_summary(), **self._world_summary()}
+
+    def _world_summary(self) -> dict[str, Any]:
+        """Of worlds that had to be found in the map."""
+        worlds = self.worlds
+        if not (worlds.found or worlds.refused):
+            return {}
+        return {"relocalization": {"worlds_found": worlds.found, "looks_refused": dict(worlds.refused)}}
 
     def _score(self, frame: PosedFrame, update: MapUpdate) -> PosedFrame:
         """Score a frame against its label; returns it without a label that is no truth, or cannot be read."""

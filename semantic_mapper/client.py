@@ -18,6 +18,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
@@ -260,6 +261,17 @@ class MapClient:
                 newest = h.newest if newest < 0 else newest  # as of the first answer: the map may outrun us
                 if h.version >= newest and self._mirror.is_whole:
                     return self._mirror
+
+    def pose(self) -> CameraPose | None:
+        """Where the last frame was taken, in the map; None before the first.
+
+        Its ``T_map_camera`` is None, and ``reason`` says why, while a camera's place in the map is not known.
+        """
+        h = self._ask("pose", messages.PoseAnswer, messages.PoseRequest())
+        if not h.camera_id:
+            return None
+        pose = np.array(h.T_map_camera, np.float64).reshape(4, 4) if h.T_map_camera else None
+        return CameraPose(h.camera_id, h.stamp_ns, pose, h.reason)
 
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None, within_ns: int = 0) -> Correction:
         """Begin to move the map with corrected poses, as a loop closure gives them; the mapper goes on meanwhile.

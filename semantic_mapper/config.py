@@ -244,6 +244,9 @@ class KeyframeConfig(Config, frozen=True):
     # Weight of what its image says by itself, against the rendered view, in what it tells the map; its own labels are
     # those of the rendered view.
     own_image_weight: Fraction = 0.2
+    # Whether the map keeps features of views that its sensor measured (45 kB each, 300 at most), by which it is found
+    # again: `relocalize`, `up --set map=...`, `merge`. Images can be guessed from such features; False keeps none.
+    save_places: bool = True
 
 
 class VoxelMapConfig(Config, frozen=True):

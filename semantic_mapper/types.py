@@ -128,6 +128,7 @@ class PosedFrame:
             None where a sensor measured it.
         label_is_pseudo: ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth:
             nothing is scored against it.
+        world: Of a camera whose world begins where it starts: which one the pose is in. 0 = the one that there is.
 
     Raises:
         FrameError: a shape or dtype is off, or a number out of its range. ``geometry.check_pose`` checks the pose.
@@ -145,11 +146,13 @@ class PosedFrame:
     pose_sigma: float = 0.0
     depth_sigma_m: Float32 | None = None
     label_is_pseudo: bool = False
+    world: int = 0
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
         _expect_range(self, "stamp_ns", self.stamp_ns, MAX_STAMP_NS)
         _expect_range(self, "seq", self.seq, (1 << 63) - 1)
+        _expect_range(self, "world", self.world, (1 << 63) - 1)
         _expect_range(self, "pose_sigma", self.pose_sigma, MAX_POSE_SIGMA_M)
         _expect(self, "rgb", self.rgb, (*size, 3), np.uint8)
         _expect(self, "T_world_camera", self.T_world_camera, (4, 4), np.float64)

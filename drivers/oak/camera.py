@@ -161,7 +161,7 @@ class OakCamera:
         if odometry is None:
             return image
         image = replace(image, tracks_itself=True)
-        if self._connections > 1:
+        if self._connections > 1 and self._config.on_tracking_reset == "no-poses":
             return image
         late = time.monotonic_ns() - image.stamp_ns > self._config.odometry_wait_s * 1e9
         if not late and not odometry.reaches(image.stamp_ns):
@@ -208,7 +208,8 @@ class OakCamera:
         )
         self._say("state", "")
         self._say("notes", "; ".join(sources.notes))
-        self._say("world", _TRACKING_RESET if odometry is not None and self._connections > 1 else "")
+        withheld = odometry is not None and self._connections > 1 and config.on_tracking_reset == "no-poses"
+        self._say("world", _TRACKING_RESET if withheld else "")
         _log.info("camera_connected", camera=self._camera_id, device=sources.name, connection=self._connections)
 
     def _begin(self, stream: Stream, config: Config) -> CameraIntrinsics:

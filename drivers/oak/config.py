@@ -41,9 +41,10 @@ class Config(semantic_mapper.config.Config, frozen=True):
     # pose.
     odometry: bool = False
     odometry_wait_s: Positive = 0.3  # how long an image waits for its pose; then it goes without
-    # Where a camera with odometry was away: go on with images that have no pose, or end the node, so that the program
-    # that watches over the launch starts it again with a new map.
-    on_tracking_reset: Literal["no-poses", "exit"] = "no-poses"
+    # Where a camera with odometry was away, and its poses begin in another world: give them as they are, and the mapper
+    # finds the camera in its map before it goes on; go on with images that have no pose; or end the node, so that the
+    # program that watches over the launch starts it again with a new map.
+    on_tracking_reset: Literal["relocalize", "no-poses", "exit"] = "relocalize"
     # JSON file (as DepthAI writes it) in place of the calibration that is stored on the device.
     calibration: str = ""
     search_s: Positive = 2.0  # how long the device is looked for before it counts as missing

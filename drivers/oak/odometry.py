@@ -67,6 +67,7 @@ class Odometry:
             raise ValueError("these sources have no odometry")
         check_pose(ports.T_left_rgb, "extrinsics of the OAK's colour camera")
         self._T_left_rgb = ports.T_left_rgb
+        self._world = time.monotonic_ns()
         self._track = PoseTrack(KEPT, GAP_NS, max_ahead_ns=0)
         self._lock = threading.Lock()  # of the track
         self._pairs = synced_queue(
@@ -99,7 +100,7 @@ class Odometry:
             found = self._track.at(stamp_ns)
         if isinstance(found, str):
             return None
-        return PoseEstimate(T_world_camera=found.T @ self._T_left_rgb, source=SOURCE)
+        return PoseEstimate(T_world_camera=found.T @ self._T_left_rgb, source=SOURCE, world=self._world)
 
     def start(self) -> None:
         """Begin, once the pipeline runs."""

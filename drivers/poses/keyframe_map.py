@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semantic_mapper.drivers.poses.alignment import Target
-from semantic_mapper.drivers.poses.features import Features
+from semantic_mapper.localization.features import Features
 from semantic_mapper.types import Float64
 
 _REACH_M, _REACH_RAD = 0.6, 0.6  # further away, or turned further, keyframes share too little with a view

@@ -23,12 +23,12 @@ from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses.alignment import Aligner, Fit, Target, fit
 from semantic_mapper.drivers.poses.config import OdometryPoses, matrix
 from semantic_mapper.drivers.poses.depth_view import Level, make_levels, thin_depth, thinned
-from semantic_mapper.drivers.poses.features import Features, find_features, pose_from_features
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
 from semantic_mapper.drivers.poses.motion import StampedPose
 from semantic_mapper.drivers.poses.still import WAYS_OUT
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
+from semantic_mapper.localization.features import Features, find_features, pose_from_features
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -54,6 +55,7 @@ class PosedCamera:
         checks: What to refuse.
         T_rig_camera: (4, 4) where the poses are those of a rig, and the camera sits there.
         scale_known: Whether poses are in metres.
+        begins_world: The world of the poses begins with this source, and is another one each time.
 
     Attributes:
         counters: "frames" given; images left out: "no_pose" (the source has none), "stale" (the image is not later than
@@ -70,7 +72,10 @@ class PosedCamera:
         *,
         T_rig_camera: Float64 | None = None,
         scale_known: bool = True,
+        begins_world: bool = False,
     ) -> None:
+        self._world = time.monotonic_ns() if begins_world else 0
+        self._worlds: dict[str, int] = {}  # of each camera's last pose
         self._camera = camera
         self._scale_known = scale_known
         self._poses = poses
@@ -143,6 +148,10 @@ class PosedCamera:
         for image in self._camera:
             estimate = self._checked_pose(image)
             if estimate is not None:
+                if self._worlds.setdefault(image.camera_id, estimate.world) != estimate.world:
+                    self._worlds[image.camera_id] = estimate.world
+                    if (old := self._gates.pop(image.camera_id, None)) is not None:
+                        yield from self._passed(old.end(), image.camera_id)
                 gate = self._gates.setdefault(
                     image.camera_id, PoseOutlierFilter(self._checks, exact=estimate.source in EXACT)
                 )
@@ -159,6 +168,8 @@ class PosedCamera:
             self._counts["no_pose"] += 1
             self._trouble = ""  # the source tells why
             return None
+        if not estimate.world:
+            estimate = replace(estimate, world=self._world)
         if self._T_rig_camera is not None:
             estimate = replace(estimate, T_world_camera=estimate.T_world_camera @ self._T_rig_camera)
         try:
@@ -204,4 +215,5 @@ def _frame(image: CameraImage, estimate: PoseEstimate) -> PosedFrame:
         T_world_camera=T_world_camera,
         pose_source=estimate.source,
         pose_sigma=float(estimate.sigma),
+        world=estimate.world,
     )

@@ -98,21 +98,22 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
 
 
 def check_world(name: str, live: LiveCamera) -> None:
-    """A camera that tracks itself must not come back: its next process would put frames where they do not belong.
+    """A camera without depth that tracks itself must not come back: it could not be found in the map again.
 
     Raises:
         ConfigError: it is to be restarted.
     """
-    from semantic_mapper.drivers.poses.config import begins_world
+    from semantic_mapper.drivers.poses.config import VisualPoses
     from semantic_mapper.drivers.poses.sources import read_pose_config
 
     config, where = table_of(live.poses, "camera.poses")
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
-    if begins_world(poses):
+    if isinstance(poses, VisualPoses):
         raise ConfigError(
             f"node '{name}' is to be restarted where it fails, but poses of kind '{poses.kind}' begin in "
-            'another world then, and its frames would spoil the map: set restart = "never" (the launch ends then, and '
-            "the map is written), or take poses from a topic or a board"
+            "another world then, in which nothing can be found again without depth, and its frames would not be "
+            'mapped: set restart = "never" (the launch ends then, and the map is written), or take poses from a topic '
+            "or a board"
         )
 
 
@@ -138,7 +139,7 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
         ConfigError, CameraError: see ``run_live_camera``.
     """
     from semantic_mapper.config import convert_config
-    from semantic_mapper.drivers.poses.config import PoseChecks, gives_metres
+    from semantic_mapper.drivers.poses.config import DevicePoses, PoseChecks, begins_world, gives_metres
     from semantic_mapper.drivers.poses.posed_camera import PosedCamera
     from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 
@@ -151,6 +152,7 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
         checks=checks,
         T_rig_camera=mount.for_poses(poses),
         scale_known=gives_metres(poses),
+        begins_world=begins_world(poses) and not isinstance(poses, DevicePoses),  # a device tells it itself
     )
 
 

@@ -109,27 +109,36 @@ def merge(
     out: Annotated[Path, typer.Option("--out", help="Map to write (.npz), in the frame of A.")],
     transform: Annotated[
         str,
-        typer.Option(help='Where B lies in A: "x y z yaw_deg" (metres; about +z), or a file with T_A_B, 4 rows of 4.'),
-    ] = "0 0 0 0",
+        typer.Option(
+            help='Where B lies in A: "x y z yaw_deg" (metres; about +z), or a file with T_A_B, 4 rows of 4; "find" = '
+            "look for it by what both maps show."
+        ),
+    ] = "find",
 ) -> None:
     """Make one map of two: what both have measured adds up.
 
-    Shifts by whole voxels are exact; for others, B's voxels are interpolated. The maps have to be aligned already:
-    nothing is searched for. Settings are those of A.
+    Where B lies in A is found by the features that both maps keep, and refused where it cannot be told for sure. Shifts
+    by whole voxels are exact; for others, B's voxels are interpolated. Settings are those of A.
 
+    Example: semantic-mapper merge runs/east runs/west --out house.npz
     Example: semantic-mapper merge runs/east runs/west --transform "3.2 0 0 90" --out house.npz
     """
     output = Output.guarded()
     from semantic_mapper.mapping.files.merge import count_empty
+    from semantic_mapper.mapping.map_alignment import find_alignment
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.outputs import prepare_file
     from semantic_mapper.nodes.cli.saved_maps import map_path, parse_transform, refuse_overwriting
 
-    T_a_b = parse_transform(transform)
+    T_a_b = None if transform == "find" else parse_transform(transform)
     sources = map_path(a), map_path(b)
     refuse_overwriting(out, *sources)
     prepare_file(out)
     one, other = map(VoxelMap.load, sources)
+    if T_a_b is None:
+        found = find_alignment(one, other)
+        output.print(f"{found.agreeing} of {found.looked_for} places of B are at one on where it lies in A")
+        T_a_b = found.T_map_other
     joined = one.merged(other, T_a_b)
     joined.save(out)
     empty = 0

@@ -28,6 +28,7 @@ from semantic_mapper.nodes.cli import map as cli_map
 from semantic_mapper.nodes.cli import query as cli_query
 from semantic_mapper.nodes.cli import record as cli_record
 from semantic_mapper.nodes.cli import refine as cli_refine
+from semantic_mapper.nodes.cli import relocalize as cli_relocalize
 from semantic_mapper.nodes.cli import replay as cli_replay
 from semantic_mapper.nodes.cli import top as cli_top
 from semantic_mapper.nodes.cli import train as cli_train
@@ -60,6 +61,7 @@ for _function in (
     cli_log.recover,
     cli_export.export,
     cli_export.merge,
+    cli_relocalize.relocalize,
     cli_refine.refine,
     cli_finetune.finetune,
     cli_autolabel.autolabel,

@@ -37,6 +37,7 @@ def map_summary(path: Path) -> dict[str, Any]:
             "ids": list(manifest.label_set.ids),
             "classes": list(manifest.label_set.names),
         },
+        "places": 0 if manifest.places is None else manifest.places.places,
         "config": to_plain(manifest.config),
     }
 
@@ -59,6 +60,8 @@ def map_table(found: dict[str, Any]) -> Table:
         table.add_row("to", ", ".join(f"{x:.2f}" for x in high) + f" {unit}")
     table.add_row("blocks", f"{found['blocks']:,} of 8 x 8 x 8 voxels")
     table.add_row("measured", f"{found['measured_voxels']:,} voxels, {found['voted_voxels']:,} with class votes")
+    places = f"{found['places']} views with features" if found["places"] else "none: nothing to find oneself by"
+    table.add_row("places", places)
     label_set = found["label_set"]
     table.add_row("classes", f"{label_set['name']}: {', '.join(label_set['classes'])}")
     return table

@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+import msgspec
 import structlog
 
 from semantic_mapper.errors import SemanticMapperError
@@ -47,24 +48,30 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     """
     from semantic_mapper.fields.checkpoint import load_checkpoint
     from semantic_mapper.mapper import Mapper
+    from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.outputs import prepare_folder
     from semantic_mapper.nodes.cli.run_replay import mapper_config
-    from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
+    from semantic_mapper.nodes.cli.saved_maps import MAP_NAME, map_path
     from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
     from semantic_mapper.nodes.mapper.live_weights import taking_weights
-    from semantic_mapper.nodes.mapper.resume import take_up
+    from semantic_mapper.nodes.mapper.resume import go_on, take_up
     from semantic_mapper.nodes.public_publisher import PublicPublisher
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 
     prepare_folder(Path(options.out))
+    saved = VoxelMap.load(map_path(Path(options.map))) if options.map else None
     config = mapper_config(
         Path(options.config) if options.config else None,
         options.voxel_size_m or None,
         depth=options.depth or None,
         live=options.delivery == "newest",
     )
+    if saved is not None:
+        config = msgspec.structs.replace(config, voxel_map=saved.config)
     bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
     taken_up = take_up(context, Path(options.out) / MAP_NAME, bundle.pipeline.voxel_map)
+    if saved is not None:
+        go_on(bundle.pipeline.voxel_map, saved, options.map)
     correction = LiveCorrection(bundle.pipeline)
     exclude = load_checkpoint(Path(options.eval_exclude)).train_stamps_ns if options.eval_exclude else frozenset[int]()
     subscribe = LosslessSubscriber if options.delivery == "all" else NewestSubscriber
@@ -111,7 +118,8 @@ def _answering(
     keys = load_keys(Path(options.keys).expanduser()) if options.keys else None
     refined = None if refinement is None else refinement.mirror
     pipeline = bundle.pipeline
-    return QueryService(endpoint, pipeline.voxel_map, correction, keys, weights, refined, pipeline.moving.space)
+    beside = (refined, pipeline.moving.space, pipeline.whereabouts)
+    return QueryService(endpoint, pipeline.voxel_map, correction, keys, weights, *beside)
 
 
 def _refining(options: MapperOptions, bundle: Mapper) -> LiveRefinement | nullcontext[None]:
@@ -266,7 +274,7 @@ class _Mapper:
     def _begin(self, info: StreamInfo) -> None:
         from semantic_mapper.nodes.cli.run_replay import clear_summary
         from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
-        from semantic_mapper.nodes.mapper.resume import keep_earlier
+        from semantic_mapper.nodes.mapper.resume import keep_earlier, noted_worlds
         from semantic_mapper.replay.session import MapSession, open_recording
 
         # A stream is announced again to a newcomer, or by a restarted camera; or another camera begins.
@@ -285,10 +293,14 @@ class _Mapper:
             exclude_stamps=self._exclude,
             source=info.source,
             rerun=open_recording(Path(self._options.rerun) if self._options.rerun else None, self._bundle.pipeline),
+            own_first=not self._options.map,
         )
+        if self._bundle.pipeline.voxel_map.frames:
+            self._session.worlds.known.update(noted_worlds(self._context))
         _log.info("stream_begins", source=info.source, frames=info.frame_count)
 
     def _map(self, frame: PosedFrame) -> None:
+        from semantic_mapper.nodes.mapper.resume import note_worlds
         from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import FrameRefused
         from semantic_mapper.types import MapUpdate
@@ -299,7 +311,13 @@ class _Mapper:
             return
         self._gaps.note(frame.camera_id, frame.seq)
         self._streams.note_frame(frame.camera_id)
+        before = len(self._session.worlds.known)
         results = self._session.process(frame)
+        if len(self._session.worlds.known) != before:
+            note_worlds(self._context, self._session.worlds.known)
+        if not results and self._session.worlds.held:  # a player in lockstep waits for an answer to every frame
+            refused = FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, self._session.worlds.warning)
+            self._publisher.publish(encode(refused))
         self._capture_age_s = (time.monotonic_ns() - frame.stamp_ns) / 1e9
         for result in results:
             if isinstance(result, MapUpdate):
@@ -348,6 +366,10 @@ class _Mapper:
             ages["capture"] = self._capture_age_s
         counters |= self._correction.counters
         degraded = self._correction.degraded
+        if self._session is not None:
+            worlds = self._session.worlds
+            counters |= {"held": worlds.held, "relocalized": worlds.found, "not_found": worlds.refused.total()}
+            degraded += (worlds.warning,) if worlds.warning else ()
         if self._weights is not None:
             counters |= self._weights.counters
             degraded += self._weights.degraded

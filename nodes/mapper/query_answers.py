@@ -14,6 +14,7 @@ from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.mapping.worlds import Whereabouts
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.queries.boxes import points_in_box
@@ -79,6 +80,7 @@ class Answers:
         weights: Says which weights are in use, and exchanges them; without it such questions are refused.
         refined: Mirror of the map as it was refined last; without it questions about that are refused.
         moving: Where something moves now that is left out of the map.
+        whereabouts: Of the last frame.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class Answers:
         weights: LiveWeights | None = None,
         refined: MapMirror | None = None,
         moving: MovingSpace | None = None,
+        whereabouts: Whereabouts | None = None,
     ) -> None:
         self.map_id = uuid.uuid4().hex
         self._mirror = mirror
@@ -95,6 +98,7 @@ class Answers:
         self._weights = weights
         self._refined = refined
         self._moving = moving
+        self._whereabouts = whereabouts or Whereabouts()
         # By direction, and whether of the refined map; the last one asked stands last.
         self._tracked: dict[tuple[messages.Point, bool], _Tracked] = {}
 
@@ -106,7 +110,8 @@ class Answers:
         except (SemanticMapperError, MemoryError) as error:
             refusal = encode_error(_to_error(error))
             return Question(lambda: refusal, messages.Request(), takes_long=False, about_map=False)
-        beside = messages.CorrectPosesRequest | messages.CorrectionRequest | messages.WeightsRequest
+        correction = messages.CorrectPosesRequest | messages.CorrectionRequest
+        beside = correction | messages.WeightsRequest | messages.PoseRequest
         about_map = not isinstance(request, beside) and not _of_refined(request)
         return Question(lambda: self._encoded(kind, request), request, takes_long, about_map)
 
@@ -151,8 +156,18 @@ class Answers:
                 return self._correct(snapshot, request)
             case messages.WeightsRequest():
                 return self._exchange_weights(snapshot, request)
+            case messages.PoseRequest():
+                return self._pose(snapshot)
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
+
+    def _pose(self, snapshot: MapSnapshot) -> messages.Answer:
+        last = self._whereabouts.last
+        if last is None:
+            return messages.PoseAnswer(**self._about(snapshot))
+        pose = () if last.T_map_camera is None else tuple(last.T_map_camera.ravel().tolist())
+        where = {"camera_id": last.camera_id, "stamp_ns": last.stamp_ns, "reason": last.reason}
+        return messages.PoseAnswer(**self._about(snapshot), **where, T_map_camera=pose)
 
     def _with_moving(self, snapshot: MapSnapshot) -> MapSnapshot:
         return snapshot if self._moving is None else snapshot.with_moving(self._moving.points)

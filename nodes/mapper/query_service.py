@@ -21,6 +21,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.mapping.worlds import Whereabouts
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.mapper.query_answers import Answers, Question
@@ -85,7 +86,7 @@ class QueryService:
         correction: Takes corrected poses; without it they are refused.
         weights: Takes other weights; without it requests about them are refused.
         keys: See ``QueryServer``.
-        refined, moving: See ``Answers``.
+        refined, moving, whereabouts: See ``Answers``.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
@@ -100,11 +101,12 @@ class QueryService:
         weights: LiveWeights | None = None,
         refined: MapMirror | None = None,
         moving: MovingSpace | None = None,
+        whereabouts: Whereabouts | None = None,
     ) -> None:
         self._map = voxel_map
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        self._answers = Answers(self._mirror, correction, weights, refined, moving)
+        self._answers = Answers(self._mirror, correction, weights, refined, moving, whereabouts)
         self._copied_version = 0
         self._copy_again_at = 0.0
         self.asked = False  # whether anybody has ever asked about the map

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import structlog
 
-from semantic_mapper.errors import MapError
+from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.outputs import free_name
 from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.types import Float64
 
-_EARLIER, _UNSOUND = "earlier", "unsound"  # notes
+_EARLIER, _UNSOUND, _WORLDS = "earlier", "unsound", "worlds"  # notes
 _NO_FILE = "none"
 _RESULTS = (
     "map.npz",
@@ -60,6 +64,41 @@ def take_up(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
     kept = _put_aside(context, path) if earlier and _identity(path) not in (earlier, _NO_FILE) else ""
     _log.warning("map_begun_anew", reason=why)
     return f"the mapper was restarted and began an empty map: {why}{kept}"
+
+
+def go_on(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
+    """Make ``voxel_map`` the saved one, unless it was taken up already.
+
+    Raises:
+        ConfigError: its classes are others.
+    """
+    if voxel_map.frames:
+        return
+    try:
+        voxel_map.take_over(saved)
+    except MapError as error:
+        raise ConfigError(
+            f"{name}: its classes are {saved.label_set.name} ({len(saved.label_set)}), those of the weights "
+            f"{voxel_map.label_set.name} ({len(voxel_map.label_set)}): go on with the weights that it was made with"
+        ) from error
+    if not len(voxel_map.places):
+        raise ConfigError(
+            f"{name}: has nothing to find oneself by: it was made without depth, by an older release, or with "
+            "keyframes.save_places = false; map its log again, or begin a new map"
+        )
+    _log.info("going_on", map=name, frames=voxel_map.frames, places=len(voxel_map.places))
+
+
+def note_worlds(context: NodeContext, known: Mapping[int, Float64]) -> None:
+    """Leave word of where worlds lie in the map, for a mapper that takes it up."""
+    plain = {str(world): T.ravel().tolist() for world, T in known.items()}
+    context.try_to_leave_note(_WORLDS, json.dumps(plain), "a mapper that replaces it has to look for the camera again")
+
+
+def noted_worlds(context: NodeContext) -> dict[int, Float64]:
+    """What ``note_worlds`` has noted in this launch."""
+    noted = context.note(_WORLDS)
+    return {int(world): np.array(T).reshape(4, 4) for world, T in json.loads(noted or "{}").items()}
 
 
 def forbid(context: NodeContext, why: str) -> bool:

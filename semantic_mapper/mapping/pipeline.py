@@ -22,6 +22,8 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.localization.features import find_place_features
+from semantic_mapper.localization.places import MAX_FEATURES, make_place
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction.corrected_map import CorrectedPoses, CorrectionStatus, MapCorrector
 from semantic_mapper.mapping.correction.history import FusedFrame
@@ -38,6 +40,7 @@ from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.mapping.worlds import Whereabouts
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
 _log = get_logger(__name__)
@@ -81,6 +84,7 @@ class MappingPipeline:
         self._frame_depth = FrameDepth(config.depth, self._cast_for_hint)
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
         self.moving = MovingFilter(config, label_set)
+        self.whereabouts = Whereabouts()  # of the last frame of a session
         self._viewpoints = ViewpointChooser(config.virtual, config.seed)
         self._steps = 0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
@@ -226,6 +230,13 @@ class MappingPipeline:
         same = self.label_set.to_ids(view.probabilities.argmax(axis=2)) == seen.label
         return int((same & sure).sum()), int(sure.sum())
 
+    def classify(self, frame: PosedFrame) -> UInt8:
+        """Class ids (h, w) of a frame as it shows them by itself, wherever it was taken; coarse. Changes nothing."""
+        resized = FrameViews(frame)
+        view = self._render(resized, [self._encode(resized)], self.config.render.scale)
+        label = self.label_set.to_ids(view.probabilities.argmax(axis=2))
+        return np.where(view.known, label, np.uint8(self.label_set.ignore_id)).astype(np.uint8)
+
     def _look_once(self) -> VirtualLook | None:
         known = [k for k in self.keyframes.keyframes if k.camera_id in self._intrinsics]
         if not known:
@@ -303,6 +314,7 @@ class MappingPipeline:
                 if is_measured(frame):  # computed depth follows from the poses and cannot contradict them
                     self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
                 self.keyframes.add(keyframe)
+            self._keep_place(frame)
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
         label, confidence = self._at_rows(view.probabilities.reshape(-1, len(self.label_set)), rows)
@@ -333,6 +345,16 @@ class MappingPipeline:
             stage_ms=self._stage_ms,
             moving=moving,
         )
+
+    def _keep_place(self, frame: PosedFrame) -> None:
+        """Note what the map can be found again by, where a view with measured depth shows a new place."""
+        places = self.voxel_map.places
+        if not self.config.keyframes.save_places or frame.depth_m is None or not is_measured(frame):
+            return
+        if places.wants(frame.T_world_camera):
+            found = find_place_features(frame.rgb, frame.depth_m, MAX_FEATURES)
+            pose = frame.T_world_camera
+            places.add(make_place(frame.camera_id, frame.stamp_ns, pose, found, frame.intrinsics))
 
     @property
     def _delay_frames(self) -> int:

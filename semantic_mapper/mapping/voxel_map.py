@@ -16,6 +16,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.localization.places import PlaceStore, moved_place
 from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.map_manifest import MapManifest
@@ -64,8 +65,8 @@ class VoxelMap:
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
     are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
     where none did. ``instances`` says which voxels belong to which thing, where that refinement found out; None
-    otherwise, and as soon as anything changes. ``cleared`` counts the voxels of surfaces that frames saw through, and
-    that were forgotten (``clear_free_space``), in this process.
+    otherwise, and as soon as anything changes. ``places`` are views to find the map again by. ``cleared`` counts the
+    voxels of surfaces that frames saw through, and that were forgotten (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.
@@ -87,6 +88,7 @@ class VoxelMap:
         self.scale_known = True
         self.refined = ""
         self.instances: InstanceLayer | None = None
+        self.places = PlaceStore()
         self.cleared = 0
         self._cleared_log = ClearedLog()
         self._bounds = NO_BOUNDS  # of the last frame that cleared
@@ -284,7 +286,7 @@ class VoxelMap:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
             self.note_scale(other.scale_known)
-            self.refined, self.instances = other.refined, other.instances
+            self.refined, self.instances, self.places = other.refined, other.instances, other.places
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
@@ -386,7 +388,7 @@ class VoxelMap:
                 scale=scale_name(self.scale_known),
                 refined=self.refined,
             )
-            return MapSaving(self.locked, manifest, self.instances)
+            return MapSaving(self.locked, manifest, self.instances, self.places.places)
 
     @classmethod
     def load(cls, path: Path, memory_mb: int | None = None) -> VoxelMap:
@@ -415,6 +417,7 @@ class VoxelMap:
                     blocks = loaded._grid.fill(pack_keys(keys), values)
                     loaded._grid.mark_changed(blocks, saved.frames)
             loaded.instances = reader.instances()
+            loaded.places = PlaceStore(reader.places())
         loaded.frames = loaded.version = saved.frames
         loaded.last_stamp_ns = saved.last_stamp_ns
         loaded.note_scale(saved.scale_known)
@@ -442,6 +445,8 @@ class VoxelMap:
         joined = VoxelMap(self.config, self.label_set)
         joined.note_scale(self.scale_known)
         joined.refined = self.refined or other.refined
+        for place in (*self.places.places, *(moved_place(p, T_self_other) for p in other.places.places)):
+            joined.places.add(place)
         with _KERNEL_LOCK:
             joined.frames = joined.version = self.frames + other.frames
             joined.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)

@@ -111,6 +111,7 @@ _NOT_SENT_AS_0 = (
     "refined",
     "gone",
     "moving",
+    "world",
 )  # came later: what does not need it is read by older releases, too
 _FRAME_BUFFERS = ("rgb", "depth", "label", "depth_sigma")  # fields of a frame's header, in the order of their buffers
 
@@ -168,6 +169,7 @@ class FrameHeader(Wire, frozen=True):
     label: LabelSpec | None = None
     depth_sigma: DepthSpec | None = None  # of computed depth
     pseudo_label: bool = False
+    world: Count = 0  # sent where it is not 0
 
     @property
     def name(self) -> str:
@@ -304,6 +306,7 @@ def encode_frame(
         label=label,
         depth_sigma=sigma,
         pseudo_label=frame.label_is_pseudo and label is not None,
+        world=int(frame.world),
     )
     return [topic_bytes("frame", frame.camera_id), _pack_frame_header(header), *buffers]
 
@@ -595,6 +598,7 @@ def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
         pose_sigma=header.pose_sigma,
         depth_sigma_m=None if sigma is None else decode_depth(sigma, data["depth_sigma"], size, f"{what}: spread of"),
         label_is_pseudo=header.pseudo_label and header.label is not None,
+        world=header.world,
     )
 
 

@@ -331,6 +331,19 @@ class WeightsAnswer(Answer, frozen=True, kw_only=True):
     entries: Annotated[tuple[WeightsEntry, ...], Meta(max_length=256)]
 
 
+class PoseRequest(Request, frozen=True, kw_only=True):
+    """Where the last frame was taken."""
+
+
+class PoseAnswer(Answer, frozen=True, kw_only=True):
+    """``CameraPose``; no ``camera_id`` before the first frame, no ``T_map_camera`` (row by row) where not known."""
+
+    camera_id: Word = ""
+    stamp_ns: Stamp = 0
+    T_map_camera: Annotated[tuple[Finite, ...], Meta(max_length=16)] = ()
+    reason: Sentence = ""
+
+
 class ErrorAnswer(Wire, frozen=True):
     """The name of an error class of ours, and what it says."""
 
@@ -365,4 +378,5 @@ QUESTIONS = {
     "correct_poses": Question(CorrectPosesRequest, CorrectionAnswer),
     "correction": Question(CorrectionRequest, CorrectionAnswer),
     "weights": Question(WeightsRequest, WeightsAnswer),
+    "pose": Question(PoseRequest, PoseAnswer),
 }

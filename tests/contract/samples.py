@@ -97,6 +97,7 @@ def questions() -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
         "points_in_box": ({**who, **box}, {}),
         "instances": ({**who, "up": (0.0, 0.0, 1.0)}, {}),
         "occupancy": (who, {"points": points}),
+        "pose": (who, {}),
         "distance_field": ({**who, **box, "unknown_is_occupied": True}, {}),
         "changes": ({**who, "since": 3, "limit": 500, "map_id": "another map"}, {}),
         "correct_poses": (
@@ -141,6 +142,7 @@ def answers() -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
             },
         ),
         "occupancy": (about, {"state": u8 % 3}),
+        "pose": ({**about, "camera_id": "rooms", "stamp_ns": 7, "T_map_camera": tuple(np.eye(4).ravel())}, {}),
         "distance_field": (
             {**about, "origin_m": (0.0, 0.1, 0.2), "voxel_size_m": 0.05},
             {"distance_m": f4.reshape(1, 1, 3), "state": u8.reshape(1, 1, 3) % 3},

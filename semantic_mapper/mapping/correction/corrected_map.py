@@ -156,6 +156,11 @@ class MapCorrector:
             failure=self._failure,
         )
 
+    @property
+    def motion(self) -> Float64:
+        """By how much frames that come are moved, (4, 4); see ``place``."""
+        return self._motion
+
     def poses(self) -> dict[tuple[str, int], Float64]:
         """(camera_id, stamp_ns) -> T_world_camera (4, 4) of the frames that can be corrected, as the map has them."""
         entries = [] if self._history is None else self._history.entries()
@@ -319,8 +324,11 @@ class MapCorrector:
     def _swap(self, rebuild: _Rebuild) -> None:
         assert self._history is not None
         entries = [replace(e, T_world_camera=rebuild.place(e)) for e in self._history.entries()]
+        poses = {(e.camera_id, e.stamp_ns): e.T_world_camera for e in entries}
+        rebuild.voxel_map.places = self._map.places
         self._map.take_over(rebuild.voxel_map)
-        moved = self._keyframes.move({(e.camera_id, e.stamp_ns): e.T_world_camera for e in entries})
+        self._map.places.move(poses)
+        moved = self._keyframes.move(poses)
         self._history.replace(entries)
         if self._journal is not None:
             self._journal.close()

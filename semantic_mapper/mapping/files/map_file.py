@@ -14,7 +14,7 @@ import hashlib
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,13 +23,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.errors import ConfigError, MapError, PoseError
 from semantic_mapper.files import atomic_write, open_regular
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapping.files.map_manifest import (
     MEND,
     InstanceTable,
     MapChunk,
     MapManifest,
+    PlaceTable,
     digest,
     encode_manifest,
     parse_manifest,
@@ -58,12 +61,24 @@ _ARRAYS = {  # name -> dtype; in the order of the file
     "votes": "<f4",  # (V,)
 }
 _INSTANCES = {"packed": "<i8", "number": "<i4"}  # (N,) each, of ``InstanceLayer``; only where there is one
+_PLACES = {  # of ``Place``; only where there are any
+    "pose": "<f8",  # (P, 4, 4)
+    "stamp_ns": "<i8",  # (P,)
+    "camera": "<i4",  # (P,) number of a name in the manifest
+    "features": "<i4",  # (P,) how many of the rows below are each place's
+    "points": "<f4",  # (N, 3)
+    "descriptors": "|u1",  # (N, 128)
+}
 _EVIDENCE = {"float32": "<f4", "int16": "<i2"}
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
 
 
 def write_map(
-    path: Path, manifest: MapManifest, parts: Iterable[BlockPart], instances: InstanceLayer | None = None
+    path: Path,
+    manifest: MapManifest,
+    parts: Iterable[BlockPart],
+    instances: InstanceLayer | None = None,
+    places: Sequence[Place] = (),
 ) -> MapManifest:
     """Write a map, replacing a file of that name in one step.
 
@@ -72,6 +87,7 @@ def write_map(
         manifest: Its settings, classes and counters; what depends on the blocks is filled in here.
         parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
         instances: Of the map, if it has them.
+        places: What the map is found again by.
 
     Returns:
         The manifest as written.
@@ -93,8 +109,9 @@ def write_map(
             blocks = sum(chunk.blocks for chunk in chunks)
             bounds = _bounds_m(corners, manifest.config.voxel_size_m)
             table = None if instances is None else _write_instances(archive, instances)
+            found = _write_places(archive, places) if places else None
             manifest = msgspec.structs.replace(
-                manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks), instances=table
+                manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks), instances=table, places=found
             )
             content = encode_manifest(manifest)
             with archive.open(_MANIFEST, "w") as member:
@@ -184,6 +201,35 @@ class MapReader:
             raise MapError(f"{where}: voxels are not in order, or numbers are negative. {MEND}")
         return layer
 
+    def places(self) -> tuple[Place, ...]:
+        """What the map is found again by; nothing where it does not say.
+
+        Raises:
+            MapError: what it says is damaged.
+        """
+        table = self.manifest.places
+        if table is None:
+            return ()
+        where = f"{self._path}: its places"
+        one, all_ = (table.places,), table.features
+        sizes = ((*one, 4, 4), one, one, one, (all_, 3), (all_, DESCRIPTOR_BYTES))
+        arrays = self._read_arrays("places", dict(zip(_PLACES, sizes, strict=True)), _PLACES, table.sha256, where)
+        counts, camera = arrays["features"], arrays["camera"]
+        sound = (counts >= 0).all() and counts.sum() == all_ and np.isfinite(arrays["points"]).all()
+        if not (sound and (camera >= 0).all() and (camera < len(table.cameras)).all()):
+            raise MapError(f"{where}: their numbers do not fit each other. {MEND}")
+        ends = np.cumsum(counts)
+        places: list[Place] = []
+        for n, pose in enumerate(arrays["pose"]):
+            try:
+                check_pose(pose, where)
+            except PoseError as error:
+                raise MapError(f"{error}. {MEND}") from error
+            rows = slice(int(ends[n] - counts[n]), int(ends[n]))
+            name, stamp_ns = table.cameras[camera[n]], int(arrays["stamp_ns"][n])
+            places.append(Place(name, stamp_ns, pose, arrays["points"][rows], arrays["descriptors"][rows]))
+        return tuple(places)
+
     def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> dict[str, NDArray[Any]]:
         shapes = _shapes(chunk, len(self.manifest.label_set))
         return self._read_arrays(f"{n:06d}", shapes, _dtypes(self.manifest), chunk.sha256, where)
@@ -231,6 +277,20 @@ def _write_chunk(
 def _write_instances(archive: zipfile.ZipFile, layer: InstanceLayer) -> InstanceTable:
     found = _write_arrays(archive, "instances", {"packed": layer.packed, "number": layer.number}, _INSTANCES)
     return InstanceTable(voxels=len(layer.packed), sha256=found)
+
+
+def _write_places(archive: zipfile.ZipFile, places: Sequence[Place]) -> PlaceTable:
+    cameras = tuple(sorted({p.camera_id for p in places}))
+    arrays = {
+        "pose": np.stack([p.T_world_camera for p in places]),
+        "stamp_ns": np.array([p.stamp_ns for p in places]),
+        "camera": np.array([cameras.index(p.camera_id) for p in places]),
+        "features": np.array([len(p.points) for p in places]),
+        "points": np.concatenate([p.points for p in places]),
+        "descriptors": np.concatenate([p.descriptors for p in places]),
+    }
+    found = _write_arrays(archive, "places", arrays, _PLACES)
+    return PlaceTable(places=len(places), features=len(arrays["points"]), cameras=cameras, sha256=found)
 
 
 def _write_arrays(
@@ -299,6 +359,7 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
         raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
     expected = [f"{n:06d}/{name}.npy" for n in range(len(manifest.chunks)) for name in _ARRAYS]
     expected += [] if manifest.instances is None else [f"instances/{name}.npy" for name in _INSTANCES]
+    expected += [] if manifest.places is None else [f"places/{name}.npy" for name in _PLACES]
     if names != [*expected, _MANIFEST]:
         raise MapError(f"{path}: damaged: arrays are missing, or others are there. {MEND}")
     return manifest

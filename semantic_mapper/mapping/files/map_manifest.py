@@ -49,6 +49,22 @@ class InstanceTable(Config, frozen=True):
     sha256: Digest
 
 
+class PlaceTable(Config, frozen=True):
+    """The places that the map is found again by (``localization.places``).
+
+    Args:
+        places: How many.
+        features: Of all of them.
+        cameras: Names of the cameras that have seen them.
+        sha256: Of its arrays, in their order.
+    """
+
+    places: NotNegative
+    features: NotNegative
+    cameras: tuple[str, ...]
+    sha256: Digest
+
+
 class MapManifest(Config, frozen=True, kw_only=True):
     """What is known of a saved map without reading its blocks.
 
@@ -63,6 +79,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
         scale: Whether lengths are metres; not written where they are, so older releases read such maps.
         refined: Digest of the weights that refined the map; empty, and not written, where none did.
         instances: Which voxels belong to which thing, of maps that were refined so; not written for others.
+        places: What it is found again by; not written where there are none.
     """
 
     format: str = FORMAT
@@ -77,6 +94,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
     scale: Literal["metres", "unknown"] = "metres"
     refined: Digest | Literal[""] = ""
     instances: InstanceTable | None = None
+    places: PlaceTable | None = None
 
     @property
     def scale_known(self) -> bool:
@@ -93,6 +111,8 @@ def encode_manifest(manifest: MapManifest) -> bytes:
         del plain["refined"]
     if manifest.instances is None:
         del plain["instances"]
+    if manifest.places is None:
+        del plain["places"]
     return msgspec.json.format(msgspec.json.encode(plain), indent=1)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from semantic_mapper.localization.places import Place
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import BlockPart, write_map
 from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS, MapManifest
@@ -26,6 +27,7 @@ class MapSaving:
         locked: Gives the storage of the map, alone; it is held while this is made.
         manifest: Settings, classes and counters of the map.
         instances: Which voxels belong to which thing, if the map says so.
+        places: What the map is found again by.
     """
 
     def __init__(
@@ -33,10 +35,12 @@ class MapSaving:
         locked: Callable[[], AbstractContextManager[BlockGrid]],
         manifest: MapManifest,
         instances: InstanceLayer | None = None,
+        places: tuple[Place, ...] = (),
     ) -> None:
         self._locked = locked
         self._manifest = manifest
         self._instances = instances
+        self._places = places
         with locked() as grid:
             self._snapshots = GridSnapshots(grid)
 
@@ -51,7 +55,7 @@ class MapSaving:
             MapError: the file cannot be written; one that was there before is as it was.
         """
         try:
-            manifest = write_map(path, self._manifest, self._parts(between), self._instances)
+            manifest = write_map(path, self._manifest, self._parts(between), self._instances, self._places)
         finally:
             with self._locked():
                 self._snapshots.close()

@@ -91,7 +91,8 @@ def test_after_a_reconnection_poses_are_withheld(calibration: Path) -> None:
     def connect(count: int, ends: bool) -> Sources:
         return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
 
-    camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=WAITS)
+    config = msgspec.structs.replace(WAITS, on_tracking_reset="no-poses")
+    camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=config)
     before: list[CameraImage] = []
     with camera:
         for image in camera:
@@ -101,6 +102,17 @@ def test_after_a_reconnection_poses_are_withheld(calibration: Path) -> None:
         after = [image, *itertools.islice(camera, 20)]
     assert with_pose(before) and not with_pose(after)
     assert after[0].seq > before[-1].seq + 1
+
+
+def test_after_a_reconnection_poses_are_of_another_world(calibration: Path) -> None:
+    def connect(count: int, ends: bool) -> Sources:
+        return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
+
+    camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=WAITS)
+    with camera:
+        images = with_pose(list(itertools.islice(camera, 70)))
+    worlds = [image.own_pose.world for image in images if image.own_pose is not None]
+    assert len(set(worlds)) == 2 and worlds == sorted(worlds) and min(worlds) > 0
 
 
 def test_a_reconnection_ends_the_camera_where_that_is_asked_for(calibration: Path) -> None:

@@ -10,12 +10,12 @@ from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses.alignment import Aligner, Target, fit
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.depth_view import make_levels, thin_depth, thinned
-from semantic_mapper.drivers.poses.features import find_features, pose_from_features
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import invert_pose, rotation_vector, unproject
+from semantic_mapper.localization.features import find_features, pose_from_features
 from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 

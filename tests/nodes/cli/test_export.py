@@ -61,7 +61,7 @@ def test_merging_a_map_with_itself_says_where_its_blocks_have_gone(results: Path
     measured = int((voxel_map.block_state()["weight"] > 0).any(axis=(1, 2, 3)).sum())
     count, empty = voxel_map.block_count, voxel_map.block_count - measured
     assert empty > 0
-    done = run("merge", results, results, "--out", tmp_path / "twice.npz")
+    done = run("merge", results, results, "--transform", "0 0 0 0", "--out", tmp_path / "twice.npz")
     assert done.returncode == 0, done.stderr
     said = " ".join(done.stdout.split())
     assert f"{count} and {count} made {measured} blocks; {2 * empty} empty blocks of the two" in said

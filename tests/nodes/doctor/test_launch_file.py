@@ -95,7 +95,8 @@ def test_what_a_node_would_refuse_as_it_starts_is_told_before(tmp_path: Path) ->
     assert "fps" in of(ROBOT, "fps=-1")["camera"][0].found
     file = tmp_path / "learning.toml"
     text = ROBOT.with_name("learning.toml").read_text(encoding="utf-8")
-    file.write_text(text.replace('restart = "never"', 'restart = "on-failure"'), encoding="utf-8")
+    text = text.replace('restart = "never"', 'restart = "on-failure"').replace('kind = "device"', 'kind = "visual"')
+    file.write_text(text, encoding="utf-8")
     (tmp_path / "mapper.toml").write_text("[voxel_map]\nvoxel_size = 0.1\n", encoding="utf-8")
     (tmp_path / "broken.safetensors").write_bytes(b"no weights")
     settings = (f"config={tmp_path / 'mapper.toml'}", f"weights={tmp_path / 'broken.safetensors'}")

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.labels import CAMVID11, ROOMS
+from semantic_mapper.localization.features import Features
+from semantic_mapper.localization.places import make_place
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.node import Playback
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.mapper.resume import forbid, keep_earlier, take_up
+from semantic_mapper.nodes.mapper.resume import forbid, go_on, keep_earlier, note_worlds, noted_worlds, take_up
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -71,6 +74,31 @@ def test_map_of_an_earlier_run_is_no_map_of_this_one(tmp_path: Path) -> None:
     assert fresh.frames == 0 and path.read_bytes() == before
     some_map(4).save(path)  # by the first restarted one
     assert "after 4 frames" in take_up(context(folder, 2), path, fresh)
+
+
+def test_a_saved_map_is_gone_on_in_where_it_can_be_found_again(tmp_path: Path) -> None:
+    saved, fresh = some_map(3), VoxelMap(CONFIG, ROOMS)
+    with pytest.raises(ConfigError, match="nothing to find oneself by"):
+        go_on(fresh, saved, "a.npz")
+    found = Features(np.zeros((4, 2)), np.ones(4), np.zeros((4, 128), np.uint8))
+    again = some_map(3)
+    again.places.add(make_place("c", 1, np.eye(4), found, INTRINSICS))
+    fresh = VoxelMap(CONFIG, ROOMS)
+    go_on(fresh, again, "a.npz")
+    assert fresh.frames == 3 and len(fresh.places) == 1
+    taken_up = some_map(2)
+    go_on(taken_up, again, "a.npz")  # by a restarted mapper, from what it had saved
+    assert taken_up.frames == 2
+    with pytest.raises(ConfigError, match="go on with the weights"):
+        go_on(VoxelMap(CONFIG, CAMVID11), again, "a.npz")
+
+
+def test_where_worlds_lie_is_noted_for_the_mapper_after_this_one(tmp_path: Path) -> None:
+    T = np.diag([-1.0, -1.0, 1.0, 1.0])
+    assert noted_worlds(context(tmp_path / "notes", 0)) == {}
+    note_worlds(context(tmp_path / "notes", 0), {0: np.eye(4), 2**60: T})
+    noted = noted_worlds(context(tmp_path / "notes", 1))
+    assert set(noted) == {0, 2**60} and np.array_equal(noted[2**60], T)
 
 
 @pytest.mark.parametrize("case", ["corrected", "damaged", "other settings"])

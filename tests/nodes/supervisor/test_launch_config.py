@@ -94,7 +94,7 @@ def test_the_launch_file_for_a_robot_publishes_on_loopback_and_restarts_what_it_
     assert (launch.publish, launch.keys) == ("tcp://127.0.0.1:7", "k")
     assert isinstance(mapper, MapperOptions) and mapper.save_every_s > 0 and mapper.keys == "k"
     assert mapper.query.startswith("tcp://127.0.0.1:") and mapper.publish.startswith("tcp://127.0.0.1:")
-    assert {node.name for node in launch.nodes if node.restart == "on-failure"} == {"mapper", "recorder"}
+    assert {node.name for node in launch.nodes if node.restart == "on-failure"} == {"camera", "mapper", "recorder"}
     assert launch.sockets() == ("launch", "mapper", "camera", "recorder")
 
 

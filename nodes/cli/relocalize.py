@@ -1,0 +1,54 @@
+"""``semantic-mapper relocalize``: where the frames of a log are in a saved map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+
+
+@verb
+def relocalize(
+    saved: Annotated[Path, typer.Argument(metavar="MAP", help="Saved map, or a folder of results with one.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Frames with measured depth.")],
+    every: Annotated[int, typer.Option(min=1, help="Look for every n-th frame.")] = 1,
+    max_frames: Annotated[int, typer.Option("--max-frames", min=0, help="Of those; 0 = all.")] = 0,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print every frame as JSON, and nothing else, on stdout.")
+    ] = False,
+) -> int:
+    """Find the frames of a log in a map, each by itself; their poses are used only to see whether they agree.
+
+    A frame is found where features, depth and brightness agree with the map. Exit code 1 where fewer than three frames
+    agree on where the world of the log lies in the map.
+
+    Example: semantic-mapper relocalize runs/yesterday today.mcap
+    """
+    output = Output.guarded()
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.nodes.cli.saved_maps import map_path
+    from semantic_mapper.replay.log.sequence import open_log
+    from semantic_mapper.replay.relocalize import relocalize_frames
+
+    voxel_map = VoxelMap.load(map_path(saved))
+    with open_log((log,)) as frames:
+        count = -(-len(frames) // every)
+        count = min(count, max_frames or count)
+        with frame_progress("relocalize", None) as bar:
+            bar.start(count)
+            found = relocalize_frames(voxel_map, frames, every, count, bar.set)
+    if json:
+        output.json(found)
+    else:
+        output.print(f"{found['found']} of {found['frames']} frames found, {found['agreeing']} at one with each other")
+        for reason, times in found["refused"].items():
+            output.print(f"  {times} not: {reason}")
+        if found["T_map_world"] is not None:
+            output.print("the log's world in the map, T_map_world:")
+            for row in found["T_map_world"]:
+                output.print("  " + " ".join(f"{value:9.4f}" for value in row))
+    return 0 if found["T_map_world"] is not None else EXIT_FAILED

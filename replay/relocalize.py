@@ -1,0 +1,47 @@
+"""Where the frames of a log are in a saved map."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from semantic_mapper.localization.consensus import AGREEING, agreed, best_consensus, sighting
+from semantic_mapper.localization.relocalizer import NotFound, Relocalizer
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.types import PosedFrame
+
+
+def relocalize_frames(
+    voxel_map: VoxelMap, log: Log, every: int, count: int, on_frame: Callable[[int], None]
+) -> dict[str, Any]:
+    """Look for every n-th frame, ``count`` of them; plain data, as of ``relocalize --json``."""
+    finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
+    rows: list[dict[str, Any]] = []
+    seen = []
+    for number, frame in enumerate(log.frames_or_errors(count * every)):
+        if number % every or not isinstance(frame, PosedFrame):
+            continue
+        began = time.perf_counter()
+        depth = None if frame.depth_sigma_m is not None else frame.depth_m
+        found = finder.find(frame.rgb, depth, frame.intrinsics)
+        row: dict[str, Any] = {"seq": frame.seq, "camera_id": frame.camera_id, "stamp_ns": frame.stamp_ns}
+        row |= {"ms": round((time.perf_counter() - began) * 1e3, 1), "features": found.inliers}
+        if isinstance(found, NotFound):
+            row |= {"reason": found.reason, "detail": found.detail}
+        else:
+            row["T_map_camera"] = found.T_map_camera.tolist()
+            seen.append(sighting(found.T_map_camera, frame.T_world_camera, found.inliers))
+        rows.append(row)
+        on_frame(len(rows))
+    best = best_consensus(seen)
+    return {
+        "frames": len(rows),
+        "found": len(seen),
+        "agreeing": len(best),
+        "refused": dict(Counter(row["reason"] for row in rows if "reason" in row).most_common()),
+        "T_map_world": agreed(best).tolist() if len(best) >= AGREEING else None,
+        "looks": rows,
+    }

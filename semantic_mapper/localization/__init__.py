@@ -1,0 +1,1 @@
+"""Where a camera is in a map that is there already."""

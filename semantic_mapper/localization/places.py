@@ -1,0 +1,157 @@
+"""Places seen so far: which of them an image shows, and what a map keeps of its own.
+
+Matches are counted with each place in turn (1 ms each), which is exact and needs no vocabulary; a few hundred places
+are as many as a map keeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semantic_mapper.localization.features import Features, match_features
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+
+DESCRIPTOR_BYTES = 128
+MAX_PLACES = 300  # that a map keeps
+MAX_FEATURES = 400  # of each: 140 bytes a feature
+_SPACING_M, _SPACING_RAD = 0.2, np.deg2rad(12.0)  # a view this far from all places is a new one
+
+
+class PlaceIndex:
+    """Descriptors of places, by number. Deterministic.
+
+    Args:
+        capacity: Places that are kept; one more takes the place of the oldest.
+    """
+
+    def __init__(self, capacity: int = MAX_PLACES) -> None:
+        self._capacity = capacity
+        self._descriptors: dict[int, UInt8] = {}
+
+    def __len__(self) -> int:
+        return len(self._descriptors)
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """Of the places that are kept, oldest first."""
+        return tuple(self._descriptors)
+
+    def add(self, key: int, features: Features) -> None:
+        """Keep a place; one of the same key is replaced. Features without depth count, too."""
+        self.add_descriptors(key, features.descriptors)
+
+    def add_descriptors(self, key: int, descriptors: UInt8) -> None:
+        """As ``add``, of descriptors (N, 128) alone."""
+        self._descriptors.pop(key, None)
+        self._descriptors[key] = descriptors
+        if len(self._descriptors) > self._capacity:
+            del self._descriptors[next(iter(self._descriptors))]
+
+    def remove(self, key: int) -> None:
+        """Forget a place, if it is there."""
+        self._descriptors.pop(key, None)
+
+    def candidates(
+        self, features: Features, count: int, exclude: frozenset[int] = frozenset()
+    ) -> list[tuple[int, int]]:
+        """The places most like an image, best first, as (key, number of features that match); older first if equal.
+
+        Args:
+            features: Of the image (``find_place_features``), as those that were added.
+            count: At most this many, each with at least one match.
+            exclude: Keys that do not count, such as those of the last seconds.
+        """
+        scored: list[tuple[int, int]] = []
+        for key, descriptors in self._descriptors.items():
+            if key not in exclude:
+                scored.append((key, len(match_features(features.descriptors, descriptors))))
+        scored.sort(key=lambda item: -item[1])
+        return [(key, score) for key, score in scored[:count] if score > 0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """What a map keeps of a view to find itself by.
+
+    Args:
+        camera_id, stamp_ns: Of the frame.
+        T_world_camera: (4, 4) float64.
+        points: (N, 3) float32 features in the camera's axes, metres.
+        descriptors: (N, 128) uint8.
+    """
+
+    camera_id: str
+    stamp_ns: int
+    T_world_camera: Float64
+    points: Float32
+    descriptors: UInt8
+
+
+def make_place(
+    camera_id: str, stamp_ns: int, T_world_camera: Float64, features: Features, intrinsics: CameraIntrinsics
+) -> Place:
+    """A place of the features that have depth."""
+    deep = np.flatnonzero(features.depth_m > 0)[:MAX_FEATURES]
+    points = features.points(intrinsics)[deep].astype(np.float32)
+    return Place(camera_id, stamp_ns, T_world_camera.copy(), points, features.descriptors[deep])
+
+
+def moved_place(place: Place, T_other_world: Float64) -> Place:
+    """A place in another world."""
+    return replace(place, T_world_camera=T_other_world @ place.T_world_camera)
+
+
+class PlaceStore:
+    """The places of a map, oldest first; bounded.
+
+    Args:
+        places: To begin with.
+        capacity: Beyond it the younger of the two that are nearest to each other goes.
+    """
+
+    def __init__(self, places: Iterable[Place] = (), capacity: int = MAX_PLACES) -> None:
+        self._places = list(places)
+        self._capacity = capacity
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """All, oldest first."""
+        return tuple(self._places)
+
+    def wants(self, T_world_camera: Float64) -> bool:
+        """Whether a view from this pose is a new place."""
+        return bool((_apart(self._poses(), T_world_camera) > 1).all())
+
+    def add(self, place: Place) -> None:
+        """Keep a place."""
+        self._places.append(place)
+        if len(self._places) > self._capacity:
+            del self._places[self._most_crowded()]
+
+    def move(self, poses: Mapping[tuple[str, int], Float64]) -> None:
+        """Give places other poses, by (camera_id, stamp_ns); those that are not named stay where they are."""
+        moved = [(p, poses.get((p.camera_id, p.stamp_ns))) for p in self._places]
+        self._places = [p if pose is None else replace(p, T_world_camera=pose.copy()) for p, pose in moved]
+
+    def _poses(self) -> Float64:
+        return np.array([p.T_world_camera for p in self._places]).reshape(-1, 4, 4)
+
+    def _most_crowded(self) -> int:
+        """Number of the younger of the two that are nearest to each other; never the newest."""
+        poses = self._poses()[:-1]
+        apart = _apart(poses[:, None], poses[None])
+        apart[np.triu_indices(len(poses))] = np.inf
+        return int(apart.argmin()) // len(poses)
+
+
+def _apart(T_world_a: Float64, T_world_b: Float64) -> Float64:
+    """Distances of views (..., 4, 4) in spacings."""
+    way = np.linalg.norm(T_world_a[..., :3, 3] - T_world_b[..., :3, 3], axis=-1)
+    cosine = ((T_world_a[..., :3, :3] * T_world_b[..., :3, :3]).sum(axis=(-2, -1)) - 1) / 2
+    return np.maximum(way / _SPACING_M, np.arccos(np.clip(cosine, -1, 1)) / _SPACING_RAD)

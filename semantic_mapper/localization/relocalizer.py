@@ -1,0 +1,291 @@
+"""Where a frame without a pose is in a map: the place it shows, a pose from its features, and what the map says to it.
+
+A pose is given only where features *and* depth agree with the map, and no other place fits nearly as well. One frame
+may still be wrong; ``Relocalization`` waits for several that agree with each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from semantic_mapper.geometry import invert_pose, project, rotation_vector, transform
+from semantic_mapper.localization.depth_fit import (
+    DepthFit,
+    Landmarks,
+    MapSurface,
+    align_depth,
+    compare_depth,
+    small_depth,
+)
+from semantic_mapper.localization.features import Features, find_place_features, match_features, pose_from_points
+from semantic_mapper.localization.places import MAX_FEATURES, Place, PlaceIndex
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+
+Reason = Literal[
+    "no-places", "no-depth", "unknown", "few-features", "contradicted", "looks-different", "classes", "ambiguous"
+]
+_CANDIDATES = 8  # places that are looked at
+_GROUP_M, _GROUP_RAD = 1.2, np.deg2rad(50.0)  # places this near to a candidate lend it their matches
+_GROUP = 4  # at most
+_REPROJECTION = 4.0 / 525.0  # of the focal length
+_SUPPORT = 8.0 / 525.0  # how far a feature may be from where the aligned pose has it: that fits the depth first
+_LEAST_DEPTH = 0.1  # fraction of the pixels
+_TRIED = 3  # poses that the map is asked about
+_FAR_M = 10.0  # from the place that it is about, no pose is believed
+_REACH_M = 1.5  # places whose views are this near may show what the frame shows; a radian counts like a metre
+_DEPTH_M, _DEPTH = 0.06, 0.04  # by which the depths of a feature may differ
+_ALIKE = 0.75 * 512.0  # distance of descriptors
+_SAME_M, _SAME_RAD = 0.3, np.deg2rad(10.0)  # poses further apart are two
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a pose must show to be believed.
+
+    Set by 1,200 views of 20 test rooms (``benchmarks.relocalization``): in the mirrored room a symmetric shelf or bath
+    has up to 141 features for it, but at most 0.87 of the depth agrees, with a likeness of 0.55; in the room itself
+    0.88 with 0.86, or 0.99 with 0.58.
+
+    Args:
+        min_inliers: Features that agree on the pose.
+        min_spread: Their standard deviation in the image, as a fraction of its diagonal.
+        min_overlap, min_agree, min_likeness, min_classes: See ``DepthFit``.
+        sure_inliers: With fewer features than these, the depth has to agree by ``sure_agree``.
+        sure_likeness: In place of ``min_likeness`` where features are fewer, or less of the depth agrees.
+        max_rival: Features of another pose, as a fraction of those of the best.
+    """
+
+    min_inliers: int = 12
+    min_spread: float = 0.08
+    min_overlap: float = 0.4
+    min_agree: float = 0.85
+    min_likeness: float = 0.5
+    min_classes: float = 0.4
+    sure_inliers: int = 40
+    sure_agree: float = 0.92
+    sure_likeness: float = 0.8
+    max_rival: float = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relocalized:
+    """A frame that was found.
+
+    Args:
+        T_map_camera: (4, 4) float64.
+        inliers: Features that agree on it.
+        fit: What its depth says.
+    """
+
+    T_map_camera: Float64
+    inliers: int
+    fit: DepthFit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NotFound:
+    """A frame that was not.
+
+    Args:
+        reason: In one word.
+        detail: In a sentence.
+        T_map_camera: The pose that was refused, if there was one.
+        inliers, fit: Of it.
+    """
+
+    reason: Reason
+    detail: str
+    T_map_camera: Float64 | None = None
+    inliers: int = 0
+    fit: DepthFit | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Guess:
+    pose: Float64
+    landmarks: Landmarks
+
+    @property
+    def inliers(self) -> int:
+        return len(self.landmarks.points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tried:
+    guess: _Guess
+    pose: Float64  # aligned
+    fit: DepthFit
+    support: Landmarks
+
+
+class Relocalizer:
+    """Finds frames in a map. Deterministic; changes nothing.
+
+    Args:
+        places: What the map keeps to find itself by.
+        surface: The map.
+        ignore_id: Of its classes.
+        limits: What is believed.
+    """
+
+    def __init__(
+        self, places: Sequence[Place], surface: MapSurface, ignore_id: int = 255, limits: Limits = Limits()
+    ) -> None:
+        self._places = places
+        self._surface = surface
+        self._ignore_id = ignore_id
+        self._limits = limits
+        self._index = PlaceIndex(max(1, len(places)))
+        for number, place in enumerate(places):
+            self._index.add_descriptors(number, place.descriptors)
+
+    def find(
+        self, rgb: UInt8, depth_m: Float32 | None, intrinsics: CameraIntrinsics, label: UInt8 | None = None
+    ) -> Relocalized | NotFound:
+        """Find a frame.
+
+        Args:
+            rgb: (H, W, 3) uint8, rectified.
+            depth_m: (H, W) float32 z as a sensor measured it, 0 = none.
+            intrinsics: Of both.
+            label: (h, w) uint8 class ids of the map's label set as something sees them in the frame; None = no idea.
+        """
+        if not self._places:
+            return NotFound("no-places", "the map has nothing to find oneself by")
+        if depth_m is None or float((depth_m > 0).mean()) < _LEAST_DEPTH:
+            return NotFound("no-depth", "the frame has hardly any measured depth, and a picture alone proves no place")
+        return self.find_features(find_place_features(rgb, depth_m, MAX_FEATURES), rgb, depth_m, intrinsics, label)
+
+    def find_features(
+        self, features: Features, rgb: UInt8, depth_m: Float32, intrinsics: CameraIntrinsics, label: UInt8 | None = None
+    ) -> Relocalized | NotFound:
+        """As ``find``, where the features of the frame are known."""
+        if not self._places:
+            return NotFound("no-places", "the map has nothing to find oneself by")
+        depth, small = small_depth(depth_m, intrinsics)
+        tried: list[_Tried] = []
+        for guess in self._guesses(features, intrinsics):
+            if any(_same(guess.pose, t.guess.pose) or _same(guess.pose, t.pose) for t in tried):
+                continue
+            pose = align_depth(self._surface, depth, small, guess.landmarks, intrinsics, guess.pose)
+            if pose is None:
+                continue
+            fit = compare_depth(self._surface, depth, small, rgb, pose, label, self._ignore_id)
+            tried.append(_Tried(guess, pose, fit, self._support(features, pose, intrinsics)))
+            if len(tried) == _TRIED:
+                break
+        if not tried:
+            return NotFound("unknown", "no place of the map shows what the frame shows")
+        tried.sort(key=lambda t: -len(t.support.points))
+        best = tried[0]
+        count = len(best.support.points)
+        refusal = self._refusal(best, tried, intrinsics)
+        if refusal is not None:
+            return NotFound(refusal[0], refusal[1], best.pose, count, best.fit)
+        return Relocalized(best.pose, count, best.fit)
+
+    def check_classes(
+        self, found: Relocalized, rgb: UInt8, depth_m: Float32, intrinsics: CameraIntrinsics, label: UInt8
+    ) -> Relocalized | NotFound:
+        """Doubt a frame that was found, where its classes are not the map's; arguments as of ``find``."""
+        depth, small = small_depth(depth_m, intrinsics)
+        fit = compare_depth(self._surface, depth, small, rgb, found.T_map_camera, label, self._ignore_id)
+        if fit.classes < self._limits.min_classes:  # false for NaN
+            return NotFound("classes", _other_classes(fit), found.T_map_camera, found.inliers, fit)
+        return replace(found, fit=fit)
+
+    def _refusal(self, best: _Tried, tried: list[_Tried], intrinsics: CameraIntrinsics) -> tuple[Reason, str] | None:
+        limits, fit, count = self._limits, best.fit, len(best.support.points)
+        if count < limits.min_inliers:
+            return "few-features", f"{count} features agree on a pose, {limits.min_inliers} have to"
+        diagonal = float(np.hypot(intrinsics.width, intrinsics.height))
+        if float(np.sqrt(best.support.pixels.var(axis=0).sum())) < limits.min_spread * diagonal:
+            return "few-features", "the features that agree on a pose are all of one small thing"
+        sure = count >= limits.sure_inliers
+        if fit.overlap < limits.min_overlap or fit.agree < (limits.min_agree if sure else limits.sure_agree):
+            return "contradicted", (
+                f"{fit.overlap:.0%} of the depth shows what the map has, and {fit.agree:.0%} of that agrees "
+                f"({fit.through:.0%} sees through it, {fit.before:.0%} stands before it)"
+            )
+        if fit.likeness < (limits.min_likeness if sure and fit.agree >= limits.sure_agree else limits.sure_likeness):
+            return "looks-different", f"brightness of frame and map correlate by {fit.likeness:.2f} only"
+        if fit.classes < limits.min_classes:  # false for NaN
+            return "classes", _other_classes(fit)
+        rival = max((len(t.support.points) for t in tried[1:] if not _same(t.pose, best.pose)), default=0)
+        if rival > limits.max_rival * count:
+            return "ambiguous", f"another pose has {rival} features for it, this one {count}"
+        return None
+
+    def _support(self, features: Features, pose: Float64, intrinsics: CameraIntrinsics) -> Landmarks:
+        """Features of a frame that the places round its pose have where they must be: at that pixel and depth."""
+        apart = [_apart_m(p.T_world_camera, pose) for p in self._places]
+        near = [i for i in np.argsort(apart, kind="stable")[:_GROUP] if apart[i] < _REACH_M]
+        if not near or not len(features.pixels):
+            return Landmarks(np.zeros((0, 3)), np.zeros((0, 2)))
+        points = np.concatenate([self._world_points(i, np.arange(len(self._places[i].points))) for i in near])
+        theirs = np.concatenate([self._places[i].descriptors for i in near]).astype(np.float32)
+        seen = transform(invert_pose(pose), points)
+        front = seen[:, 2] > 0.1
+        if not front.any():
+            return Landmarks(np.zeros((0, 3)), np.zeros((0, 2)))
+        points, theirs, seen = points[front], theirs[front], seen[front]
+        pixels = project(seen, intrinsics)
+        off = np.linalg.norm(features.pixels[:, None] - pixels[None], axis=2)  # (N, M)
+        deep = np.abs(features.depth_m[:, None] - seen[None, :, 2]) < _DEPTH_M + _DEPTH * seen[None, :, 2]
+        ours = features.descriptors.astype(np.float32)
+        square = (ours**2).sum(axis=1)[:, None] + (theirs**2).sum(axis=1)[None] - 2 * ours @ theirs.T
+        square[(off > _SUPPORT * intrinsics.fx) | (~deep & (features.depth_m[:, None] > 0))] = np.inf
+        best = square.argmin(axis=1)
+        alike = np.flatnonzero(square.min(axis=1) < _ALIKE**2)
+        return Landmarks(points[best[alike]], features.pixels[alike])
+
+    def _guesses(self, features: Features, intrinsics: CameraIntrinsics) -> list[_Guess]:
+        """Poses that features tell of, those with the most of them first."""
+        ranked = [key for key, _ in self._index.candidates(features, _CANDIDATES)]
+        pairs = {key: match_features(features.descriptors, self._places[key].descriptors) for key in ranked}
+        limit_px = _REPROJECTION * intrinsics.fx
+        guesses: list[_Guess] = []
+        for key in ranked:
+            near = [k for k in ranked if self._near(k, key)][:_GROUP]
+            points = np.concatenate([self._world_points(k, pairs[k][:, 1]) for k in near])
+            pixels = np.concatenate([features.pixels[pairs[k][:, 0]] for k in near])
+            found = pose_from_points(points, pixels, intrinsics, 6, limit_px)
+            if found is None:
+                continue
+            pose, inliers = found
+            if np.linalg.norm(pose[:3, 3] - self._places[key].T_world_camera[:3, 3]) > _FAR_M:
+                continue
+            _, first = np.unique(np.rint(pixels[inliers]), axis=0, return_index=True)  # one pixel is one feature
+            chosen = inliers[first]
+            guesses.append(_Guess(pose, Landmarks(points[chosen], pixels[chosen])))
+        guesses.sort(key=lambda g: -g.inliers)
+        return guesses
+
+    def _near(self, a: int, b: int) -> bool:
+        return _within(self._places[a].T_world_camera, self._places[b].T_world_camera, _GROUP_M, _GROUP_RAD)
+
+    def _world_points(self, key: int, which: np.ndarray) -> Float64:
+        place = self._places[key]
+        return transform(place.T_world_camera, place.points[which].astype(np.float64))
+
+
+def _other_classes(fit: DepthFit) -> str:
+    return f"{fit.classes:.0%} of the pixels are of the map's class"
+
+
+def _within(a: Float64, b: Float64, way_m: float, turn_rad: float) -> bool:
+    apart = invert_pose(a) @ b
+    return bool(np.linalg.norm(apart[:3, 3]) < way_m and np.linalg.norm(rotation_vector(apart)) < turn_rad)
+
+
+def _apart_m(a: Float64, b: Float64) -> float:
+    apart = invert_pose(a) @ b
+    return float(np.linalg.norm(apart[:3, 3]) + np.linalg.norm(rotation_vector(apart)))
+
+
+def _same(a: Float64, b: Float64) -> bool:
+    return _within(a, b, _SAME_M, _SAME_RAD)

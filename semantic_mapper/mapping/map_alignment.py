@@ -1,0 +1,89 @@
+"""Where one map lies in another: the places of one are looked for in the other."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import project
+from semantic_mapper.localization.consensus import AGREEING, agreed, agreeing_with, best_consensus, sighting
+from semantic_mapper.localization.features import Features
+from semantic_mapper.localization.places import Place
+from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.mapping.files.merge import check_fit
+from semantic_mapper.mapping.map_scale import require_same_scale
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import CameraIntrinsics, Float64
+
+LOOKED_FOR = 60  # places, at most
+SURE = 0.7  # confidence from which on a class counts
+_RIVAL = 0.5  # of the places that agree: so many that say something else are too many
+_VIEW = CameraIntrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
+_WAY_OUT = 'Give it: --transform "x y z yaw_deg", or "0 0 0 0" where both are in one world'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapAlignment:
+    """Where another map lies.
+
+    Args:
+        T_map_other: (4, 4) float64.
+        agreeing: Places of the other map that say so.
+        looked_for: Of so many.
+    """
+
+    T_map_other: Float64
+    agreeing: int
+    looked_for: int
+
+
+def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
+    """Where another map lies in this one.
+
+    Raises:
+        MapError: the maps do not fit each other, nothing can be told, or not for sure; says why.
+    """
+    check_fit(voxel_map.config, voxel_map.label_set, other.config, other.label_set)
+    require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
+    for one, which in ((voxel_map, "first"), (other, "second")):
+        if not len(one.places):
+            raise MapError(
+                f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without "
+                f"depth, by an older release, or with keyframes.save_places = false). {_WAY_OUT}"
+            )
+    finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
+    chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
+    seen = []
+    reasons: Counter[str] = Counter()
+    for place in chosen:
+        found = _find(finder, other, place)
+        if isinstance(found, NotFound):
+            reasons[found.reason] += 1
+        else:
+            seen.append(sighting(found.T_map_camera, place.T_world_camera, found.inliers))
+    best = best_consensus(seen)
+    if len(best) < AGREEING:
+        told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        raise MapError(
+            f"where the maps lie cannot be found: {len(best)} of {len(chosen)} places of the second are at one with "
+            f"the first, {AGREEING} have to be ({told}). {_WAY_OUT}"
+        )
+    rival = best_consensus([s for s in seen if not agreeing_with(s, best)])
+    if len(rival) > _RIVAL * len(best):
+        raise MapError(
+            f"where the maps lie cannot be told: {len(best)} places say one thing and {len(rival)} another, as of "
+            f"rooms that look alike. {_WAY_OUT}"
+        )
+    return MapAlignment(agreed(best), len(best), len(chosen))
+
+
+def _find(finder: Relocalizer, other: VoxelMap, place: Place) -> Relocalized | NotFound:
+    """Look for a place, with what its own map shows from there as picture and depth."""
+    view = other.ray_cast(place.T_world_camera, _VIEW)
+    points = place.points.astype(np.float64)
+    features = Features(project(points, _VIEW), points[:, 2], place.descriptors)
+    label = np.where(view.confidence >= SURE, view.label, np.uint8(other.label_set.ignore_id)).astype(np.uint8)
+    return finder.find_features(features, view.rgb, view.depth_m, _VIEW, label)

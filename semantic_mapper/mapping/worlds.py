@@ -1,0 +1,183 @@
+"""Frames of other worlds, brought into that of the map.
+
+A camera that tracks itself begins its world where it starts: after it was unplugged, or in another launch, its poses
+say nothing of where it is in the map. Its frames are held until they are found there (``localization.relocalizer``),
+each by itself, and several agree with each other and with the camera's own motion between them. Then they are mapped,
+and those after them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semantic_mapper.errors import PoseError
+from semantic_mapper.geometry import check_pose, invert_pose
+from semantic_mapper.localization.consensus import AGREEING, Sighting, agreed, agreeing_with, sighting
+from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.correction.pose_correction import move
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import Float64, PosedFrame, UInt8
+
+REMEMBERED = 10  # frames that may
+HELD = 30  # frames, at most; older ones are given up
+
+_log = get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Taken:
+    """What became of frames.
+
+    Args:
+        ready: To be mapped, in the map's world, oldest first.
+        given_up: Frames that were held, with the reason why they are not mapped.
+    """
+
+    ready: tuple[PosedFrame, ...] = ()
+    given_up: tuple[tuple[PosedFrame, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPose:
+    """Where a frame was taken.
+
+    Args:
+        camera_id, stamp_ns: Of the frame.
+        T_map_camera: (4, 4) float64; None while its place in the map is not known.
+        reason: Why it is not; empty otherwise.
+    """
+
+    camera_id: str
+    stamp_ns: int
+    T_map_camera: Float64 | None
+    reason: str = ""
+
+
+class Whereabouts:
+    """Where the last frame was taken, ``last``, for any thread; None before the first."""
+
+    def __init__(self) -> None:
+        self.last: CameraPose | None = None
+
+
+class MapWorlds:
+    """Which worlds are known in a map, and the search for those that are not.
+
+    Args:
+        voxel_map: With its places.
+        classify: Class ids (h, w) of a frame as its pixels alone tell them; they have to agree with the map's. None =
+            classes are not looked at.
+        own_first: The first world that comes is the map's own, as in a map that begins empty.
+        whereabouts: Is told of every frame.
+        motion: By how much frames to come are moved later on, (4, 4); see ``MapCorrector.motion``.
+
+    Attributes:
+        known: T_map_world (4, 4) by world.
+        found: Worlds that were found.
+        refused: Looks at a frame that did not find it, by reason.
+        reason: Why the last frame was not found; empty where it was, or needs no search.
+    """
+
+    def __init__(
+        self,
+        voxel_map: VoxelMap,
+        classify: Callable[[PosedFrame], UInt8] | None = None,
+        *,
+        own_first: bool = True,
+        whereabouts: Whereabouts | None = None,
+        motion: Callable[[], Float64] = lambda: np.eye(4),
+    ) -> None:
+        self._map = voxel_map
+        self._classify = classify
+        self._own_first = own_first
+        self._motion = motion
+        self._held: deque[PosedFrame] = deque()
+        self._sightings: dict[int, deque[Sighting]] = {}
+        self.known: dict[int, Float64] = {}
+        self.found = 0
+        self.refused: Counter[str] = Counter()
+        self._whereabouts = whereabouts or Whereabouts()
+        self.reason = ""
+
+    @property
+    def held(self) -> int:
+        """Frames that wait."""
+        return len(self._held)
+
+    @property
+    def warning(self) -> str:
+        """While frames wait: why."""
+        if not self._held:
+            return ""
+        return f"{len(self._held)} frames are held until their place in the map is known: {self.reason or 'looking'}"
+
+    def take(self, frame: PosedFrame) -> Taken:
+        """Take the next frame. One whose pose is none goes on to where it is refused."""
+        try:
+            check_pose(frame.T_world_camera, "")
+        except PoseError:
+            return Taken(ready=(frame,))
+        if self._own_first and not self.known:
+            self.known[frame.world] = np.eye(4)
+        if frame.world in self.known:
+            return Taken(ready=(self._at(frame),))
+        if not self._held:
+            _log.info("world_sought", camera=frame.camera_id, seq=frame.seq, places=len(self._map.places))
+        self._held.append(frame)
+        given_up = ((self._held.popleft(), self._why()),) if len(self._held) > HELD else ()
+        if not self._look(frame):
+            self._whereabouts.last = CameraPose(frame.camera_id, frame.stamp_ns, None, self.reason)
+            return Taken(given_up=given_up)
+        ready = [f for f in self._held if f.world in self.known]
+        self._held = deque(f for f in self._held if f.world not in self.known)
+        return Taken(tuple(self._at(f) for f in ready), given_up)
+
+    def take_rest(self) -> Taken:
+        """Give up what still waits."""
+        given_up = tuple((frame, self._why()) for frame in self._held)
+        self._held.clear()
+        return Taken(given_up=given_up)
+
+    def _why(self) -> str:
+        return f"its place in the map is not known: {self.reason}"
+
+    def _at(self, frame: PosedFrame) -> PosedFrame:
+        """A frame of a known world."""
+        pose = move(self.known[frame.world], frame.T_world_camera)
+        self.reason = ""
+        self._whereabouts.last = CameraPose(frame.camera_id, frame.stamp_ns, move(self._motion(), pose))
+        return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
+
+    def _look(self, frame: PosedFrame) -> bool:
+        """Look for a frame; True where its world has become known."""
+        found = self._find(frame)
+        if isinstance(found, NotFound):
+            self.refused[found.reason] += 1
+            self.reason = found.detail
+            return False
+        new = sighting(found.T_map_camera, frame.T_world_camera, found.inliers)
+        seen = self._sightings.setdefault(frame.world, deque(maxlen=REMEMBERED))
+        seen.append(new)
+        agreeing = agreeing_with(new, seen)
+        if len(agreeing) < AGREEING:
+            self.refused["alone"] += 1
+            self.reason = f"{len(agreeing)} of {AGREEING} frames agree on it"
+            return False
+        self.known[frame.world] = move(invert_pose(self._motion()), agreed(agreeing))
+        self.found += 1
+        del self._sightings[frame.world]
+        _log.info("world_found", camera=frame.camera_id, seq=frame.seq, agreeing=len(agreeing), held=len(self._held))
+        return True
+
+    def _find(self, frame: PosedFrame) -> Relocalized | NotFound:
+        depth = None if frame.depth_sigma_m is not None else frame.depth_m
+        finder = Relocalizer(self._map.places.places, self._map, self._map.label_set.ignore_id)
+        found = finder.find(frame.rgb, depth, frame.intrinsics)
+        if depth is None or self._classify is None or isinstance(found, NotFound):
+            return found
+        return finder.check_classes(found, frame.rgb, depth, frame.intrinsics, self._classify(frame))
