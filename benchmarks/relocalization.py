@@ -33,6 +33,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import (
     TEST_SEEDS,
+    TRAIN_SEEDS,
     VALIDATION_SEEDS,
     NoiseConfig,
     RoomConfig,
@@ -47,6 +48,7 @@ from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 
 CAMERA = CameraIntrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 MAPPED = 80  # frames of each room
+SPLITS = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS, "train": TRAIN_SEEDS[:20]}
 PLACES = 20  # looked for in each room, and from other rooms
 NOISE = NoiseConfig()
 OTHER_LIGHT = NoiseConfig(exposure_stops=0.8, white_balance=0.25)
@@ -112,12 +114,19 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return told
 
 
-def kitchen(log_path: Path) -> dict[str, Any]:
-    """Map the first half of a log and look for the second."""
+def kitchen(log_path: Path, places: int) -> dict[str, Any]:
+    """Map the first half of a log and look for the second, among ``places`` that are there at least."""
     with open_log((log_path,)) as log:
         frames = [f for f in log.frames_or_errors(200) if isinstance(f, PosedFrame)]
     plain = [replace(f, label=None) for f in frames]
     mapped = map_frames(plain[:100])
+    own, rng = mapped.places.places, np.random.default_rng(0)
+    shuffled = [
+        replace(own[n % len(own)], descriptors=rng.permuted(own[n % len(own)].descriptors, axis=1))
+        for n in range(max(0, places - len(own)))
+    ]
+    relocalizer = Relocalizer((*own, *shuffled), mapped.voxel_map, ROOMS.ignore_id)
+    mapped = replace(mapped, relocalizer=relocalizer)
     return {"kitchen": summary([look_for(mapped, f, f.T_world_camera) for f in plain[100:]])}
 
 
@@ -187,15 +196,16 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     of_kitchen = commands.add_parser("kitchen", help="frames 100 to 199 in a map of 0 to 99")
     of_kitchen.add_argument("log", type=Path)
+    of_kitchen.add_argument("--places", type=int, default=0, help="fill the map up with shuffled ones to this number")
     of_rooms = commands.add_parser("rooms", help="test rooms in other light, other rooms, mirrored rooms")
     of_rooms.add_argument("--rooms", type=int, default=len(TEST_SEEDS))
-    of_rooms.add_argument("--split", choices=("test", "validation"), default="test")
+    of_rooms.add_argument("--split", choices=tuple(SPLITS), default="test")
     of_rooms.add_argument("--out", type=Path, help="write every query there (JSON)")
     args = parser.parse_args()
     if args.command == "kitchen":
-        print(json.dumps(kitchen(args.log), indent=1))
+        print(json.dumps(kitchen(args.log, args.places), indent=1))
         return
-    found = rooms((TEST_SEEDS if args.split == "test" else VALIDATION_SEEDS)[: args.rooms], args.out)
+    found = rooms(SPLITS[args.split][: args.rooms], args.out)
     print(json.dumps(found, indent=1))
 
 

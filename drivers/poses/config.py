@@ -153,6 +153,12 @@ def begins_world(config: PoseConfig) -> bool:
     return isinstance(config, DevicePoses | OdometryPoses | VisualPoses)
 
 
+def can_be_found(config: PoseConfig) -> bool:
+    """Whether a camera whose world begins anew is found again in the map: with depth, and where no setting says that
+    its world is the one of other cameras."""
+    return isinstance(config, DevicePoses) or (isinstance(config, OdometryPoses) and config.T_world_start == IDENTITY)
+
+
 def tells_of_rig(config: PoseConfig) -> bool:
     """Whether poses are of a rig, on which the camera sits somewhere, rather than of the camera itself."""
     match config:

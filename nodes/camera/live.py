@@ -103,17 +103,17 @@ def check_world(name: str, live: LiveCamera) -> None:
     Raises:
         ConfigError: it is to be restarted.
     """
-    from semantic_mapper.drivers.poses.config import VisualPoses
+    from semantic_mapper.drivers.poses.config import begins_world, can_be_found
     from semantic_mapper.drivers.poses.sources import read_pose_config
 
     config, where = table_of(live.poses, "camera.poses")
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
-    if isinstance(poses, VisualPoses):
+    if begins_world(poses) and not can_be_found(poses):
         raise ConfigError(
             f"node '{name}' is to be restarted where it fails, but poses of kind '{poses.kind}' begin in "
-            "another world then, in which nothing can be found again without depth, and its frames would not be "
-            'mapped: set restart = "never" (the launch ends then, and the map is written), or take poses from a topic '
-            "or a board"
+            "another world then, and without depth, or with a T_world_start of its own, the camera is not found in the "
+            'map again: set restart = "never" (the launch ends then, and the map is written), or take poses from a '
+            "topic or a board"
         )
 
 
@@ -139,7 +139,7 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
         ConfigError, CameraError: see ``run_live_camera``.
     """
     from semantic_mapper.config import convert_config
-    from semantic_mapper.drivers.poses.config import DevicePoses, PoseChecks, begins_world, gives_metres
+    from semantic_mapper.drivers.poses.config import OdometryPoses, PoseChecks, can_be_found, gives_metres
     from semantic_mapper.drivers.poses.posed_camera import PosedCamera
     from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 
@@ -152,7 +152,7 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
         checks=checks,
         T_rig_camera=mount.for_poses(poses),
         scale_known=gives_metres(poses),
-        begins_world=begins_world(poses) and not isinstance(poses, DevicePoses),  # a device tells it itself
+        begins_world=isinstance(poses, OdometryPoses) and can_be_found(poses),  # a device tells it itself
     )
 
 

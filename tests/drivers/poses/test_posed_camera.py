@@ -154,6 +154,20 @@ def test_a_source_that_begins_in_another_world_is_refused_until_it_comes_back(fa
     assert run(camera) == [*range(8), *range(600, 610)] and camera.counters["outliers"] == 592
 
 
+def test_a_source_that_says_that_its_world_is_another_one_is_believed() -> None:
+    class Restarted(Told):
+        def pose(self, image: CameraImage) -> PoseEstimate | None:
+            T = self.pose_of(image)
+            return None if T is None else PoseEstimate(T, "told", world=1 if image.seq < 8 else 2)
+
+    told = Restarted(lambda i: rigid(shift=(6.0 if i.seq >= 8 else 0.0, 0, 0)))
+    with PosedCamera(ListCamera(images(16)), told) as camera:
+        assert [f.world for f in camera] == [1] * 8 + [2] * 8
+    with PosedCamera(ListCamera(images(9)), Told(lambda i: np.eye(4)), begins_world=True) as camera:
+        (world,) = {f.world for f in camera}
+        assert world > 0
+
+
 def test_one_that_was_a_little_too_quick_passes_when_it_is_within_reach() -> None:
     told = Told(lambda i: rigid(shift=(0.4 * min(i.seq, 5), 0, 0)))  # 4 m/s; 3 are believed
     camera = PosedCamera(ListCamera(images(20)), told, PoseChecks(slack_m=0.0, init_consensus=1))

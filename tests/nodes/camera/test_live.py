@@ -232,11 +232,10 @@ def test_a_video_file_that_waits_for_a_reader_can_be_stopped_and_has_a_limit(tmp
     assert "taken no frame for 0.5 s" in str(node.error)
 
 
-@pytest.mark.parametrize("kind", ["visual"])
-def test_a_camera_without_depth_that_tracks_itself_must_not_come_back_in_another_world(
-    tmp_path: Path, kind: str
-) -> None:
-    camera = v4l2(tmp_path / "video0", tmp_path)["camera"] | {"poses": {"kind": kind}}
+@pytest.mark.parametrize("start", [None, np.diag((-1.0, -1, 1, 1)).tolist()])
+def test_a_camera_that_cannot_be_found_again_must_not_come_back_in_another_world(tmp_path: Path, start: object) -> None:
+    poses = {"kind": "visual"} if start is None else {"kind": "rgbd", "T_world_start": start}
+    camera = v4l2(tmp_path / "video0", tmp_path)["camera"] | {"poses": poses}
     with running({"camera": camera}, restartable=True) as node:
         node.thread.join(PATIENCE_S)
     assert isinstance(node.error, ConfigError) and 'set restart = "never"' in str(node.error)
