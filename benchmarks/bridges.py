@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from benchmarks.foxglove_client import FoxgloveClient
 from semantic_mapper.nodes.bridge.feed import lower_priority
+from semantic_mapper.nodes.supervisor.heartbeat import end_with_launcher
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import StreamInfo
@@ -82,7 +83,7 @@ def measure(folder: Path, info: StreamInfo, frames: list[PosedFrame], args: argp
         ]
         camera.wait_for_subscribers("frame", 3, PATIENCE_S)
         command = [sys.executable, "-m", "benchmarks.bridges", str(args.log), "--client", str(port), address]
-        client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=end_with_launcher)
         stack.callback(_end, client)
         beside.append(client)
         answers = stack.enter_context(LosslessSubscriber(endpoints["mapper"], ("map", "refused")))
@@ -216,7 +217,10 @@ def _node(kind: str, options: dict[str, Any], endpoints: dict[str, str]) -> Iter
     """A node process that ends with us."""
     job = {"name": kind, "options": options, "endpoints": endpoints}
     process = subprocess.Popen(
-        [sys.executable, "-I", "-m", f"semantic_mapper.nodes.{kind}", json.dumps(job)], stdout=sys.stderr, text=True
+        [sys.executable, "-I", "-m", f"semantic_mapper.nodes.{kind}", json.dumps(job)],
+        stdout=sys.stderr,
+        text=True,
+        preexec_fn=end_with_launcher,  # frozen ones, too
     )
     try:
         yield process
