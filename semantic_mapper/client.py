@@ -19,6 +19,7 @@ from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.checks import as_numbers
+from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.lookup import PointAnswers
 from semantic_mapper.queries.mirror import MapMirror
@@ -153,6 +154,7 @@ class MapClient:
         self._mirror: MapMirror | None = None
         self._mirrored = ""  # map_id of the mirror
         self._mirror_lock = threading.Lock()
+        self._graphs: dict[tuple[str, messages.Point], GraphTracker] = {}
         self._labels: tuple[str, LabelSet] | None = None
         self.version = 0
 
@@ -205,6 +207,19 @@ class MapClient:
         request = messages.InstancesRequest(up=_point(up, "up"), gone=gone)
         found = self._ask("instances", messages.InstancesAnswer, request)
         return _things(found, self._label_set(found.map_id))
+
+    def graph(self, up: ArrayLike = UP) -> SceneGraph:
+        """Floors, rooms, doors and things; see ``queries.graph.GraphTracker``.
+
+        Computed here, from ``mirror``; the things are those of ``instances``. Ids of rooms stay from call to call of
+        this client, for each ``up``; those of another client may differ.
+        """
+        things = self.instances(up)
+        snapshot = self.mirror().snapshot()
+        with self._mirror_lock:
+            key = (self._mirrored, _point(up, "up"))
+            tracker = self._graphs.setdefault(key, GraphTracker(up))
+        return tracker.update(snapshot, things)
 
     def occupancy(self, points: ArrayLike) -> UInt8:
         """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from rich.table import Table
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_scale import length_unit, scale_name
 from semantic_mapper.plain_text import counted
+from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.lookup import PointAnswers
 from semantic_mapper.queries.nearest import NearestSurface
@@ -89,6 +91,34 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance], told_ap
     return found
 
 
+def answer_graph(graph: SceneGraph) -> dict[str, Any]:
+    """Floors, rooms, doors and objects; places are world metres, and ids are those of the tracker."""
+    return {
+        "question": "graph",
+        "up": _rounded(graph.up),
+        "floors": [{"id": f.id, "height_m": round(f.height_m, DIGITS), "rooms": list(f.rooms)} for f in graph.floors],
+        "rooms": [
+            {
+                "id": room.id,
+                "floor": room.floor,
+                "area_m2": round(room.area_m2, DIGITS),
+                "center": _rounded(room.center),
+                "outline": _rounded(room.outline),
+                "neighbours": sorted(
+                    {n for door in graph.doors if room.id in door.rooms for n in door.rooms} - {room.id}
+                ),
+                "objects": [thing.id for thing in graph.things if graph.room_of[thing.id] == room.id],
+            }
+            for room in graph.rooms
+        ],
+        "doors": [
+            {"rooms": list(door.rooms), "center": _rounded(door.center), "width_m": round(door.width_m, DIGITS)}
+            for door in graph.doors
+        ],
+        "objects": [{**_describe_thing(thing), "room": graph.room_of[thing.id]} for thing in graph.things],
+    }
+
+
 def _describe_thing(thing: Instance) -> dict[str, Any]:
     return {
         "id": thing.id,
@@ -109,6 +139,8 @@ def answer_table(found: dict[str, Any], width: int) -> Table:
     """An answer, for people, on a terminal of ``width`` characters."""
     if found["question"] == "instances":
         return _instance_table(found, width)
+    if found["question"] == "graph":
+        return _graph_table(found)
     unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
     table = Table(title=found["map"], title_justify="left", show_header=False)
     for key, value in found.items():
@@ -155,6 +187,21 @@ def _instance_table(found: dict[str, Any], width: int) -> Table:
         table.width = narrowest
     for row in rows:
         table.add_row(*row)
+    return table
+
+
+def _graph_table(found: dict[str, Any]) -> Table:
+    table = Table(title=found["map"], title_justify="left")
+    if not found["floors"]:
+        table.caption = "no floor was found: too little level surface, or another way is up (--up)"
+    for name in ("room", "floor", "area, m2", "doors to", "objects"):
+        table.add_column(name, overflow="fold", min_width=len(name))
+    class_of = {thing["id"]: thing["class"] for thing in found["objects"]}
+    for room in found["rooms"]:
+        counts = Counter(class_of[number] for number in room["objects"])
+        objects = ", ".join(name if count == 1 else f"{count} {name}" for name, count in sorted(counts.items()))
+        doors = " ".join(map(str, room["neighbours"]))
+        table.add_row(str(room["id"]), str(room["floor"]), f"{room['area_m2']:.1f}", doors, objects)
     return table
 
 

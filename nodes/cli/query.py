@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -14,6 +14,9 @@ from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_id
 from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 
+if TYPE_CHECKING:
+    from semantic_mapper.queries.graph import SceneGraph
+
 
 class Question(StrEnum):
     """What can be asked."""
@@ -22,9 +25,10 @@ class Question(StrEnum):
     AT = "at"
     NEAREST = "nearest"
     INSTANCES = "instances"
+    GRAPH = "graph"
 
 
-ARGUMENTS = {Question.INFO: "", Question.AT: "X Y Z", Question.NEAREST: "CLASS X Y Z", Question.INSTANCES: ""}
+ARGUMENTS = {Question.AT: "X Y Z", Question.NEAREST: "CLASS X Y Z"}
 
 
 class Asked(NamedTuple):
@@ -39,6 +43,7 @@ class Asked(NamedTuple):
     keys: Path | None = None
     refined: bool = False
     gone: bool = False
+    picture: Path | None = None
 
 
 @verb
@@ -50,12 +55,13 @@ def query(
             help="Saved map, folder of results, `live` for the launch that runs here, or ipc://PATH, tcp://HOST:PORT.",
         ),
     ],
-    question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest or instances.")],
+    question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest, instances or graph.")],
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z]", help="Class, and world coordinates in metres.")
     ] = None,
     up: Annotated[
-        tuple[float, float, float], typer.Option(metavar="X Y Z", help="instances: which way is up in the world.")
+        tuple[float, float, float],
+        typer.Option(metavar="X Y Z", help="instances, graph: which way is up in the world."),
     ] = (0.0, 0.0, 1.0),
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
@@ -66,6 +72,9 @@ def query(
     gone: Annotated[
         bool, typer.Option("--gone", help="Running mapper, instances: also those of earlier answers that have gone.")
     ] = False,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="graph: also draw rooms, doors and objects from above.")
+    ] = None,
     server: ServerOption = "",
     keys: KeysOption = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the answer here, as JSON.")] = None,
@@ -76,12 +85,14 @@ def query(
     info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
     things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
-    that `refine` has told things apart in, those.
+    that `refine` has told things apart in, those. graph: floors, their rooms, which part at doors, the doors between
+    them, and the same things with their rooms.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
+    Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
     Example: semantic-mapper query live nearest chair 0 0 1 --json
     Example: semantic-mapper query live nearest chair 0 0 1 --refined
     Example: semantic-mapper query live instances --gone --json
@@ -93,23 +104,27 @@ def query(
         raise typer.BadParameter("goes with a running mapper; name the refined file itself", param_hint="--refined")
     if gone and not (endpoint and question is Question.INSTANCES):
         raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
+    if picture is not None and question is not Question.GRAPH:
+        raise typer.BadParameter("goes with `graph`", param_hint="--picture")
     output = Output.guarded()
     from semantic_mapper.nodes.cli.map_answers import answer_table
     from semantic_mapper.replay.artifacts import write_json
 
     out, output.quiet = results_file(out, json)
-    if out is not None:
-        prepare_file(out)
+    for path in (out, picture):
+        if path is not None:
+            prepare_file(path)
     ask = ask_mapper if endpoint else ask_file
-    asked = Asked(question, class_name, point, up, min_confidence, server, keys, refined, gone)
+    asked = Asked(question, class_name, point, up, min_confidence, server, keys, refined, gone, picture)
     found = {"map": source, **ask(endpoint or source, asked)}
     if out is not None:
         write_json(out, found)
     if output.quiet:
         output.json(found)
     output.print(answer_table(found, output.console.width))
-    if out is not None:
-        output.print(f"written to {out}")
+    for path in (out, picture):
+        if path is not None:
+            output.print(f"written to {path}")
 
 
 def ask_file(source: str, asked: Asked) -> dict[str, Any]:
@@ -121,6 +136,7 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli import map_answers
     from semantic_mapper.nodes.cli.saved_maps import map_path
+    from semantic_mapper.queries.graph import GraphTracker
     from semantic_mapper.queries.instances import InstanceTracker
     from semantic_mapper.queries.lookup import at
     from semantic_mapper.queries.mirror import MapMirror
@@ -138,6 +154,8 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
         case Question.INSTANCES:
             by = map_answers.CONNECTED if snapshot.instances is None else map_answers.LEARNED
             return map_answers.answer_instances(asked.up, InstanceTracker(up=asked.up).update(snapshot), by)
+        case Question.GRAPH:
+            return _answer_graph(source, GraphTracker(asked.up).update(snapshot), asked.picture)
 
 
 def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
@@ -163,14 +181,27 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
                 # A map that grows has no things of its own; of a refined one the answer does not say.
                 by = "" if asked.refined else map_answers.CONNECTED
                 return map_answers.answer_instances(asked.up, client.instances(asked.up, gone=asked.gone), by)
+            case Question.GRAPH:
+                return _answer_graph(source, client.graph(asked.up), asked.picture)
+
+
+def _answer_graph(source: str, graph: SceneGraph, picture: Path | None) -> dict[str, Any]:
+    from semantic_mapper.nodes.cli.map_answers import answer_graph
+
+    if picture is not None:
+        from semantic_mapper.plots import write_picture
+        from semantic_mapper.queries.graph_picture import draw_graph
+
+        write_picture(picture, draw_graph(source, graph))
+    return answer_graph(graph)
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:
     """Class name and point, as far as the question has them."""
-    expected = ARGUMENTS[question].split()
+    expected = ARGUMENTS.get(question, "").split()
     if len(arguments) != len(expected):
         raise typer.BadParameter(
-            f"`{question.value}` takes {ARGUMENTS[question] or 'nothing more'}, got {' '.join(arguments) or 'nothing'}"
+            f"`{question.value}` takes {' '.join(expected) or 'nothing more'}, got {' '.join(arguments) or 'nothing'}"
         )
     name = arguments[0] if question is Question.NEAREST else ""
     try:

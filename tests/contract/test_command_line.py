@@ -45,6 +45,7 @@ COMMANDS: dict[str, str] = {
     "query at": "query {map} at 0.5 -0.5 0.25 --json {tmp}/at.json",
     "query nearest": "query {stored} nearest wall 0 0 1 --json {tmp}/nearest.json",
     "query instances": "query {map} instances --up 0 0 1 --json {tmp}/instances.json",
+    "query graph": "query {map} graph --json {tmp}/graph.json",
     "query of an unknown class": "query {map} nearest unicorn 0 0 1",
     "query with too few numbers": "query {map} at 1 2",
     "query of an unknown kind": "query {map} why",
@@ -99,7 +100,7 @@ COMMANDS: dict[str, str] = {
     "label sends without weights": "label {log} --weights {weights}",
     "finetune with labels of nothing": "finetune {log} --labels {tmp}/none --out {tmp}/a.safetensors",
 }
-JSON_FILES = {"query at": "at", "query nearest": "nearest", "query instances": "instances"}
+JSON_FILES = {"query at": "at", "query nearest": "nearest", "query instances": "instances", "query graph": "graph"}
 
 
 def observe(folder: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.query import Asked, Question, ask_file, ask_mapper
@@ -148,3 +149,21 @@ def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
     assert missing.returncode == 1 and "no such map file" in missing.stderr
     nan = run("query", map_file, "at", "nan", "0", "0")
     assert nan.returncode == 1 and "row 0" in nan.stderr
+
+
+def test_graph_with_a_picture(map_file: Path, tmp_path: Path) -> None:
+    found, shown = ask(map_file, "graph", "--picture", tmp_path / "rooms.png")
+    (floor,), (room,) = found["floors"], found["rooms"]
+    assert (
+        floor["rooms"] == [room["id"]] and abs(floor["height_m"]) < 0.02 and room["neighbours"] == found["doors"] == []
+    )
+    assert {thing["class"] for thing in found["objects"] if thing["room"] == room["id"]} == {"table", "cup"}
+    assert "cup" in shown and (tmp_path / "rooms.png").read_bytes().startswith(b"\x89PNG")
+    assert run_here("query", map_file, "info", "--picture", "p.png")[0] == 2
+
+
+def test_graph_of_a_running_mapper_keeps_its_ids() -> None:
+    with a_folder() as folder, answering(f"ipc://{folder}/query", whole_map()), MapClient(f"ipc://{folder}/query") as c:
+        first, again = c.graph(), c.graph()
+        assert [room.id for room in first.rooms] == [room.id for room in again.rooms] == [1]
+        assert first.room_of == again.room_of and [t.id for t in first.things] == [t.id for t in c.instances()]

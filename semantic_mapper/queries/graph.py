@@ -1,0 +1,335 @@
+"""Floors, rooms, doors and things of a map, and which belong to which; ids stay while the map grows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.labels import STUFF_NAMES, LabelSet
+from semantic_mapper.mapping.files.up_axis import turn_onto
+from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.queries.checks import check_direction
+from semantic_mapper.queries.instances import LEAST_OVERLAP, Instance, InstanceTracker
+from semantic_mapper.queries.occupancy import State, read_states
+from semantic_mapper.queries.rooms import RoomPlan, find_walls, part_rooms
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.types import Bool, Float64, Int64, UInt8
+
+CELL_M = 0.05  # of a plan, or a voxel where that is larger
+STOREY_M = 1.8  # floors are at least so far from each other
+FLOOR_SHARE = 0.2  # of the largest floor: less level surface is no floor
+LEAST_FLOOR_M2 = 2.0
+LAYER_M = 0.05  # of heights, among which floors are looked for
+LOW_M = (-0.15, 0.4)  # above the floor: surface here is floor, or stands on it
+BODY_M = (0.4, 1.6)  # above the floor: here walls are told from doors, whose lintel is higher
+HIGH_M = 2.4  # above the floor: up to here a wall shows over what hides it below, and over doors
+WALL_LAYER_M = 0.2
+WALL_LAYERS = (3, 2)  # that a wall fills at least, of the 6 of the body, and of the 4 above
+NEAR_ROOM_M = 0.4  # what hangs at a wall, or stands in it, belongs to a room so near
+# Things that cover walls: where they hang there is no way through. Doors are no walls, open or closed.
+HUNG_NAMES = frozenset("window picture curtain blinds mirror showercurtain whiteboard".split())
+LEVEL_NAMES = frozenset("floor floormat ceiling".split())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Floor:
+    """One level: its height in metres along up from the origin of the world, and its rooms' ids."""
+
+    id: int
+    height_m: float
+    rooms: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Room:
+    """One room.
+
+    Args:
+        id: Above 0; stays with the room from update to update, and is never given to another.
+        floor: Id of its floor.
+        area_m2: Of its floor, with what furniture covers.
+        center: (3,) float64 world metres, on the floor where that is widest.
+        outline: (N, 3) float64 world metres, on the floor, anticlockwise seen from above; holes are left out.
+    """
+
+    id: int
+    floor: int
+    area_m2: float
+    center: Float64
+    outline: Float64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Door:
+    """A passage between two rooms, ids ascending: its middle (3,) on the floor in the world, and its width, metres."""
+
+    rooms: tuple[int, int]
+    center: Float64
+    width_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneGraph:
+    """What a map consists of.
+
+    Args:
+        up: (3,) unit vector.
+        floors: By height.
+        rooms: By id.
+        doors: Between them, by rooms.
+        things: By id, as ``InstanceTracker`` finds them.
+        room_of: Id of the room that holds most of a thing, for each id of a thing; None = none does.
+    """
+
+    up: Float64
+    floors: tuple[Floor, ...]
+    rooms: tuple[Room, ...]
+    doors: tuple[Door, ...]
+    things: tuple[Instance, ...]
+    room_of: dict[int, int | None]
+
+
+class _Plan(NamedTuple):
+    """Rooms of one floor on cells of the world: ``ids`` (H, W), 0 = none, from cell ``first`` (x, y) on."""
+
+    floor: int
+    height_m: float
+    first: Int64
+    ids: Int64
+
+
+class _Level(NamedTuple):
+    """What was found on one floor."""
+
+    floor: Floor
+    rooms: list[Room]
+    doors: list[Door]
+    plan: _Plan
+
+
+class GraphTracker:
+    """Finds the graph of one map again and again. Safe to call from several threads.
+
+    A room is what an earlier one became where it holds the most of that one's floor, and at least a tenth; of several
+    that became one, the oldest id stays. A floor is the earlier one that is within half a metre of its height.
+
+    Args:
+        up: (3,) direction in the world.
+
+    Raises:
+        MapError: ``up`` without a direction.
+    """
+
+    def __init__(self, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        self._up = check_direction(up, "up")
+        if self._up.shape != (3,):
+            raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
+        self._things = InstanceTracker(up=self._up)
+        self._plans: tuple[_Plan, ...] = ()
+        self._next_floor = self._next_room = 1
+        self._lock = threading.Lock()
+
+    def update(self, snapshot: MapSnapshot, things: Sequence[Instance] | None = None) -> SceneGraph:
+        """The graph of the map as it is now.
+
+        Args:
+            snapshot: The map.
+            things: Of it, found by another; by default this finds them.
+
+        Raises:
+            MapError: lengths of the map are not metres.
+        """
+        require_metres(snapshot.scale_known, "graph")
+        R_grid_world = turn_onto(self._up, np.array((0.0, 0.0, 1.0)))
+        cell_m = max(CELL_M, snapshot.voxel_size_m)
+        with self._lock:
+            things = tuple(self._things.update(snapshot) if things is None else things)
+            xyz, label, level = _surface(snapshot, R_grid_world)
+            heights = find_floors(xyz[level, 2], snapshot.voxel_size_m)
+            floors = list[_Level]()
+            for height, above in zip(heights, [*heights, np.inf][1:], strict=True):
+                within = (xyz[:, 2] >= height + LOW_M[0]) & (xyz[:, 2] < min(above + LOW_M[0], height + HIGH_M))
+                first, seen, wall = _plan(xyz[within], label[within], height, cell_m, snapshot.label_set)
+                found = part_rooms(seen, wall, cell_m)
+                plan, ids = self._identify(found, height, first, [level.plan for level in floors])
+                floors.append(_describe_level(found, plan, ids, _ToWorld(R_grid_world, first, cell_m, height)))
+            plans = self._plans = tuple(level.plan for level in floors)
+        return SceneGraph(
+            self._up,
+            tuple(level.floor for level in floors),
+            tuple(sorted((room for level in floors for room in level.rooms), key=lambda room: room.id)),
+            tuple(sorted((door for level in floors for door in level.doors), key=lambda door: door.rooms)),
+            things,
+            {thing.id: _room_of(thing, snapshot.voxel_size_m, R_grid_world, plans, cell_m) for thing in things},
+        )
+
+    def _identify(
+        self, found: RoomPlan, height: float, first: Int64, taken: Sequence[_Plan]
+    ) -> tuple[_Plan, NDArray[np.int64]]:
+        """The plan with ids that last, and the id (R,) of each of its rooms; ``taken`` are plans of other floors."""
+        used = {plan.floor for plan in taken}
+        before = [plan for plan in self._plans if plan.floor not in used and abs(plan.height_m - height) < 0.5]
+        last = min(before, key=lambda plan: abs(plan.height_m - height), default=None)
+        ids = np.zeros(found.rooms, np.int64)
+        if last is not None:
+            _match(last, found, first, ids)
+        new = np.flatnonzero(ids == 0)
+        ids[new] = self._next_room + np.arange(len(new))
+        self._next_room += len(new)
+        floor = self._next_floor if last is None else last.floor
+        self._next_floor += last is None
+        return _Plan(floor, height, first, np.append(ids, 0)[found.room]), ids
+
+
+def find_floors(height: Float64, voxel_size_m: float) -> list[float]:
+    """Heights of floors, ascending: where level surface is largest, and as far apart as storeys are.
+
+    Args:
+        height: (N,) of the voxels of surface that one could stand on, metres.
+        voxel_size_m: Each of them covers this squared.
+    """
+    if not len(height):
+        return []
+    layer = np.floor(height / LAYER_M).astype(np.int64)
+    counts = np.bincount(layer - layer.min())
+    area = np.convolve(counts, np.ones(3), "same") * voxel_size_m**2
+    least = max(LEAST_FLOOR_M2, FLOOR_SHARE * float(area.max()))
+    found: list[float] = []
+    for k in np.argsort(-area, kind="stable"):
+        if area[k] < least:
+            break
+        middle = float(np.median(height[np.abs(layer - layer.min() - k) <= 1]))
+        if all(abs(middle - other) >= STOREY_M for other in found):
+            found.append(middle)
+    return sorted(found)
+
+
+def _surface(snapshot: MapSnapshot, R_grid_world: Float64) -> tuple[Float64, UInt8, Bool]:
+    """Surface points (N, 3) in the plan's frame, metres, z up; class ids (N,); whether one could stand there (N,)."""
+    surface = surface_voxels(snapshot)
+    label = snapshot.voxels.label[snapshot.slots[surface.row], surface.voxel]
+    up = R_grid_world[2]
+    above = read_states(surface.point + 1.5 * up, snapshot)
+    level = above == State.FREE
+    level[level] = read_states(surface.point[level] - 1.5 * up, snapshot) != State.FREE
+    return surface.point @ (R_grid_world.T * snapshot.voxel_size_m), label, level
+
+
+def _plan(xyz: Float64, label: UInt8, floor_m: float, cell_m: float, labels: LabelSet) -> tuple[Int64, Bool, Bool]:
+    """First cell (x, y), and on cells (H, W), row = y, where floor or furniture was seen, and where there is a wall.
+
+    Surface without a class is a wall where most of the map has none; elsewhere it is the back of something thin.
+    """
+    furniture, upright = np.zeros(256, np.bool_), np.ones(256, np.bool_)
+    furniture[list(labels.thing_ids(STUFF_NAMES | HUNG_NAMES))] = True
+    upright[[i for i, name in zip(labels.ids, labels.names, strict=True) if name in LEVEL_NAMES]] = False
+    cell = np.floor(xyz[:, :2] / cell_m + 0.5).astype(np.int64)
+    first = cell.min(axis=0) - 1
+    width, rows = (cell.max(axis=0) - first + 2).tolist()
+    column, row = (cell - first).T
+    height, is_furniture = xyz[:, 2] - floor_m, furniture[label]
+    seen = np.zeros((rows, width), np.bool_)
+    shown = (is_furniture & (height < BODY_M[1])) | (height < LOW_M[1])
+    seen[row[shown], column[shown]] = True
+    unnamed = label == labels.ignore_id
+    upright[labels.ignore_id] = unnamed.mean() > 0.5
+    is_wall = ~is_furniture & upright[label] & (height >= BODY_M[0])
+    layer = ((height[is_wall] - BODY_M[0]) / WALL_LAYER_M).astype(np.int64)
+    filled = np.zeros((int(layer.max(initial=0)) + 1, rows, width), np.bool_)
+    filled[layer, row[is_wall], column[is_wall]] = True
+    body = round((BODY_M[1] - BODY_M[0]) / WALL_LAYER_M)
+    low, high = filled[:body].sum(axis=0), filled[body:].sum(axis=0)
+    return first, seen, find_walls((low >= WALL_LAYERS[0]) | ((high >= WALL_LAYERS[1]) & ~seen), cell_m)
+
+
+class _ToWorld(NamedTuple):
+    """Where a plan lies."""
+
+    R_grid_world: Float64
+    first: Int64
+    cell_m: float
+    height_m: float
+
+    def cells(self, xy: Float64) -> Float64:
+        """World points (..., 3) of (..., 2) column and row, as real numbers, on the floor."""
+        flat = (self.first + xy - 0.5) * self.cell_m
+        return np.concatenate((flat, np.full((*flat.shape[:-1], 1), self.height_m)), axis=-1) @ self.R_grid_world
+
+
+def _describe_level(found: RoomPlan, plan: _Plan, ids: NDArray[np.int64], to_world: _ToWorld) -> _Level:
+    rooms = [_describe(found, number, room_id, plan.floor, to_world) for number, room_id in enumerate(ids.tolist())]
+    doors = list[Door]()
+    for passage in found.passages:
+        a, b = sorted(int(ids[number]) for number in passage.rooms)
+        row, column = passage.cell
+        doors.append(Door((a, b), to_world.cells(np.array((column + 0.5, row + 0.5))), passage.width_m))
+    return _Level(Floor(plan.floor, plan.height_m, tuple(sorted(ids.tolist()))), rooms, doors, plan)
+
+
+def _describe(found: RoomPlan, number: int, room_id: int, floor: int, to_world: _ToWorld) -> Room:
+    own = found.room == number
+    row, column = np.unravel_index(int(np.where(own, found.clearance_m, -1).argmax()), own.shape)
+    # Twice the size, so that the outline runs along the outer edges of the cells, and no cell is a line.
+    twice = np.repeat(np.repeat(own.astype(np.uint8), 2, axis=0), 2, axis=1)
+    contours, _ = cv2.findContours(twice, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    corners = cv2.approxPolyDP(max(contours, key=cv2.contourArea), 2.0, True).reshape(-1, 2).astype(np.float64)
+    x, y = corners.T
+    if (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() < 0:
+        corners = corners[::-1]
+    center = to_world.cells(np.array((float(column), float(row))) + 0.5)
+    outline = to_world.cells(corners / 2 + 0.25)
+    return Room(room_id, floor, float(own.sum()) * to_world.cell_m**2, center, outline)
+
+
+def _match(last: _Plan, found: RoomPlan, first: Int64, numbers: NDArray[np.int64]) -> None:
+    """Write the ids (R,) of the earlier rooms that these still are, 0 where one is new."""
+    shift = last.first - first  # of the earlier plan's cells in this one
+    rows, columns = np.indices(last.ids.shape)
+    rows, columns = rows + shift[1], columns + shift[0]
+    height, width = found.room.shape
+    there = (last.ids > 0) & (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    now, was = found.room[rows[there], columns[there]], last.ids[there]
+    for old in np.unique(last.ids[last.ids > 0]):
+        overlap = np.bincount(now[(was == old) & (now >= 0)], minlength=max(found.rooms, 1))
+        best = int(overlap.argmax())
+        if overlap[best] >= max(1, LEAST_OVERLAP * (last.ids == old).sum()) and numbers[best] == 0:
+            numbers[best] = old
+
+
+def _room_of(
+    thing: Instance, voxel_size_m: float, R_grid_world: Float64, plans: Sequence[_Plan], cell_m: float
+) -> int | None:
+    """Id of the room that holds most of a thing's voxels, or is nearest to most of them."""
+    xyz = thing.voxels @ (R_grid_world.T * voxel_size_m)
+    below = [plan for plan in plans if plan.height_m <= float(np.median(xyz[:, 2])) + LOW_M[1]]
+    if not below:
+        return None
+    plan = below[-1]
+    cell = np.floor(xyz[:, :2] / cell_m + 0.5).astype(np.int64) - plan.first
+    reach = round(NEAR_ROOM_M / cell_m)
+    low, high = np.maximum(cell.min(0) - reach, 0), cell.max(0) + reach + 1
+    part = plan.ids[low[1] : high[1], low[0] : high[0]]
+    if not part.any():
+        return None
+    distance, nearest = _nearest(part > 0)
+    column, row = (cell - low).T
+    here = (column >= 0) & (row >= 0) & (column < part.shape[1]) & (row < part.shape[0])
+    column, row = column[here], row[here]
+    near = distance[row, column] <= reach
+    ids = part.ravel()[nearest[row[near], column[near]]]
+    return int(np.bincount(ids).argmax()) if len(ids) else None
+
+
+def _nearest(mask: Bool) -> tuple[Float64, Int64]:
+    """Distance (H, W) in cells to the nearest cell of a mask, and the flat index of that cell."""
+    distance, (row, column) = ndimage.distance_transform_edt(~mask, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    return distance, row * mask.shape[1] + column
