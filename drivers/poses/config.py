@@ -100,7 +100,7 @@ class OdometryPoses(Config, frozen=True):
     depth_max_m: Positive = 4.0
     iterations: tuple[AtLeastOne, ...] = (20, 15, 10)  # at most, from the coarsest level, each half as wide as the next
     outlier_m: Positive = 0.07  # points further than this from the surface do not count
-    huber_m: Positive = 0.05  # beyond this a distance counts less
+    noise_m: Positive = 0.009  # of depth at 1 m, growing with its square; beyond this a distance counts less
     neighbours: AtLeastOne = 3  # keyframes that a frame is aligned to
     keyframe_m: Positive = 0.35  # a new one when moved this far from the nearest, or ...
     keyframe_deg: Positive = 20.0  # ... turned this far, or ...
@@ -115,6 +115,7 @@ class OdometryPoses(Config, frozen=True):
     min_matches: Annotated[int, msgspec.Meta(ge=6)] = 15  # consistent ones, for a guess
     relocalise_keyframes: AtLeastOne = 20  # tried for each image while lost, in turn
     drift: Fraction = 0.05  # of the way: what ``sigma`` grows by with the chain of keyframes
+    loop_closure: bool = True  # where the camera comes back to a place, correct the way in between, and the map with it
 
 
 class VisualPoses(Config, frozen=True):
