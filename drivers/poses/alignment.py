@@ -105,7 +105,7 @@ def align(
         chosen = targets if number == 0 else targets[:1]
         noise_m = config.noise_m * _COARSER**number
         for _ in range(count):
-            step = _step(config, levels[number], number, chosen, pose, noise_m)
+            step = _step(config, levels[min(number + 1, len(levels) - 1)], number, chosen, pose, noise_m)
             if step is None:
                 return None
             pose = pose @ step

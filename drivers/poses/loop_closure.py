@@ -26,7 +26,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import Float64
 
 PLACE_FEATURES = 300
-_NEAR = 6  # keyframes that a new one is aligned to because they should overlap
+_NEAR = 4  # keyframes that a new one is aligned to because they should overlap
 _LOOK_ALIKE = 2  # of each slice of places, at most
 _SLICE = 10  # places compared at a time (2 ms each)
 _JOBS = 60  # that wait, at most; the oldest is dropped
@@ -36,8 +36,10 @@ _AGREE_M, _AGREE_DEG = 0.15, 4.0  # between two loops that do not
 _PATIENCE = 15  # keyframes for which a loop waits for another
 _DRIFT_DEG_M = 1.5  # as ``drift``, of rotation: degrees a metre
 _SLACK_M, _SLACK_DEG = 0.1, 5.0
-_BENT_M, _BENT_DEG = 0.06, 4.0  # loops that bend the chain of keyframes by more somewhere are wrong
+_BENT_M, _BENT_DEG = 0.06, 4.0  # loops that bend the chain of keyframes by more are wrong, unless it is known badly
+_FIRM_M = 0.02  # one sigma of the chain's edges that are known well
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
+_FALSE = 0.01  # of what the best known direction is told: the noise of normals says so much about every direction
 _FLOOR_M, _FLOOR_RAD = 0.004, 0.0025  # no motion is known better
 _OPEN_M, _OPEN_RAD = 0.1, 0.05  # along what no point tells of
 
@@ -46,12 +48,11 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """Align keyframe ``b`` to ``a`` from a guess, or by their features where there is none; or look for places."""
+    """Align keyframe ``b`` to ``a`` from a guess, or by their features where there is none."""
 
+    a: int
     b: int
-    a: int = -1
     T_a_b: Float64 | None = None
-    places: frozenset[int] = frozenset()
 
 
 class LoopCloser:
@@ -70,56 +71,70 @@ class LoopCloser:
         self._keyframes: dict[int, OdometryKeyframe] = {}
         self._places = PlaceIndex(config.max_keyframes)
         self._jobs: deque[_Job] = deque(maxlen=_JOBS)
+        self._looking: tuple[int, list[int]] = -1, []  # a keyframe, and the places that it is still to be compared with
         self._waiting: list[Edge] = []  # loops that need another that agrees with them
         self._new: list[Edge] = []  # loops since the graph was optimised
-        self._tried: dict[int, set[int]] = {}
-        self.counters: Counter[str] = Counter(loops_closed=0, loops_refused=0)
+        self.counters: Counter[str] = Counter()
 
     @property
     def busy(self) -> bool:
         """Whether ``work`` has something to do."""
-        return bool(self._jobs or self._new)
+        return bool(self._jobs or self._looking[1] or self._new)
 
-    def add(self, keyframe: OdometryKeyframe, parent: int | None) -> None:
-        """A new keyframe, and the one that it was tracked against (None: it is the first)."""
+    def add(self, keyframe: OdometryKeyframe, parent: int | None, before: tuple[int, Float64] | None = None) -> None:
+        """A new keyframe.
+
+        Args:
+            keyframe: The one.
+            parent: The one that it was tracked against; None: it is the first.
+            before: Where tracking has jumped: the keyframe that it went by before, and T_before_keyframe (4, 4) as it
+                should be then.
+        """
         number, pose = keyframe.number, keyframe.target.T_world_camera
         self._keyframes[number] = keyframe
         edges: list[Edge] = []
         if parent is not None:
             guess = invert_pose(self._graph.poses[parent]) @ pose
             measured = self._measure(parent, number, guess)
-            edges.append(_tracked(parent, number, guess) if measured is None else replace(measured, chain=True))
+            measured = _tracked(parent, number, guess) if measured is None else measured
+            edges.append(replace(measured, chain=_is_firm(measured)))
         self._graph.add(number, pose, edges)
         near = [] if parent is None else self._near(number)
-        self._tried[number] = {number, *near} | set(self._graph.linked(number))
         for other in near:
             if other != parent:
-                self._jobs.append(_Job(number, other, invert_pose(self._graph.poses[other]) @ pose))
-        looked_at = [key for key in self._places.keys if key not in self._tried[number]]
-        for begin in range(0, len(looked_at), _SLICE):
-            self._jobs.append(_Job(number, places=frozenset(looked_at[begin : begin + _SLICE])))
+                self._jobs.append(_Job(other, number, invert_pose(self._graph.poses[other]) @ pose))
+        if before is not None:
+            self._jobs.appendleft(_Job(before[0], number, before[1]))
+        if not self._looking[1]:  # else this keyframe is not looked for: the search has to keep up
+            known = {number, *near} | self._graph.linked(number)
+            self._looking = number, [key for key in self._places.keys if key not in known]
         self._places.add(number, keyframe.place)
 
     def remove(self, number: int, heir: int) -> None:
         """A keyframe is no longer kept; another one near it takes its edges."""
         self._graph.remove(number, heir)
-        del self._keyframes[number], self._tried[number]
+        del self._keyframes[number]
         self._places.remove(number)
         gone = {number}
+        seeker, places = self._looking
+        self._looking = seeker, [] if seeker == number else [key for key in places if key != number]
         self._jobs = deque((j for j in self._jobs if not gone & {j.a, j.b}), maxlen=_JOBS)
         self._waiting = [e for e in self._waiting if not gone & {e.a, e.b}]
         self._new = [e for e in self._new if e in self._graph.edges]
 
-    def work(self) -> Mapping[int, Float64] | None:
-        """Look at one candidate, or optimise once none is left; new poses of the keyframes where that moved them."""
+    def work(self, optimize: bool) -> Mapping[int, Float64] | None:
+        """Optimise, if allowed and there is something new, else look at one candidate.
+
+        Returns:
+            New poses of the keyframes by number; None where they stay.
+        """
+        if self._new and optimize:
+            return self._close()
         if self._jobs:
-            job = self._jobs.popleft()
-            if job.a < 0:
-                self._look(job)
-            else:
-                self._verify(job)
-            return None
-        return self._close() if self._new else None
+            self._verify(self._jobs.popleft())
+        elif self._looking[1]:
+            self._look()
+        return None
 
     def _near(self, number: int) -> list[int]:
         """Keyframes that should overlap with one, those from all of its past alike."""
@@ -133,12 +148,13 @@ class LoopCloser:
         steps = np.linspace(0, len(found) - 1, min(_NEAR, len(found)))
         return [found[round(s)] for s in steps]
 
-    def _look(self, job: _Job) -> None:
-        own = self._keyframes[job.b]
-        others = frozenset(self._places.keys) - job.places
-        for key, matches in self._places.candidates(own.place, _LOOK_ALIKE, exclude=others):
+    def _look(self) -> None:
+        number, places = self._looking
+        self._looking = number, places[_SLICE:]
+        others = frozenset(self._places.keys) - frozenset(places[:_SLICE])
+        for key, matches in self._places.candidates(self._keyframes[number].place, _LOOK_ALIKE, exclude=others):
             if matches >= self._config.min_matches:
-                self._jobs.appendleft(_Job(job.b, key))
+                self._jobs.append(_Job(key, number))
 
     def _verify(self, job: _Job) -> None:
         a, b = self._keyframes[job.a], self._keyframes[job.b]
@@ -177,8 +193,9 @@ class LoopCloser:
         """Take a loop in, let it wait for another, or refuse it."""
         poses = self._graph.poses
         moved_m, turned_deg = between(poses[edge.b], poses[edge.a] @ edge.T_a_b)
-        way_m = self._way(edge.a, edge.b)
-        if moved_m > _SLACK_M + 3 * self._config.drift * way_m or turned_deg > _SLACK_DEG + 3 * _DRIFT_DEG_M * way_m:
+        way_m, sigma_m = self._way(edge.a, edge.b)
+        allowed_m = _SLACK_M + 3 * float(np.hypot(self._config.drift * way_m, sigma_m))
+        if moved_m > allowed_m or turned_deg > _SLACK_DEG + 3 * _DRIFT_DEG_M * way_m:
             self._refuse(edge, moved_m, turned_deg)
             return
         if moved_m < _SMALL_M and turned_deg < _SMALL_DEG:
@@ -211,25 +228,25 @@ class LoopCloser:
             "loop_refused", keyframes=(edge.a, edge.b), moved_m=round(moved_m, 3), turned_deg=round(turned_deg, 1)
         )
 
-    def _way(self, a: int, b: int) -> float:
-        """Metres along the shortest chain of edges."""
-        links: dict[int, list[tuple[int, float]]] = {}
+    def _way(self, a: int, b: int) -> tuple[float, float]:
+        """Metres along the shortest chain of edges, and one sigma of all of these together."""
+        links: dict[int, list[tuple[int, float, float]]] = {}
         for e in self._graph.edges:
-            length = float(np.linalg.norm(e.T_a_b[:3, 3]))
-            links.setdefault(e.a, []).append((e.b, length))
-            links.setdefault(e.b, []).append((e.a, length))
-        best, heap = {a: 0.0}, [(0.0, a)]
+            length, variance = float(np.linalg.norm(e.T_a_b[:3, 3])), float(np.trace(e.covariance[3:, 3:]))
+            links.setdefault(e.a, []).append((e.b, length, variance))
+            links.setdefault(e.b, []).append((e.a, length, variance))
+        best, heap = {a: 0.0}, [(0.0, 0.0, a)]
         while heap:
-            way, here = heapq.heappop(heap)
+            way, variance, here = heapq.heappop(heap)
             if here == b:
-                return way
+                return way, float(np.sqrt(variance))
             if way > best[here]:
                 continue
-            for there, length in links.get(here, []):
+            for there, length, more in links.get(here, []):
                 if way + length < best.get(there, np.inf):
                     best[there] = way + length
-                    heapq.heappush(heap, (way + length, there))
-        return 0.0
+                    heapq.heappush(heap, (way + length, variance + more, there))
+        return 0.0, 0.0
 
     def _close(self) -> Mapping[int, Float64] | None:
         new, self._new = self._new, []
@@ -253,6 +270,10 @@ def _is_bent(edge: Edge, poses: Mapping[int, Float64]) -> bool:
     return edge.chain and (moved_m > _BENT_M or turned_deg > _BENT_DEG)
 
 
+def _is_firm(edge: Edge) -> bool:
+    return bool(np.linalg.eigvalsh(edge.covariance[3:, 3:])[-1] < _FIRM_M**2)
+
+
 def _tracked(a: int, b: int, T_a_b: Float64) -> Edge:
     """What tracking says, where the two alone cannot be aligned."""
     return Edge(a, b, T_a_b, np.diag([_OPEN_RAD**2] * 3 + [_OPEN_M**2] * 3))
@@ -260,6 +281,7 @@ def _tracked(a: int, b: int, T_a_b: Float64) -> Edge:
 
 def _covariance(found: Fit) -> Float64:
     """(6, 6) of a measured motion, from what the points say about each direction."""
-    told = found.normal_matrix / max(found.noise_m, 1e-3) ** 2 / _POINTS_A_VOTE
-    told += np.diag([_OPEN_RAD**-2] * 3 + [_OPEN_M**-2] * 3)
+    values, axes = np.linalg.eigh(found.normal_matrix)
+    values = np.maximum(values - _FALSE * values[-1], 0.0) / max(found.noise_m, 1e-3) ** 2 / _POINTS_A_VOTE
+    told = (axes * values) @ axes.T + np.diag([_OPEN_RAD**-2] * 3 + [_OPEN_M**-2] * 3)
     return np.linalg.inv(told) + np.diag([_FLOOR_RAD**2] * 3 + [_FLOOR_M**2] * 3)

@@ -26,6 +26,7 @@ from semantic_mapper.drivers.poses.depth_view import Level, make_levels, thin_de
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
 from semantic_mapper.drivers.poses.loop_closure import PLACE_FEATURES, LoopCloser
 from semantic_mapper.drivers.poses.motion import StampedPose
+from semantic_mapper.drivers.poses.pose_graph import between
 from semantic_mapper.drivers.poses.still import WAYS_OUT
 from semantic_mapper.drivers.poses.trail import PoseTrail
 from semantic_mapper.errors import CameraError
@@ -37,6 +38,8 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 _LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
+_JUMP_M = 0.06  # from where the last motion leads, where another keyframe is nearest than for the last image
+_PAUSE_NS = 2_000_000_000  # between two corrections: each is work for the map
 
 _log = get_logger(__name__)
 
@@ -79,12 +82,15 @@ class OdometryPoseSource:
         self._warnings: tuple[str, ...] = ()
         self._closer = LoopCloser(config) if config.loop_closure else None
         self._trail = PoseTrail()
+        self._corrected: CorrectedWorld | None = None
+        self._closed_ns = -_PAUSE_NS
+        self._nearest = -1  # keyframe that the last image was aligned to first
         self._counts: Counter[str] = Counter()
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counter[str]:
         """Totals; see the class."""
-        return dict(self._counts) | ({} if self._closer is None else dict(self._closer.counters))
+        return Counter(self._counts) if self._closer is None else self._counts + self._closer.counters
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -111,7 +117,7 @@ class OdometryPoseSource:
             CameraError: the camera has no depth, or images of another camera come in between.
         """
         self._check(image)
-        self._close_loops()
+        self._close_loops(image.stamp_ns)
         view = self._view(image)
         if view is None:
             return self._lose("it has hardly any depth")
@@ -130,20 +136,28 @@ class OdometryPoseSource:
         Args:
             final: No more images will come: finish what is under way.
         """
-        if self._closer is None:
-            return None
-        while final and self._closer.busy:
-            self._close_loops()
-        return self._trail.correction({k.number: k.target.T_world_camera for k in self._map.frames}, final)
+        while final and self._closer is not None and self._closer.busy:
+            self._close_loops(None)
+        if final:
+            self._corrected = self._trail.correction(self._keyframe_poses(), final) or self._corrected
+        corrected, self._corrected = self._corrected, None
+        return corrected
 
-    def _close_loops(self) -> None:
-        """Look at one candidate; where keyframes move, the last poses move along."""
-        poses = None if self._closer is None else self._closer.work()
+    def _close_loops(self, stamp_ns: int | None) -> None:
+        """Look at one candidate; where keyframes move, the last poses move along, at most once in a while."""
+        if self._closer is None:
+            return
+        due = stamp_ns is None or stamp_ns - self._closed_ns > _PAUSE_NS
+        poses = self._closer.work(optimize=due)
         if poses is None:
             return
+        self._closed_ns = self._closed_ns if stamp_ns is None else stamp_ns
         self._past = [replace(past, T=self._moved(past.T, poses)) for past in self._past]
         self._map.move(poses)
-        self._trail.keyframes_moved()
+        self._corrected = self._trail.correction(self._keyframe_poses(), final=False) or self._corrected
+
+    def _keyframe_poses(self) -> dict[int, Float64]:
+        return {k.number: k.target.T_world_camera for k in self._map.frames}
 
     def _moved(self, T_world_camera: Float64, poses: Mapping[int, Float64]) -> Float64:
         nearest = self._map.near(T_world_camera, 1)[0]
@@ -188,13 +202,17 @@ class OdometryPoseSource:
 
     def _guesses(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
         """The last motion gone on with, and what corners say; that first which lies better on the nearest keyframe."""
-        guess = self._past[-1].T
-        if len(self._past) > 1:
-            a, b = self._past
-            guess = interpolate_pose(a.T, b.T, min((view.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
+        guess = self._expected(view.stamp_ns)
         near = self._map.near(guess, self._config.neighbours)
         guesses = [(guess, near), *self._guesses_of_features(view, near)]
         return sorted(guesses, key=lambda g: fit(self._config, view.levels, g[1][0].target, g[0]).cost_m)
+
+    def _expected(self, stamp_ns: int) -> Float64:
+        """Where the last motion leads."""
+        if len(self._past) < 2:
+            return self._past[-1].T
+        a, b = self._past
+        return interpolate_pose(a.T, b.T, min((stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
 
     def _guesses_while_lost(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
         """What corners say of keyframes near the last pose, then of the others, this many an image in turn."""
@@ -252,19 +270,38 @@ class OdometryPoseSource:
             self._counts["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
             self._past = []
+        jumped = self._jump(view, nearest, pose)
         self._lost, self._warnings = False, ()
         self._counts["tracked"] += 1
         self._past = [*self._past[-1:], StampedPose(view.stamp_ns, pose)]
         way, turn = self._map.distances(pose)
         reach = np.maximum(way / self._config.keyframe_m, np.rad2deg(turn) / self._config.keyframe_deg)
         way_m = float(min(k.way_m + d for k, d in zip(self._map.frames, way, strict=True)))
-        if reach.min() > 1 or fits[0].overlap < self._config.keyframe_overlap:
-            self._add_keyframe(view, pose, way_m, nearest.number)
+        if reach.min() > 1 or fits[0].overlap < self._config.keyframe_overlap or jumped is not None:
+            self._add_keyframe(view, pose, way_m, nearest.number, jumped)
         else:
             self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
         return PoseEstimate(pose, "odometry", _sigma(fits, self._config.drift * way_m))
 
-    def _add_keyframe(self, view: _View, pose: Float64, way_m: float, parent: int | None) -> None:
+    def _jump(self, view: _View, nearest: OdometryKeyframe, pose: Float64) -> tuple[int, Float64] | None:
+        """Where another keyframe has taken the camera off its way: the one before, and the way expected from it."""
+        before, self._nearest = self._nearest, nearest.number
+        known = self._keyframe_poses()
+        if self._closer is None or self._lost or before == nearest.number or before not in known or not self._past:
+            return None
+        expected = self._expected(view.stamp_ns)
+        if between(expected, pose)[0] < _JUMP_M:
+            return None
+        return before, invert_pose(known[before]) @ expected
+
+    def _add_keyframe(
+        self,
+        view: _View,
+        pose: Float64,
+        way_m: float,
+        parent: int | None,
+        before: tuple[int, Float64] | None = None,
+    ) -> None:
         count = self._config.features
         places = PLACE_FEATURES if self._closer is not None else 0
         place = find_place_features(view.rgb, view.depth_m, places) if places else view.features(count)
@@ -272,9 +309,9 @@ class OdometryPoseSource:
         self._counts["keyframes"] += 1
         keyframe = OdometryKeyframe(number, Target(view.levels, pose), view.features(count), place, way_m)
         if self._closer is not None:
-            self._closer.add(keyframe, parent)
+            self._closer.add(keyframe, parent, before)
         self._trail.add(view.stamp_ns, number, pose, pose)
-        known = {k.number: k.target.T_world_camera for k in self._map.frames}
+        known = self._keyframe_poses()
         gone = self._map.add(keyframe)
         if gone is not None and self._closer is not None:
             self._trail.hand_over(*gone, invert_pose(known[gone[1]]) @ known[gone[0]])

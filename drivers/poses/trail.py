@@ -13,7 +13,6 @@ from semantic_mapper.types import Float64
 _KEPT = 20_000  # poses; 2 x 128 bytes each
 _VISIBLE_M = 0.02  # no correction for less; what is left is given at the end
 _LEFT_M = 0.002
-_PAUSE_NS = 2_000_000_000  # between two corrections: each is work for the map
 
 
 class PoseTrail:
@@ -24,8 +23,6 @@ class PoseTrail:
         self._keyframes: list[int] = []
         self._relative: list[Float64] = []  # T_keyframe_camera
         self._given: list[Float64] = []  # T_world_camera, as of the last correction
-        self._last_ns: int | None = None  # of the last correction
-        self._moved = False
 
     def add(self, stamp_ns: int, keyframe: int, T_world_keyframe: Float64, T_world_camera: Float64) -> None:
         """A pose is given."""
@@ -44,25 +41,19 @@ class PoseTrail:
                 self._keyframes[row] = heir
                 self._relative[row] = T_heir_gone @ self._relative[row]
 
-    def keyframes_moved(self) -> None:
-        """A correction may be due."""
-        self._moved = True
-
     def correction(self, T_world_keyframe: Mapping[int, Float64], final: bool) -> CorrectedWorld | None:
-        """All poses as the keyframes stand now, if that moves one visibly; none within a while of the last.
+        """All poses as the keyframes stand now, if that moves one visibly.
 
         Args:
             T_world_keyframe: (4, 4) of the keyframes that are kept, by number.
             final: No more poses will come.
         """
-        now_ns = self._stamps[-1] if self._stamps else 0
-        recent = self._last_ns is not None and now_ns - self._last_ns < _PAUSE_NS
-        if not self._moved or not self._stamps or (recent and not final):
+        if not self._stamps:
             return None
         poses = np.array([T_world_keyframe[n] for n in self._keyframes]) @ np.array(self._relative)
         moved_m = float(np.linalg.norm(poses[:, :3, 3] - np.array(self._given)[:, :3, 3], axis=1).max())
         if moved_m < (_LEFT_M if final else _VISIBLE_M):
             return None
         motion = poses[-1] @ invert_pose(self._given[-1])
-        self._given, self._moved, self._last_ns = list(poses), False, now_ns
-        return CorrectedWorld(dict(zip(self._stamps, poses, strict=True)), now_ns, motion)
+        self._given = list(poses)
+        return CorrectedWorld(dict(zip(self._stamps, poses, strict=True)), self._stamps[-1], motion)

@@ -62,6 +62,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         options.voxel_size_m or None,
         depth=options.depth or None,
         live=options.delivery == "newest",
+        history_frames=options.history_frames,
     )
     bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
     taken_up = take_up(context, Path(options.out) / MAP_NAME, bundle.pipeline.voxel_map)
