@@ -94,6 +94,8 @@ class BoardPoses(Config, frozen=True):
 class OdometryPoses(Config, frozen=True):
     """RGB-D odometry: each frame is aligned to several keyframes; the world begins at the first frame."""
 
+    old_names: ClassVar = {"huber_m": "noise_m"}
+
     kind: Literal["rgbd"] = "rgbd"
     T_world_start: Matrix = IDENTITY  # T_world_camera of the first frame
     width: AtLeastOne = 320  # images are thinned out to about this
