@@ -203,3 +203,9 @@ def test_the_most_crowded_keyframe_goes_and_old_ones_are_preferred() -> None:
     assert [k.way_m for k in made.near(rigid(shift=(9, 0, 0)), 3)] == [1.8]
     way, turn = made.distances(rigid((0, 0.2, 0), (0, 1.0, 0)))
     assert way[0] == pytest.approx(1.0) and turn[0] == pytest.approx(0.2)
+
+
+def test_same_images_same_poses_bit_for_bit() -> None:
+    frames = [as_image(f) for f in walk(noise=True)[:15]]
+    one, other = (poses_of(follow(frames, started())) for _ in range(2))
+    assert np.array_equal(one, other)
