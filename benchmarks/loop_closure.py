@@ -179,7 +179,7 @@ def measure(frames: Sequence[PosedFrame], truth: Float64, config: OdometryPoses)
 def main() -> None:
     """Run it, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[200_000, 200_001, 200_003, 200_005, 200_006])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[200_000, 200_001, 200_003, 200_005])
     parser.add_argument("--area", type=float, default=32.0, help="of a storey, square metres")
     parser.add_argument("--json", type=Path, help="the figures, for programs")
     given = parser.parse_args()
