@@ -27,19 +27,21 @@ from semantic_mapper.types import Float64, PosedFrame
 
 @dataclass(slots=True)
 class Run:
-    """What the odometry made of a log; rows of NaN where it was lost."""
+    """What the odometry made of a log; rows of NaN where it was lost. ``estimated``: after all corrections."""
 
     estimated: list[Float64] = field(default_factory=list)
+    as_they_came: list[Float64] = field(default_factory=list)
     given: list[Float64] = field(default_factory=list)
     sigma_m: list[float] = field(default_factory=list)
     clock_ms: list[float] = field(default_factory=list)
     processor_ms: list[float] = field(default_factory=list)
+    corrections: int = 0
     counters: dict[str, int] = field(default_factory=dict)
 
 
-def follow(frames: Sequence[PosedFrame], config: OdometryPoses, writer: LogWriter | None) -> Run:
-    """Run the odometry from the log's first pose on; frames that get a pose are written, if there is a writer."""
-    run = Run()
+def follow(frames: Sequence[PosedFrame], config: OdometryPoses) -> Run:
+    """Run the odometry from the log's first pose on."""
+    run, better = Run(), dict[int, Float64]()
     rows = tuple(tuple(float(v) for v in row) for row in frames[0].T_world_camera)
     settings = {**to_plain(config), "T_world_start": rows}
     with OdometryPoseSource(convert_config(settings, OdometryPoses, "odometry")) as odometry:
@@ -47,14 +49,17 @@ def follow(frames: Sequence[PosedFrame], config: OdometryPoses, writer: LogWrite
             image = CameraImage(frame.stamp_ns, frame.seq, frame.camera_id, frame.rgb, frame.depth_m, frame.intrinsics)
             clock, processor = time.perf_counter(), time.process_time()
             estimate = odometry.pose(image)
+            corrected = odometry.correction()
             run.processor_ms.append((time.process_time() - processor) * 1e3)
             run.clock_ms.append((time.perf_counter() - clock) * 1e3)
             run.given.append(frame.T_world_camera)
-            run.estimated.append(np.full((4, 4), np.nan) if estimate is None else estimate.T_world_camera)
+            run.as_they_came.append(np.full((4, 4), np.nan) if estimate is None else estimate.T_world_camera)
             run.sigma_m.append(0.0 if estimate is None else estimate.sigma)
-            if writer is not None and estimate is not None:
-                pose, source = estimate.T_world_camera, estimate.source
-                writer.write_frame(replace(frame, T_world_camera=pose, pose_source=source, pose_sigma=estimate.sigma))
+            better |= {} if corrected is None else corrected.poses
+            run.corrections += corrected is not None
+        corrected = odometry.correction(final=True)
+        better |= {} if corrected is None else corrected.poses
+    run.estimated = [better.get(f.stamp_ns, pose) for f, pose in zip(frames, run.as_they_came, strict=True)]
     run.counters = dict(odometry.counters)
     return run
 
@@ -65,6 +70,7 @@ def report(run: Run) -> dict[str, Any]:
     known = np.isfinite(estimated[:, 0, 0])
     e, g = estimated[known], given[known]
     path = float(np.linalg.norm(np.diff(given[:, :3, 3], axis=0), axis=1).sum())
+    came = np.array(run.as_they_came)[known]
     at_end = float(np.linalg.norm(e[-1, :3, 3] - g[-1, :3, 3]))
     sigma = np.array(run.sigma_m)[known]
     off = np.linalg.norm(e[:, :3, 3] - g[:, :3, 3], axis=1)
@@ -74,6 +80,8 @@ def report(run: Run) -> dict[str, Any]:
         "path_m": path,
         **run.counters,
         "ate_m": {name: value for name, value in absolute.items() if name != "rmse_deg"},  # of positions alone
+        "ate_as_they_came_m": absolute_trajectory_error(came, g).rmse_m,
+        "corrections": run.corrections,
         "end_without_alignment_m": at_end,
         "off_by_at_most_3_sigma_share": float((off[1:] <= 3 * sigma[1:]).mean()),
         "rpe_frame": asdict(relative_pose_error(e, g, 1)),
@@ -108,11 +116,13 @@ def main() -> None:
     config = convert_config(settings, OdometryPoses, str(given.config))
     with LogReader(given.log) as log:
         frames = list(log)[:: given.every][: given.max_frames or None]
-        if given.write is None:
-            run = follow(frames, config, None)
-        else:
+        run = follow(frames, config)
+        if given.write is not None:
             with LogWriter(given.write, log.info, overwrite=True) as writer:
-                run = follow(frames, config, writer)
+                for frame, pose, sigma in zip(frames, run.estimated, run.sigma_m, strict=True):
+                    if np.isfinite(pose).all():
+                        changes = {"T_world_camera": pose, "pose_source": "odometry", "pose_sigma": sigma}
+                        writer.write_frame(replace(frame, **changes))
     figures = report(run)
     print(json.dumps(figures, indent=1))
     if given.json is not None:

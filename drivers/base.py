@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
@@ -54,6 +54,21 @@ class PoseEstimate:
     source: str
     sigma: float = 0.0
     world: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedWorld:
+    """What a pose source thinks now of where the camera was: the world of the poses to come.
+
+    Args:
+        poses: T_world_camera (4, 4) by stamp of the image, of as many of the past images as it remembers.
+        until_ns: Stamp of the last image whose pose was of the world before.
+        motion: (4, 4) what takes the last of these poses from the world before to this one.
+    """
+
+    poses: Mapping[int, Float64]
+    until_ns: int
+    motion: Float64
 
 
 @dataclass(frozen=True, slots=True, eq=False)

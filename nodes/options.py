@@ -16,6 +16,7 @@ POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd", "visual")
 TRACKING_KINDS = ("oak",)  # cameras that can tell their own pose
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
 ENDPOINT_NAME_PATTERN = r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+)\Z"  # a socket of the launch, or an endpoint
+NAME_OR_ENDPOINT = r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+|)\Z"
 
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**31 - 1)]
@@ -74,6 +75,9 @@ class CameraOptions(Config, frozen=True):
     subscriber_timeout_s: Positive = 180.0  # how long the others may take to start
     # How long a mapper that is waited for (lockstep, fast, a video) may take for one frame; the first one compiles.
     ack_timeout_s: Positive = 300.0
+    # Where the mapper answers (its `query`), for poses that close loops (`rgbd`): it moves its map with them, if it
+    # keeps a history. Empty = nowhere, and the map stays as it is.
+    corrections: Annotated[str, msgspec.Meta(pattern=NAME_OR_ENDPOINT)] = ""
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
@@ -106,6 +110,7 @@ class MapperOptions(Config, frozen=True):
     # A saved map, or a folder with one, to go on in, with its settings: frames are held until their place in it is
     # known (30 at most); empty = a new map.
     map: str = ""
+    history_frames: Count = 0  # kept on disk for closed loops, where the config does not say how many
     eval_exclude: str = ""  # weights whose finetuning frames are left out of the scores, too
     rerun: str = ""  # write a Rerun recording there; empty = none
     # Also write the map of the moment to ``map.npz`` in ``out`` every n seconds, beside mapping: what a killed
@@ -120,7 +125,7 @@ class MapperOptions(Config, frozen=True):
     # Where questions about the map are answered: a name, or an endpoint (ipc://PATH, tcp://127.0.0.1:PORT; with keys
     # also tcp://0.0.0.0:PORT, for other machines); empty = nowhere. A name stands for a socket among those of the
     # launch, or of this user where the node is started by hand.
-    query: Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+|)\Z")] = "query"
+    query: Annotated[str, msgspec.Meta(pattern=NAME_OR_ENDPOINT)] = "query"
 
     # The node of kind "finetuner" whose weights are taken while mapping, if they are better; empty = none.
     learner: str = ""

@@ -94,13 +94,15 @@ class BoardPoses(Config, frozen=True):
 class OdometryPoses(Config, frozen=True):
     """RGB-D odometry: each frame is aligned to several keyframes; the world begins at the first frame."""
 
+    old_names: ClassVar = {"huber_m": "noise_m"}
+
     kind: Literal["rgbd"] = "rgbd"
     T_world_start: Matrix = IDENTITY  # T_world_camera of the first frame
     width: AtLeastOne = 320  # images are thinned out to about this
     depth_max_m: Positive = 4.0
     iterations: tuple[AtLeastOne, ...] = (20, 15, 10)  # at most, from the coarsest level, each half as wide as the next
     outlier_m: Positive = 0.07  # points further than this from the surface do not count
-    huber_m: Positive = 0.05  # beyond this a distance counts less
+    noise_m: Positive = 0.009  # of depth at 1 m, growing with its square; beyond this a distance counts less
     neighbours: AtLeastOne = 3  # keyframes that a frame is aligned to
     keyframe_m: Positive = 0.35  # a new one when moved this far from the nearest, or ...
     keyframe_deg: Positive = 20.0  # ... turned this far, or ...
@@ -115,6 +117,7 @@ class OdometryPoses(Config, frozen=True):
     min_matches: Annotated[int, msgspec.Meta(ge=6)] = 15  # consistent ones, for a guess
     relocalise_keyframes: AtLeastOne = 20  # tried for each image while lost, in turn
     drift: Fraction = 0.05  # of the way: what ``sigma`` grows by with the chain of keyframes
+    loop_closure: bool = True  # where the camera comes back to a place, correct the way in between, and the map with it
 
 
 class VisualPoses(Config, frozen=True):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,14 +19,22 @@ class OdometryKeyframe:
     """One.
 
     Args:
+        number: Counts keyframes.
         target: What views are aligned to.
         features: For finding back.
+        place: For loop closure.
         way_m: Length of the shortest chain of keyframes back to the first one: errors add up along it.
     """
 
+    number: int
     target: Target
     features: Features
+    place: Features
     way_m: float
+
+    def moved(self, T_world_camera: Float64) -> OdometryKeyframe:
+        """The same at another pose."""
+        return replace(self, target=replace(self.target, T_world_camera=T_world_camera))
 
 
 class KeyframeMap:
@@ -44,11 +53,23 @@ class KeyframeMap:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def add(self, keyframe: OdometryKeyframe) -> None:
-        """Append one."""
+    def add(self, keyframe: OdometryKeyframe) -> tuple[int, int] | None:
+        """Append one; the number of the one that had to go, and of that nearest to it, or None."""
         self.frames.append(keyframe)
+        gone: tuple[int, int] | None = None
         if len(self.frames) > self._capacity:
-            del self.frames[self._most_crowded()]
+            heir, leaving = self._most_crowded()
+            gone = self.frames[leaving].number, self.frames[heir].number
+            del self.frames[leaving]
+        self._place()
+        return gone
+
+    def move(self, poses: Mapping[int, Float64]) -> None:
+        """Put keyframes at other poses, by number."""
+        self.frames = [k.moved(poses[k.number]) for k in self.frames]
+        self._place()
+
+    def _place(self) -> None:
         poses = np.array([k.target.T_world_camera for k in self.frames])
         self._positions, self._rotations = poses[:, :3, 3], poses[:, :3, :3]
 
@@ -70,10 +91,11 @@ class KeyframeMap:
         others = [i for i in np.flatnonzero(apart < 1) if i != nearest]
         return [self.frames[i] for i in (nearest, *others[: count - 1])]
 
-    def _most_crowded(self) -> int:
-        """Index of the younger of the two frames nearest to each other; never the newest, which is in use."""
+    def _most_crowded(self) -> tuple[int, int]:
+        """Indices of the two frames nearest to each other, the older first; never the newest, which is in use."""
         poses = np.array([k.target.T_world_camera for k in self.frames[:-1]])
         turn = np.arccos(np.clip((np.einsum("nij,mij->nm", poses[:, :3, :3], poses[:, :3, :3]) - 1) / 2, -1, 1))
         way = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=-1)
         apart = np.hypot(way / _REACH_M, turn / _REACH_RAD) + np.diag(np.full(len(poses), np.inf))
-        return int(max(np.unravel_index(int(apart.argmin()), apart.shape)))
+        a, b = np.unravel_index(int(apart.argmin()), apart.shape)
+        return int(min(a, b)), int(max(a, b))

@@ -1,40 +1,45 @@
 """RGB-D odometry: where a camera with depth went, from its images alone.
 
-Each view is aligned to keyframes, not to the view before, so that errors add up from keyframe to keyframe only, and not
-at all where the camera comes back to old ones. The first guess goes on with the last motion; where that leads nowhere,
-corners that view and keyframe share give another. A view that lies on no keyframe is lost: no pose, until its corners
-are found in a keyframe again.
+Each view is aligned to keyframes, not to the view before, so that errors add up from keyframe to keyframe only. Where
+the camera comes back to old ones, a pose graph takes the errors back (``loop_closure``). The first guess goes on with
+the last motion; where that leads nowhere, corners that view and keyframe share give another. A view that lies on no
+keyframe is lost: no pose, until its corners are found in a keyframe again.
 
-Open3D sums over points in an order that its threads decide, so poses of two runs differ in their last digits (some
-micrometres); a log keeps the poses that were used.
+Same images, same poses and corrections, bit for bit.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
 import cv2
 import numpy as np
 
-from semantic_mapper.drivers.base import CameraImage, PoseEstimate
-from semantic_mapper.drivers.poses.alignment import Aligner, Fit, Target, fit
+from semantic_mapper.drivers.base import CameraImage, CorrectedWorld, PoseEstimate
+from semantic_mapper.drivers.poses.alignment import Fit, Target, align, fit
 from semantic_mapper.drivers.poses.config import OdometryPoses, matrix
 from semantic_mapper.drivers.poses.depth_view import Level, make_levels, thin_depth, thinned
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
+from semantic_mapper.drivers.poses.loop_closure import PLACE_FEATURES, LoopCloser
 from semantic_mapper.drivers.poses.motion import StampedPose
+from semantic_mapper.drivers.poses.pose_graph import between
 from semantic_mapper.drivers.poses.still import WAYS_OUT
+from semantic_mapper.drivers.poses.trail import PoseTrail
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
-from semantic_mapper.localization.features import Features, find_features, pose_from_features
+from semantic_mapper.localization.features import Features, find_features, find_place_features, pose_from_features
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
+_JUMP_M = 0.06  # from where the last motion leads, where another keyframe is nearest than for the last image
+_PAUSE_NS = 2_000_000_000  # between two corrections: each is work for the map
 
 _log = get_logger(__name__)
 
@@ -63,22 +68,29 @@ class OdometryPoseSource:
         config: How.
 
     Attributes:
-        counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
+        counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made; with
+            ``loop_closure`` "loops_closed" and "loops_refused".
     """
 
     def __init__(self, config: OdometryPoses) -> None:
         self._config = config
-        self._aligner = Aligner(config)
         self._map = KeyframeMap(config.max_keyframes)
         self._camera: tuple[str, CameraIntrinsics] | None = None
         self._past: list[StampedPose] = []  # the last two poses
         self._lost = False
         self._next_try = 0  # keyframe that is tried next while lost
         self._warnings: tuple[str, ...] = ()
-        self.counters: Counter[str] = Counter()
+        self._closer = LoopCloser(config) if config.loop_closure else None
+        self._trail = PoseTrail()
+        self._corrected: CorrectedWorld | None = None
+        self._closed_ns = -_PAUSE_NS
+        self._nearest = -1  # keyframe that the last image was aligned to first
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Totals; see the class."""
+        return Counter(self._counts) if self._closer is None else self._counts + self._closer.counters
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -105,6 +117,7 @@ class OdometryPoseSource:
             CameraError: the camera has no depth, or images of another camera come in between.
         """
         self._check(image)
+        self._close_loops(image.stamp_ns)
         view = self._view(image)
         if view is None:
             return self._lose("it has hardly any depth")
@@ -114,8 +127,41 @@ class OdometryPoseSource:
         for guess, targets in guesses:
             found = self._try(view, guess, targets)
             if found is not None:
-                return self._accept(view, *found)
+                return self._accept(view, targets[0], *found)
         return self._lose("it lies on no keyframe")
+
+    def correction(self, final: bool = False) -> CorrectedWorld | None:
+        """New poses of past images since loops were closed, or None; to be asked for after each ``pose``.
+
+        Args:
+            final: No more images will come: finish what is under way.
+        """
+        while final and self._closer is not None and self._closer.busy:
+            self._close_loops(None)
+        if final:
+            self._corrected = self._trail.correction(self._keyframe_poses(), final) or self._corrected
+        corrected, self._corrected = self._corrected, None
+        return corrected
+
+    def _close_loops(self, stamp_ns: int | None) -> None:
+        """Look at one candidate; where keyframes move, the last poses move along, at most once in a while."""
+        if self._closer is None:
+            return
+        due = stamp_ns is None or stamp_ns - self._closed_ns > _PAUSE_NS
+        poses = self._closer.work(optimize=due)
+        if poses is None:
+            return
+        self._closed_ns = self._closed_ns if stamp_ns is None else stamp_ns
+        self._past = [replace(past, T=self._moved(past.T, poses)) for past in self._past]
+        self._map.move(poses)
+        self._corrected = self._trail.correction(self._keyframe_poses(), final=False) or self._corrected
+
+    def _keyframe_poses(self) -> dict[int, Float64]:
+        return {k.number: k.target.T_world_camera for k in self._map.frames}
+
+    def _moved(self, T_world_camera: Float64, poses: Mapping[int, Float64]) -> Float64:
+        nearest = self._map.near(T_world_camera, 1)[0]
+        return poses[nearest.number] @ invert_pose(nearest.target.T_world_camera) @ T_world_camera
 
     def _check(self, image: CameraImage) -> None:
         camera = (image.camera_id, image.intrinsics)
@@ -149,20 +195,24 @@ class OdometryPoseSource:
 
     def _begin(self, view: _View) -> PoseEstimate:
         pose = matrix(self._config.T_world_start)
-        self._add_keyframe(view, pose, 0.0)
+        self._add_keyframe(view, pose, 0.0, None)
         self._past = [StampedPose(view.stamp_ns, pose)]
-        self.counters["tracked"] += 1
+        self._counts["tracked"] += 1
         return PoseEstimate(pose, "odometry", 0.0)
 
     def _guesses(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
         """The last motion gone on with, and what corners say; that first which lies better on the nearest keyframe."""
-        guess = self._past[-1].T
-        if len(self._past) > 1:
-            a, b = self._past
-            guess = interpolate_pose(a.T, b.T, min((view.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
+        guess = self._expected(view.stamp_ns)
         near = self._map.near(guess, self._config.neighbours)
         guesses = [(guess, near), *self._guesses_of_features(view, near)]
-        return sorted(guesses, key=lambda g: fit(view.levels, g[1][0].target, g[0], self._config.outlier_m).cost_m)
+        return sorted(guesses, key=lambda g: fit(self._config, view.levels, g[1][0].target, g[0]).cost_m)
+
+    def _expected(self, stamp_ns: int) -> Float64:
+        """Where the last motion leads."""
+        if len(self._past) < 2:
+            return self._past[-1].T
+        a, b = self._past
+        return interpolate_pose(a.T, b.T, min((stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
 
     def _guesses_while_lost(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
         """What corners say of keyframes near the last pose, then of the others, this many an image in turn."""
@@ -191,16 +241,16 @@ class OdometryPoseSource:
 
     def _try(self, view: _View, guess: Float64, keyframes: list[OdometryKeyframe]) -> tuple[Float64, list[Fit]] | None:
         """Align a view to keyframes; None where the result cannot be believed."""
-        fits = [fit(view.levels, k.target, guess, self._config.outlier_m) for k in keyframes]
+        fits = [fit(self._config, view.levels, k.target, guess) for k in keyframes]
         targets = [
             k.target
             for number, (k, f) in enumerate(zip(keyframes, fits, strict=True))
             if number == 0 or f.overlap >= self._config.min_overlap
         ]
-        pose = self._aligner.align(view.levels, targets, guess)
+        pose = align(self._config, view.levels, targets, guess)
         if pose is None or not self._is_near(guess, pose):
             return None
-        fits = [fit(view.levels, t, pose, self._config.outlier_m) for t in targets]
+        fits = [fit(self._config, view.levels, t, pose) for t in targets]
         return (pose, fits) if self._lies_on(fits[0]) else None
 
     def _is_near(self, guess: Float64, pose: Float64) -> bool:
@@ -215,36 +265,68 @@ class OdometryPoseSource:
             and found.rmse_m <= self._config.max_rmse_m
         )
 
-    def _accept(self, view: _View, pose: Float64, fits: list[Fit]) -> PoseEstimate:
+    def _accept(self, view: _View, nearest: OdometryKeyframe, pose: Float64, fits: list[Fit]) -> PoseEstimate:
         if self._lost:
-            self.counters["relocalised"] += 1
+            self._counts["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
             self._past = []
+        jumped = self._jump(view, nearest, pose)
         self._lost, self._warnings = False, ()
-        self.counters["tracked"] += 1
+        self._counts["tracked"] += 1
         self._past = [*self._past[-1:], StampedPose(view.stamp_ns, pose)]
         way, turn = self._map.distances(pose)
         reach = np.maximum(way / self._config.keyframe_m, np.rad2deg(turn) / self._config.keyframe_deg)
         way_m = float(min(k.way_m + d for k, d in zip(self._map.frames, way, strict=True)))
-        if reach.min() > 1 or fits[0].overlap < self._config.keyframe_overlap:
-            self._add_keyframe(view, pose, way_m)
+        if reach.min() > 1 or fits[0].overlap < self._config.keyframe_overlap or jumped is not None:
+            self._add_keyframe(view, pose, way_m, nearest.number, jumped)
+        else:
+            self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
         return PoseEstimate(pose, "odometry", _sigma(fits, self._config.drift * way_m))
 
-    def _add_keyframe(self, view: _View, pose: Float64, way_m: float) -> None:
-        features = view.features(self._config.features)
-        self._map.add(OdometryKeyframe(Target(view.levels, pose), features, way_m))
-        self.counters["keyframes"] += 1
+    def _jump(self, view: _View, nearest: OdometryKeyframe, pose: Float64) -> tuple[int, Float64] | None:
+        """Where another keyframe has taken the camera off its way: the one before, and the way expected from it."""
+        before, self._nearest = self._nearest, nearest.number
+        known = self._keyframe_poses()
+        if self._closer is None or self._lost or before == nearest.number or before not in known or not self._past:
+            return None
+        expected = self._expected(view.stamp_ns)
+        if between(expected, pose)[0] < _JUMP_M:
+            return None
+        return before, invert_pose(known[before]) @ expected
+
+    def _add_keyframe(
+        self,
+        view: _View,
+        pose: Float64,
+        way_m: float,
+        parent: int | None,
+        before: tuple[int, Float64] | None = None,
+    ) -> None:
+        count = self._config.features
+        places = PLACE_FEATURES if self._closer is not None else 0
+        place = find_place_features(view.rgb, view.depth_m, places) if places else view.features(count)
+        number = self._counts["keyframes"]
+        self._counts["keyframes"] += 1
+        keyframe = OdometryKeyframe(number, Target(view.levels, pose), view.features(count), place, way_m)
+        if self._closer is not None:
+            self._closer.add(keyframe, parent, before)
+        self._trail.add(view.stamp_ns, number, pose, pose)
+        known = self._keyframe_poses()
+        gone = self._map.add(keyframe)
+        if gone is not None and self._closer is not None:
+            self._trail.hand_over(*gone, invert_pose(known[gone[1]]) @ known[gone[0]])
+            self._closer.remove(*gone)
 
     def _lose(self, reason: str) -> None:
         if not self._lost:
             _log.warning("odometry_lost", reason=reason)
         self._lost = True
         self._warnings = (f"the odometry is lost ({reason}); show the camera a place that it has seen before",)
-        self.counters["lost"] += 1
+        self._counts["lost"] += 1
 
 
 def _sigma(fits: list[Fit], drift_m: float) -> float:
     """One-sigma uncertainty of the position in metres: of the points' noise, and of the keyframes' own poses."""
-    total = sum((f.normal_matrix / max(f.rmse_m, 1e-3) ** 2 for f in fits), np.zeros((6, 6))) / _POINTS_A_VOTE
+    total = sum((f.normal_matrix / max(f.noise_m, 1e-3) ** 2 for f in fits), np.zeros((6, 6))) / _POINTS_A_VOTE
     covariance = np.linalg.pinv(total)[3:, 3:]
     return float(np.hypot(np.sqrt(max(np.trace(covariance), 0.0) / 3), drift_m))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from semantic_mapper.drivers.poses.config import PoseChecks
 from semantic_mapper.drivers.poses.motion import StampedPose
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import Float64, PosedFrame
 
 FAR = 2.0  # times what is allowed: a jump, whatever comes after it
 HELD = 3  # times ``init_consensus``: this many frames are held back at most while the first poses do not agree
@@ -57,6 +57,10 @@ class PoseOutlierFilter:
             return verdict
         reason = self._jumps.refusal(_sample(frame))
         return FilterResult(outliers=((frame, reason),)) if reason else FilterResult((frame,))
+
+    def follow(self, motion: Float64) -> None:
+        """The world of the poses to come is another one: ``motion`` (4, 4) takes the last pose there."""
+        self._jumps.follow(motion)
 
     def end(self) -> FilterResult:
         """No more will come: what is held back passes where no pose has contradicted it."""
@@ -136,6 +140,13 @@ class _JumpGate:
     def believe(self, sample: StampedPose) -> None:
         """Go on from here."""
         self._last, self._elsewhere, self._agreeing = sample, None, 0
+
+    def follow(self, motion: Float64) -> None:
+        """See ``PoseOutlierFilter``."""
+        if self._last is not None:
+            self._last = replace(self._last, T=motion @ self._last.T)
+        if self._elsewhere is not None:
+            self._elsewhere = replace(self._elsewhere, T=motion @ self._elsewhere.T)
 
     def refusal(self, sample: StampedPose) -> str:
         """Why a pose is refused; empty where it passes."""

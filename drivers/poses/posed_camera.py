@@ -12,7 +12,7 @@ from typing import Protocol, Self, runtime_checkable
 import msgspec
 import numpy as np
 
-from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
+from semantic_mapper.drivers.base import Camera, CameraImage, CorrectedWorld, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import PoseChecks
 from semantic_mapper.drivers.poses.outlier_filter import FilterResult, PoseOutlierFilter
 from semantic_mapper.errors import PoseError, ShapeError
@@ -40,6 +40,15 @@ class DiagnosticPoseSource(PoseSource, Protocol):
     @property
     def counters(self) -> dict[str, int]:
         """Totals since it was opened, by name."""
+        ...
+
+
+@runtime_checkable
+class CorrectingPoseSource(PoseSource, Protocol):
+    """A pose source that closes loops."""
+
+    def correction(self, final: bool = False) -> CorrectedWorld | None:
+        """New poses of past images, once after each change; ``final``: no more images will come."""
         ...
 
 
@@ -85,6 +94,7 @@ class PosedCamera:
         self._gates: dict[str, PoseOutlierFilter] = {}
         self._last_ns: dict[str, int] = {}
         self._trouble = ""
+        self._corrected: CorrectedWorld | None = None
 
     @property
     def info(self) -> StreamInfo:
@@ -139,6 +149,19 @@ class PosedCamera:
         """End the iteration soon, from any thread or signal handler."""
         self._camera.stop()
 
+    def correction(self, final: bool = False) -> CorrectedWorld | None:
+        """Better poses of past frames, since the pose source has closed a loop; None where nothing has changed.
+
+        To be asked for after each frame, which then is of the corrected world.
+
+        Args:
+            final: No more frames are wanted.
+        """
+        if final:
+            self._follow_correction(final=True)
+        corrected, self._corrected = self._corrected, None
+        return corrected
+
     def __iter__(self) -> Iterator[PosedFrame]:
         """Frames in the order of capture.
 
@@ -147,6 +170,7 @@ class PosedCamera:
         """
         for image in self._camera:
             estimate = self._checked_pose(image)
+            self._follow_correction()
             if estimate is not None:
                 if self._worlds.setdefault(image.camera_id, estimate.world) != estimate.world:
                     self._worlds[image.camera_id] = estimate.world
@@ -158,6 +182,19 @@ class PosedCamera:
                 yield from self._passed(gate.take(_frame(image, estimate)), image.camera_id)
         for camera_id, gate in self._gates.items():
             yield from self._passed(gate.end(), camera_id)
+
+    def _follow_correction(self, final: bool = False) -> None:
+        if not isinstance(self._poses, CorrectingPoseSource):
+            return
+        corrected = self._poses.correction(final)
+        if corrected is None:
+            return
+        for gate in self._gates.values():
+            gate.follow(corrected.motion)
+        if self._T_rig_camera is not None:
+            cameras = {stamp_ns: pose @ self._T_rig_camera for stamp_ns, pose in corrected.poses.items()}
+            corrected = replace(corrected, poses=cameras)
+        self._corrected = corrected
 
     def _checked_pose(self, image: CameraImage) -> PoseEstimate | None:
         if image.stamp_ns <= self._last_ns.get(image.camera_id, -1):

@@ -32,7 +32,6 @@ def open_poses(config: Mapping[str, Any], where: str = "poses") -> DiagnosticPos
 
     Raises:
         ConfigError: no such kind, an unknown or bad setting, or a matrix that is no rigid transform.
-        DependencyError: "rgbd", and Open3D cannot be loaded.
     """
     return make_poses(read_pose_config(config, where))
 

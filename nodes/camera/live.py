@@ -22,8 +22,9 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions, LiveCamera
 
 if TYPE_CHECKING:
-    from semantic_mapper.drivers.base import Camera, FrameSource
+    from semantic_mapper.drivers.base import Camera, CorrectedWorld, FrameSource
     from semantic_mapper.drivers.mounts import Mount
+    from semantic_mapper.nodes.camera.corrections import CorrectionSender
     from semantic_mapper.transport.framing import Parts
     from semantic_mapper.transport.messages import EndReason, NodeState
     from semantic_mapper.transport.sockets import Publisher
@@ -54,6 +55,10 @@ if TYPE_CHECKING:
 
         def stop(self) -> None:
             """As of ``Camera``."""
+            ...
+
+        def correction(self, final: bool = False) -> CorrectedWorld | None:
+            """As of ``PosedCamera``."""
             ...
 
 
@@ -91,8 +96,10 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
             if source is None:
                 return
             _listeners(context, options, publisher)
+            sender = _correction_sender(context, options, live, stack)
+            reporter.sender = sender
             with reporter.watching_driver():
-                _publish(context, options, publisher, reporter, source)
+                _publish(context, options, publisher, reporter, source, sender)
         context.heartbeat.ending()
         drain(context, publisher)
 
@@ -205,8 +212,25 @@ def _listeners(context: NodeContext, options: CameraOptions, publisher: Publishe
         _log.warning("some_do_not_listen", reason=str(error))
 
 
+def _correction_sender(
+    context: NodeContext, options: CameraOptions, live: LiveCamera, stack: ExitStack
+) -> CorrectionSender | None:
+    """Takes closed loops to the mapper, where the options name one; ``stack`` ends it."""
+    from semantic_mapper.nodes.camera.corrections import CorrectionSender
+
+    named = options.corrections
+    if not named:
+        return None
+    return stack.enter_context(CorrectionSender(named if "://" in named else context.endpoint(named), live.id))
+
+
 def _publish(
-    context: NodeContext, options: CameraOptions, publisher: Publisher, reporter: _StatusReporter, source: LiveSource
+    context: NodeContext,
+    options: CameraOptions,
+    publisher: Publisher,
+    reporter: _StatusReporter,
+    source: LiveSource,
+    sender: CorrectionSender | None,
 ) -> None:
     from semantic_mapper.transport.codec import encode, encode_frame
     from semantic_mapper.transport.messages import EndOfStream
@@ -222,8 +246,10 @@ def _publish(
             if not _send_frame(context, options, publisher, encode_frame(frame)):
                 break
             reporter.sent(frame)
+            _correct(source, sender)
             if options.max_frames and reporter.published >= options.max_frames:
                 break
+        _correct(source, sender, final=True)
         reason, detail = ("stopped" if context.stop else "end"), ""
     except CameraError as error:
         detail = str(error)
@@ -232,6 +258,15 @@ def _publish(
         if reason != "error" or not context.restartable:  # else the stream goes on with the process after this one
             _send_end(publisher, encode(EndOfStream(context.name, reason, reporter.published, detail)))
         _log.info("published", frames=reporter.published, reason=reason)
+
+
+def _correct(source: LiveSource, sender: CorrectionSender | None, *, final: bool = False) -> None:
+    """Hand on what closed loops have changed, if anything."""
+    if sender is None:
+        return
+    corrected = source.correction(final)
+    if corrected is not None:
+        sender.put(corrected)
 
 
 def _send_frame(context: NodeContext, options: CameraOptions, publisher: Publisher, parts: Parts) -> bool:
@@ -270,6 +305,7 @@ class _StatusReporter:
     def __init__(self, context: NodeContext, publisher: Publisher) -> None:
         self.published = 0
         self.waiting_for = ""  # why the camera could not be opened yet
+        self.sender: CorrectionSender | None = None
         self._context = context
         self._publisher = publisher
         self._source: LiveSource | None = None
@@ -336,7 +372,8 @@ class _StatusReporter:
             return "stopping"
         if self._source is None:
             return "starting"
-        return "degraded" if self._source.warnings else "running"
+        sender = () if self.sender is None else self.sender.warnings
+        return "degraded" if self._source.warnings or sender else "running"
 
     def _tell(self, state: NodeState) -> None:
         from semantic_mapper.transport.codec import encode
@@ -349,6 +386,9 @@ class _StatusReporter:
         if self._source is not None:
             counters |= self._source.counters
             warnings = self._source.warnings
+        if self.sender is not None:
+            counters |= self.sender.counters
+            warnings = (*warnings, *self.sender.warnings)
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, warnings)
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did

@@ -144,6 +144,7 @@ def mapper_config(
     depth: DepthSource | None = None,
     delay_frames: int = 0,
     live: bool = False,
+    history_frames: int = 0,
 ) -> MapperConfig:
     """The mapper's config from a TOML file (None = defaults) with what the command line says on top.
 
@@ -152,6 +153,7 @@ def mapper_config(
         voxel_size_m, seed, quality, depth: What the command line says, None = nothing.
         delay_frames: How many later frames one may wait for whose depth is computed, where the file does not say it.
         live: No frame waits for the bundle of poses.
+        history_frames: Kept for corrections, where the file does not say it; 0 = none.
 
     Raises:
         ConfigError: see ``load_config`` and ``check_quality``.
@@ -167,6 +169,9 @@ def mapper_config(
     if "delay_frames" not in data.get("depth", {}).get("from_motion", {}):
         from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=delay_frames)
         config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, from_motion=from_motion))
+    if history_frames and not config.history.max_frames:
+        history = msgspec.structs.replace(config.history, max_frames=history_frames)
+        config = msgspec.structs.replace(config, history=history)
     if depth is not None:
         config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, source=depth))
     given = {"seed": seed, "quality": quality}

@@ -40,6 +40,7 @@ class LiveCorrection:
         self._ended = False
         self._followed = 0  # corrections that the session knows of
         self._since_step = 0  # frames of the history
+        self._moved_worlds = False  # whether frames of another world have been brought into the map's
 
     @property
     def running(self) -> bool:
@@ -95,6 +96,8 @@ class LiveCorrection:
             mapped: A frame was mapped since the last call: then the history goes on by as much as it must, which is
                 nothing where there was time to spare before this frame. Otherwise no frame waits.
         """
+        if session is not None and any(not np.allclose(T, np.eye(4)) for T in session.worlds.known.values()):
+            self._moved_worlds = True
         if self.running:
             self._advance(max(0, HISTORY_A_STEP - self._since_step) if mapped else 1)
         self._since_step = 0 if mapped else self._since_step + 1
@@ -131,6 +134,11 @@ class LiveCorrection:
             _log.error("correction_unfinished", reason=session.unfinished_correction)
 
     def _begin(self, request: CorrectPosesRequest) -> tuple[int, int]:
+        if self._moved_worlds:
+            raise MapError(
+                "poses cannot be corrected: a camera of another world was found in this map, and corrected poses do not "
+                "say of which world they are"
+            )
         poses = self._to_frames(request)
         known = self._pipeline.corrector.poses()
         stamps = {stamp_ns for _, stamp_ns in known}

@@ -65,6 +65,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         options.voxel_size_m or None,
         depth=options.depth or None,
         live=options.delivery == "newest",
+        history_frames=options.history_frames,
     )
     if saved is not None:
         config = msgspec.structs.replace(config, voxel_map=saved.config)

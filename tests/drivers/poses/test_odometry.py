@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
-from semantic_mapper.drivers.poses.alignment import Aligner, Target, fit
+from semantic_mapper.drivers.poses.alignment import Target, align, fit
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.depth_view import make_levels, thin_depth, thinned
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
@@ -159,17 +159,17 @@ def test_alignment_finds_the_way_between_two_views() -> None:
         levels.append(make_levels(thin_depth(f.depth_m, 1, 6.0), INTRINSICS, 3))
     target = Target(levels[0], a.T_world_camera)
     guess = b.T_world_camera @ rigid((0.01, -0.015, 0.01), (0.02, -0.01, 0.02))
-    found = Aligner(CONFIG).align(levels[1], [target], guess)
+    found = align(CONFIG, levels[1], [target], guess)
     assert found is not None
     assert np.linalg.norm(found[:3, 3] - b.T_world_camera[:3, 3]) < 0.005
     assert np.allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
-    before, after = (fit(levels[1], target, T, 0.07) for T in (guess, found))
+    before, after = (fit(CONFIG, levels[1], target, T) for T in (guess, found))
     assert after.rmse_m < 0.5 * before.rmse_m and after.fitness > 0.9 and after.overlap > 0.6
 
 
 def test_a_bare_wall_holds_nothing() -> None:
     wall = make_levels(np.full((120, 160), 2.0, np.float32), INTRINSICS, 3)
-    found = fit(wall, Target(wall, np.eye(4)), np.eye(4), 0.07)
+    found = fit(CONFIG, wall, Target(wall, np.eye(4)), np.eye(4))
     eigenvalues = np.linalg.eigvalsh(found.normal_matrix)
     assert (eigenvalues[:3] < 1e-3 * eigenvalues[3]).all()  # along it, and turning on it
 
@@ -193,11 +193,19 @@ def test_corners_tell_the_way_between_two_views() -> None:
 def test_the_most_crowded_keyframe_goes_and_old_ones_are_preferred() -> None:
     features = find_features(np.full((120, 160, 3), 50, np.uint8), np.ones((120, 160), np.float32), 10)
     made = KeyframeMap(capacity=4)
-    for x in (0.0, 0.3, 0.35, 1.5, 1.8):
-        made.add(OdometryKeyframe(Target((), rigid(shift=(x, 0, 0))), features, x))
+    gone = []
+    for number, x in enumerate((0.0, 0.3, 0.35, 1.5, 1.8)):
+        gone.append(made.add(OdometryKeyframe(number, Target((), rigid(shift=(x, 0, 0))), features, features, x)))
+    assert gone == [None, None, None, None, (2, 1)]
     assert [k.way_m for k in made.frames] == [0.0, 0.3, 1.5, 1.8]  # 0.35 was next to 0.3, and younger
     assert [k.way_m for k in made.near(rigid(shift=(0.25, 0, 0)), 3)] == [0.3, 0.0]
     assert [k.way_m for k in made.near(rigid(shift=(1.7, 0, 0)), 2)] == [1.8, 1.5]
     assert [k.way_m for k in made.near(rigid(shift=(9, 0, 0)), 3)] == [1.8]
     way, turn = made.distances(rigid((0, 0.2, 0), (0, 1.0, 0)))
     assert way[0] == pytest.approx(1.0) and turn[0] == pytest.approx(0.2)
+
+
+def test_same_images_same_poses_bit_for_bit() -> None:
+    frames = [as_image(f) for f in walk(noise=True)[:15]]
+    one, other = (poses_of(follow(frames, started())) for _ in range(2))
+    assert np.array_equal(one, other)

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 import pytest
 
-from semantic_mapper.drivers.base import Camera, CameraImage, FrameSource, PoseEstimate, PoseSource
+from semantic_mapper.drivers.base import Camera, CameraImage, CorrectedWorld, FrameSource, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import DevicePoses, FixedPose, PoseChecks
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.still import DevicePoseSource, FixedPoseSource
@@ -282,3 +282,32 @@ def test_a_fixed_camera_is_where_it_is_said_to_be() -> None:
         frames = list(camera)
     assert [f.pose_source for f in frames] == ["fixed", "fixed"] and frames[1].pose_sigma == 0.3
     assert np.allclose(frames[1].T_world_camera, rigid((0, 1, 0), (3, 2, 1)))
+
+
+class ClosingLoops(Told):
+    """Before its seventh image it finds out that the world is two metres further to the right."""
+
+    motion = rigid(shift=(2, 0, 0))
+
+    def correction(self, final: bool = False) -> CorrectedWorld | None:
+        if self.seq != 6:
+            return None
+        return CorrectedWorld({(i + 1) * 100 * MS: self.motion for i in range(6)}, 600 * MS, self.motion)
+
+    def pose(self, image: CameraImage) -> PoseEstimate | None:
+        self.seq = image.seq
+        return super().pose(image)
+
+
+def test_a_closed_loop_is_no_jump_and_is_handed_on_as_poses_of_the_camera() -> None:
+    mount = rigid(shift=(0, 0, 0.5))
+    source = ClosingLoops(lambda i: np.eye(4) if i.seq < 6 else ClosingLoops.motion)
+    given: list[tuple[int, CorrectedWorld | None]] = []
+    with PosedCamera(ListCamera(images(9)), source, T_rig_camera=mount) as camera:
+        for frame in camera:
+            given.append((frame.seq, camera.correction()))
+    assert [seq for seq, _ in given] == list(range(9))
+    (corrected,) = (c for _, c in given if c is not None)
+    assert given[6][1] is corrected and corrected.until_ns == 600 * MS
+    assert np.allclose(corrected.poses[100 * MS], ClosingLoops.motion @ mount)
+    assert camera.correction(final=True) is None

@@ -91,6 +91,9 @@ class Walking:
     def stop(self) -> None:
         self._camera.stop()
 
+    def correction(self, final: bool = False) -> None:
+        """It closes no loops."""
+
 
 @dataclass
 class Running:

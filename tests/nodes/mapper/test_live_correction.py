@@ -17,12 +17,14 @@ from structlog.testing import capture_logs
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig, load_config
+from semantic_mapper.drivers.base import CorrectedWorld
 from semantic_mapper.errors import CodecError, MapError, PoseError, ShapeError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.correction.pose_correction import ALWAYS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.camera.corrections import CorrectionSender
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.query_service import QueryService
@@ -180,6 +182,34 @@ def test_a_drifting_stream_that_is_corrected_midway_ends_as_the_map_of_true_pose
     ours, ideal = state_of(saved), state_of(ideal_map(bundle_of, frames))
     for name in GEOMETRY:  # what the field rendered along the way differs a little
         assert ours[name].tobytes() == ideal[name].tobytes(), name
+
+
+def test_a_camera_that_closes_a_loop_moves_the_map(weights, tmp_path):
+    frames = tiny_frames(8)
+    late = drifted(frames)
+    unseen = {frames[-1].stamp_ns + 10: np.eye(4)}  # of an image that was never mapped
+    poses = {frame.stamp_ns: frame.T_world_camera for frame in frames}
+    with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:
+        robot.send(late)
+        assert robot.fused(8)
+        with CorrectionSender(robot.query, frames[0].camera_id) as sender:
+            sender.put(CorrectedWorld(poses | unseen, frames[-1].stamp_ns + 10, np.eye(4)))
+            assert eventually(lambda: client.correction().completed == 1)
+        assert sender.counters == {"corrections_sent": 1} and sender.warnings == ()
+        assert client.correction().poses == 8
+        robot.end(8)
+
+
+def test_a_map_that_keeps_no_frames_says_what_to_set_to_the_camera(weights, tmp_path):
+    frame = tiny_frames(1)[0]
+    with running_robot(weights, tmp_path / "out", history=0) as robot:
+        robot.send([frame])
+        assert robot.fused(1)
+        with CorrectionSender(robot.query, frame.camera_id) as sender:
+            sender.put(CorrectedWorld({frame.stamp_ns: np.eye(4)}, frame.stamp_ns, np.eye(4)))
+            assert eventually(lambda: bool(sender.warnings))
+        assert "does not follow closed loops" in sender.warnings[0] and "history.max_frames" in sender.warnings[0]
+        robot.end(1)
 
 
 def test_where_odometry_goes_on_frames_to_come_move_too_and_the_end_waits_for_the_correction(

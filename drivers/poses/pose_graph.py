@@ -1,0 +1,95 @@
+"""A graph of keyframe poses and measured motions between them, optimised with GTSAM (Levenberg-Marquardt, Huber)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from semantic_mapper.geometry import invert_pose, rotation_vector
+from semantic_mapper.types import Float64
+
+_HUBER_SIGMAS = 1.5  # motions further off than this count less
+_HELD_SIGMA = 1e-4  # radians and metres, of the first keyframe, which stays
+_ITERATIONS = 20
+_TOLERANCE = 1e-4  # relative decrease of the cost that ends it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """A measured motion from one keyframe to another.
+
+    Args:
+        a, b: Keyframes by number.
+        T_a_b: (4, 4).
+        covariance: (6, 6) of rotation and position, in the axes of b.
+        chain: Between keyframes that tracking has linked, and measured well: no loop may bend it.
+    """
+
+    a: int
+    b: int
+    T_a_b: Float64
+    covariance: Float64
+    chain: bool = False
+
+
+class PoseGraph:
+    """Keyframes by number and edges between them. The first keyframe stays where it is. Deterministic."""
+
+    def __init__(self) -> None:
+        self.poses: dict[int, Float64] = {}
+        self.edges: list[Edge] = []
+
+    def add(self, number: int, T_world_camera: Float64, edges: list[Edge]) -> None:
+        """A keyframe and its edges to earlier ones; without any it would float, so the first alone may have none."""
+        self.poses[number] = T_world_camera
+        self.edges += edges
+
+    def remove(self, number: int, heir: int) -> None:
+        """Take a keyframe out; its edges go on from another one, as both stand now."""
+        T_heir_gone = invert_pose(self.poses[heir]) @ self.poses.pop(number)
+        kept: list[Edge] = []
+        for edge in self.edges:
+            if number not in (edge.a, edge.b):
+                kept.append(edge)
+            elif edge.a == number and edge.b != heir:
+                kept.append(replace(edge, a=heir, T_a_b=T_heir_gone @ edge.T_a_b))
+            elif edge.b == number and edge.a != heir:
+                kept.append(replace(edge, b=heir, T_a_b=edge.T_a_b @ invert_pose(T_heir_gone)))
+        self.edges = kept
+
+    def linked(self, number: int) -> frozenset[int]:
+        """Keyframes that have an edge to this one, and itself."""
+        ends = {e.b if e.a == number else e.a for e in self.edges if number in (e.a, e.b)}
+        return frozenset(ends | {number})
+
+    def optimized(self) -> dict[int, Float64]:
+        """Poses that fit all edges best, by number. The graph stays as it is."""
+        graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        noise = gtsam.noiseModel
+        for number, pose in self.poses.items():
+            start.insert(X(number), gtsam.Pose3(pose))
+        first = min(self.poses)
+        held = noise.Isotropic.Sigma(6, _HELD_SIGMA)
+        graph.add(gtsam.PriorFactorPose3(X(first), gtsam.Pose3(self.poses[first]), held))
+        huber = noise.mEstimator.Huber.Create(_HUBER_SIGMAS)
+        for edge in self.edges:
+            robust = noise.Robust.Create(huber, noise.Gaussian.Covariance(edge.covariance))
+            graph.add(gtsam.BetweenFactorPose3(X(edge.a), X(edge.b), gtsam.Pose3(edge.T_a_b), robust))
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams())
+        cost = optimizer.error()
+        for _ in range(_ITERATIONS):  # ``optimize`` would keep Python's other threads waiting until its end
+            optimizer.iterate()
+            before, cost = cost, optimizer.error()
+            if before - cost <= _TOLERANCE * before:
+                break
+        found = optimizer.values()
+        return {number: found.atPose3(X(number)).matrix() for number in self.poses}
+
+
+def between(T_a: Float64, T_b: Float64) -> tuple[float, float]:
+    """Metres and degrees from one pose to another."""
+    T = invert_pose(T_a) @ T_b
+    return float(np.linalg.norm(T[:3, 3])), float(np.rad2deg(np.linalg.norm(rotation_vector(T))))

@@ -1,0 +1,100 @@
+"""Closed loops of the pose source, on their way to the mapper: a thread asks it to move its map, frames go on."""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import structlog
+
+from semantic_mapper.errors import SemanticMapperError, TransportError
+
+if TYPE_CHECKING:
+    from semantic_mapper.drivers.base import CorrectedWorld
+
+RETRY_S = 2.0
+LAST_S = 10.0  # how long the last correction may take to reach the mapper, once the stream has ended
+_SAME_FRAME_NS = 1  # poses of images that were never mapped are left out, instead of refused
+
+_log = structlog.get_logger(__name__)
+
+
+class CorrectionSender:
+    """Sends the newest correction that has not arrived; each one says all that the one before it did.
+
+    Args:
+        endpoint: Where the mapper answers.
+        camera_id: Whose poses they are.
+    """
+
+    def __init__(self, endpoint: str, camera_id: str) -> None:
+        self._endpoint = endpoint
+        self._camera_id = camera_id
+        self._changed = threading.Condition()
+        self._next: CorrectedWorld | None = None
+        self._ended = False
+        self._sent = 0
+        self._trouble = ""
+        self._thread = threading.Thread(target=self._run, name="corrections", daemon=True)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """For the status of the camera."""
+        return {"corrections_sent": self._sent}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the map does not follow closed loops."""
+        return (self._trouble,) if self._trouble else ()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._thread.join(LAST_S)
+
+    def put(self, corrected: CorrectedWorld) -> None:
+        """Send it soon; does not wait."""
+        with self._changed:
+            self._next = corrected
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._ended or self._next is not None)
+                corrected, self._next = self._next, None
+            if corrected is None:
+                return
+            try:
+                self._send(corrected)
+            except TransportError as error:  # the mapper starts again, or hangs
+                self._tell(str(error))
+                with self._changed:
+                    if self._ended:
+                        return
+                    self._next = self._next or corrected
+                    self._changed.wait_for(lambda: self._ended, RETRY_S)
+            except SemanticMapperError as error:  # it refuses; it says what to set
+                self._tell(str(error))
+
+    def _send(self, corrected: CorrectedWorld) -> None:
+        from semantic_mapper.client import MapClient
+
+        poses = {(self._camera_id, stamp_ns): pose for stamp_ns, pose in corrected.poses.items()}
+        with MapClient(self._endpoint) as client:
+            client.correct_poses(poses, until_ns=corrected.until_ns, within_ns=_SAME_FRAME_NS)
+        self._sent += 1
+        self._trouble = ""
+
+    def _tell(self, reason: str) -> None:
+        if not self._trouble:
+            _log.warning("correction_not_taken", reason=reason)
+        self._trouble = f"the map does not follow closed loops: {reason}"
