@@ -136,8 +136,8 @@ class LiveCorrection:
     def _begin(self, request: CorrectPosesRequest) -> tuple[int, int]:
         if self._moved_worlds:
             raise MapError(
-                "poses cannot be corrected: a camera of another world was found in this map, and corrected poses do not "
-                "say of which world they are"
+                "poses cannot be corrected: a camera of another world was found in this map, and corrected poses do "
+                "not say of which world they are"
             )
         poses = self._to_frames(request)
         known = self._pipeline.corrector.poses()

@@ -93,6 +93,7 @@ class _Cells(NamedTuple):
 class _View(NamedTuple):
     """What one frame saw: where it was, and its cells, the nearest depth of each cell and those around it."""
 
+    camera_id: str
     stamp_ns: int
     T_camera_world: Float64
     focal: tuple[float, float]  # in cells
@@ -127,7 +128,7 @@ class MotionDetector:
             free, seen = _seen_before(frame, cells, views)
             if free.sum() <= MOST_MOVING * (cells.near > 0).sum():
                 moving = _filled(_grown(_without_specks(free), cells.near, ~(free | seen)), cells.near)
-        last = max((v.stamp_ns for v in views if v.near.shape == cells.near.shape), default=None)
+        last = max((v.stamp_ns for v in views if v.camera_id == frame.camera_id), default=None)
         if last is None or frame.stamp_ns // _EVERY_NS > last // _EVERY_NS:  # whichever frame was the first one
             self._views.append(_view(frame, cells))
         return _pixels(moving, cells, frame.depth_m)
@@ -155,7 +156,13 @@ def _view(frame: PosedFrame, cells: _Cells) -> _View:
     around = cv2.erode(near, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
     focal, centre = _intrinsics(frame, cells.size)
     return _View(
-        frame.stamp_ns, invert_pose(frame.T_world_camera), focal, centre, cells.near, np.asarray(around, np.float32)
+        frame.camera_id,
+        frame.stamp_ns,
+        invert_pose(frame.T_world_camera),
+        focal,
+        centre,
+        cells.near,
+        np.asarray(around, np.float32),
     )
 
 

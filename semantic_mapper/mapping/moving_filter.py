@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from semantic_mapper.config import MapperConfig
-from semantic_mapper.labels import LabelSet
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.labels import MOVING_NAMES, LabelSet
 from semantic_mapper.mapping.moving import BEYOND_M, EVERY_S, SETTLED_S, MotionDetector, MovingSpace
 from semantic_mapper.types import Bool, PosedFrame, UInt8
 
@@ -26,12 +27,21 @@ class MovingFilter:
         pixels: Left out so far.
         space: Where what moves was within the last second.
         uses_classes: Whether classes of ``label_set`` move.
+
+    Raises:
+        ConfigError: ``moving.classes``, and none of the classes does.
     """
 
     def __init__(self, config: MapperConfig, label_set: LabelSet) -> None:
         self._config = config
         self._motion = MotionDetector(config.voxel_map.depth_max_m)
         self._ids = label_set.moving_ids() if config.moving.classes else ()
+        if config.moving.classes and not self._ids:
+            names = ", ".join(sorted(MOVING_NAMES))
+            raise ConfigError(
+                f"moving.classes: none of the classes of '{label_set.name}' moves by itself ({names} would); use weights "
+                "that know one, or moving.motion"
+            )
         self.pixels = 0
         self.space = MovingSpace()
 

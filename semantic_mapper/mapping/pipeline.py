@@ -158,8 +158,9 @@ class MappingPipeline:
                 changed then.
             PoseError: a pose is not a rigid transform.
         """
+        status = self.corrector.start(poses, until_ns)
         self.moving.clear()
-        return self.corrector.start(poses, until_ns)
+        return status
 
     def advance_correction(self, max_frames: int = 1) -> bool:
         """Carry a correction on by this many frames of the history; see ``MapCorrector.advance``."""
@@ -328,6 +329,9 @@ class MappingPipeline:
                     self.look_around(virtual.views)
                 except FrameError as error:  # the frame itself is in the map
                     _log.warning("virtual_view_refused", seq=frame.seq, reason=str(error))
+        told_m = depth if moving is None or seen.depth_m is None else np.where(moving, seen.depth_m, depth)
+        if self.config.voxel_map.no_return_range_m > 0:
+            told_m = np.where(told_m == BEYOND_M, np.float32(0), told_m)
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -337,7 +341,7 @@ class MappingPipeline:
             source_seqs=tuple(k.seq for k in sources),
             label=label,
             confidence=confidence,
-            depth_m=depth if moving is None or seen.depth_m is None else np.where(moving, seen.depth_m, depth),
+            depth_m=told_m,
             blocks=self.voxel_map.block_count,
             blocks_touched=touched,
             rays=view.rays,

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import CARLA, NYU40, ROOMS
 from semantic_mapper.mapping.moving import BEYOND_M, SETTLED_S, MotionDetector, MovingSpace
@@ -59,6 +60,17 @@ def test_what_stays_settles_and_forgetting_leaves_nothing_to_compare_with() -> N
     detector.find(scene(100, None)[0])
     detector.clear()
     assert not detector.find(scene(103, 60)[0]).any()
+
+
+def test_each_camera_of_a_rig_sees_what_moves() -> None:
+    detector = MotionDetector(6.0)
+    for number in range(12):
+        for camera in ("left", "right"):
+            frame, thing = scene(number, None if number < 9 else 60)
+            found = detector.find(
+                replace(frame, camera_id=camera, stamp_ns=frame.stamp_ns + 1000 * (camera == "right"))
+            )
+            assert found.any() == thing.any(), (camera, number)
 
 
 def test_a_pose_that_jumps_is_no_motion() -> None:
@@ -140,6 +152,8 @@ def test_what_is_left_out_is_no_free_space_for_a_sensor_whose_missing_depth_is()
             thing[30:90, 60:100] = number > 5
             p.step(replace(frame, depth_m=np.where(thing, np.float32(left_out), frame.depth_m)))
         cleared.append(p.voxel_map.cleared)
+        told, _ = scene(12, 60)
+        assert p.step(told).depth_m.max() < 10, "nothing that stands for no return is told as depth"
     assert cleared[0] > 100 and cleared[1] == 0
 
 
@@ -167,6 +181,8 @@ def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPat
     off = pipeline(motion=False)
     label = np.concatenate([off.step(f).label.ravel() for f in frames])
     common = int(np.bincount(label[label != ROOMS.ignore_id]).argmax())
+    with pytest.raises(ConfigError, match="none of the classes of 'rooms' moves"):
+        pipeline(classes=True)
     monkeypatch.setattr("semantic_mapper.labels.MOVING_NAMES", {ROOMS.names[ROOMS.ids.index(common)]})
     on = pipeline(classes=True, motion=False)
     updates = [on.step(f) for f in frames]
