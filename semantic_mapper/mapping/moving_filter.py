@@ -39,8 +39,8 @@ class MovingFilter:
         if config.moving.classes and not self._ids:
             names = ", ".join(sorted(MOVING_NAMES))
             raise ConfigError(
-                f"moving.classes: none of the classes of '{label_set.name}' moves by itself ({names} would); use weights "
-                "that know one, or moving.motion"
+                f"moving.classes: none of the classes of '{label_set.name}' moves by itself ({names} would); use "
+                "weights that know one, or moving.motion"
             )
         self.pixels = 0
         self.space = MovingSpace()
