@@ -38,7 +38,7 @@ from semantic_mapper.transport.codec import encode, encode_frame, encode_request
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import Float64, MapUpdate, PosedFrame
-from tests.mapping.correction.test_corrected_map import drifted, true_poses
+from tests.mapping.correction.test_corrected_map import drift, drifted, true_poses
 from tests.nodes.mapper.test_query_service import Stranger, a_folder
 from tests.nodes.support import CONFIG, eventually, run
 from tests.replay.test_corrected_poses import write as write_tum
@@ -313,6 +313,20 @@ def test_what_is_refused_says_why_and_changes_nothing(bundle_of):
         pytest.raises(MapError, match="only answers questions"),
     ):
         client.correction()
+
+
+def test_a_map_that_another_world_was_brought_into_takes_no_corrections(bundle_of):
+    frames = tiny_frames(2)
+    session = session_of(bundle_of(), frames)
+    poses = {frames[0].stamp_ns: frames[0].T_world_camera}
+    with answered(session.pipeline) as (correction, client):
+        session.worlds.known[0] = np.eye(4)
+        correction.carry_on(session, mapped=False)
+        assert client.correct_poses(poses).running
+        session.worlds.known[7] = drift(0.5)
+        correction.carry_on(session, mapped=False)
+        with pytest.raises(MapError, match="another world"):
+            client.correct_poses(poses)
 
 
 def test_a_request_that_arrives_twice_counts_once(bundle_of):
