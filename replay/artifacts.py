@@ -24,10 +24,10 @@ from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
-from semantic_mapper.queries.graph import SceneGraph, find_graph
 from semantic_mapper.types import Float64
 
 if TYPE_CHECKING:  # session imports this module
+    from semantic_mapper.queries.graph import SceneGraph
     from semantic_mapper.replay.exporters.rerun_log import RerunLog
     from semantic_mapper.replay.session import MapSession, Refusal
     from semantic_mapper.replay.stats import LatencyHistogram
@@ -45,6 +45,8 @@ PACKAGES = ("torch", "open3d", "numpy", "opencv-contrib-python-headless", "pyzmq
 
 def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> dict[str, Any]:
     """Write everything to ``out`` (made if missing); the summary comes last, so its presence means "complete"."""
+    from semantic_mapper.queries.graph import find_graph  # needs SciPy, which machines that train lack
+
     out.mkdir(parents=True, exist_ok=True)
     points = session.pipeline.voxel_map.points()
     voxel_map = session.pipeline.voxel_map

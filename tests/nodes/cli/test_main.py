@@ -82,7 +82,7 @@ def test_completion_of_bash_knows_verbs_and_options(tmp_path: Path) -> None:
         done = subprocess.run([str(COMMAND)], env=environment, capture_output=True, text=True, check=False)
         return done.stdout.split()
 
-    assert complete("semantic-mapper re") == ["replay", "record", "recover", "refine"]
+    assert complete("semantic-mapper re") == ["replay", "record", "recover", "relocalize", "refine"]
     assert complete("semantic-mapper launch ") == ["list", "show", "copy"]
     assert "--voxel-size" in complete("semantic-mapper replay --vo")
     script = complete("", _SEMANTIC_MAPPER_COMPLETE="source_bash")
