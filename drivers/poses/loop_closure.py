@@ -39,7 +39,7 @@ _SLACK_M, _SLACK_DEG = 0.1, 5.0
 _BENT_M, _BENT_DEG = 0.06, 4.0  # loops that bend the chain of keyframes by more are wrong, unless it is known badly
 _FIRM_M = 0.02  # one sigma of the chain's edges that are known well
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
-_FALSE = 0.01  # of what the best known direction is told: the noise of normals says so much about every direction
+_FALSE = 0.01  # of the information about the best known direction: noise of normals gives so much about every direction
 _FLOOR_M, _FLOOR_RAD = 0.004, 0.0025  # no motion is known better
 _OPEN_M, _OPEN_RAD = 0.1, 0.05  # along what no point tells of
 

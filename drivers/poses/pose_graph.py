@@ -8,13 +8,13 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
+from semantic_mapper.bundle.adjustment import minimize
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.types import Float64
 
 _HUBER_SIGMAS = 1.5  # motions further off than this count less
 _HELD_SIGMA = 1e-4  # radians and metres, of the first keyframe, which stays
 _ITERATIONS = 20
-_TOLERANCE = 1e-4  # relative decrease of the cost that ends it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,14 +78,7 @@ class PoseGraph:
         for edge in self.edges:
             robust = noise.Robust.Create(huber, noise.Gaussian.Covariance(edge.covariance))
             graph.add(gtsam.BetweenFactorPose3(X(edge.a), X(edge.b), gtsam.Pose3(edge.T_a_b), robust))
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams())
-        cost = optimizer.error()
-        for _ in range(_ITERATIONS):  # ``optimize`` would keep Python's other threads waiting until its end
-            optimizer.iterate()
-            before, cost = cost, optimizer.error()
-            if before - cost <= _TOLERANCE * before:
-                break
-        found = optimizer.values()
+        found = minimize(graph, start, _ITERATIONS)
         return {number: found.atPose3(X(number)).matrix() for number in self.poses}
 
 

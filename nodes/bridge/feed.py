@@ -96,7 +96,7 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
 
     Raises:
         NodeError: the thread that sends the map has ended, by a bug; what it has said is in the log.
-        TransportError: an endpoint that is none, or that of the node is taken; or there are no keys.
+        TransportError: an invalid endpoint, the endpoint of the node is taken, or there are no keys.
     """
     query = options.query if "://" in options.query else context.endpoint(options.query)
     endpoints = [context.endpoint(name) for name in options.inputs()]

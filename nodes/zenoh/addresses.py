@@ -18,7 +18,7 @@ def zenoh_settings(options: ZenohOptions) -> dict[str, Any]:
     """Zenoh's configuration: it listens and connects where it is instructed to, and looks for nobody.
 
     Raises:
-        ConfigError: an address that is none.
+        ConfigError: an invalid address.
         TransportError: other machines could connect, or are connected to, without certificates; or these are not there.
     """
     folder = Path(options.certificates).expanduser() if options.certificates else None

@@ -168,7 +168,7 @@ class ZenohSession:
 
 
 def _has_subscribers(publisher: zenoh.Publisher) -> bool:
-    status: Any = publisher.matching_status  # the package's stubs say bool, and it is none
+    status: Any = publisher.matching_status  # the package's stubs say bool, which is wrong
     return bool(status.matching)
 
 

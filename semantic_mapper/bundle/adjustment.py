@@ -88,16 +88,8 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     factor = gtsam.GenericProjectionFactorCal3_S2
     for seen, row, column in zip(problem.pixels, problem.keyframe.tolist(), problem.point.tolist(), strict=True):
         graph.add(factor(seen, pixel, X(row), L(column), lens, False, False))
-    settings = gtsam.LevenbergMarquardtParams()
     try:
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, settings)
-        cost = optimizer.error()
-        for _ in range(iterations):  # ``optimize`` would keep Python's other threads waiting until its end
-            optimizer.iterate()
-            before, cost = cost, optimizer.error()
-            if before - cost <= _TOLERANCE * before:
-                break
-        found = optimizer.values()
+        found = minimize(graph, start, iterations)
     except RuntimeError as error:  # what GTSAM raises where sights leave a direction open
         _log.warning("bundle_left_out", reason=str(error).strip()[:200])
         found = start
@@ -105,6 +97,22 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     poses[problem.held] = problem.poses[problem.held]
     points = np.array([found.atPoint3(L(row)) for row in range(len(problem.points))]).reshape(-1, 3)
     return BundleResult(poses, points, sight_errors(problem, poses, points))
+
+
+def minimize(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int) -> gtsam.Values:
+    """Values of the least cost (Levenberg-Marquardt), after at most so many iterations.
+
+    Raises:
+        RuntimeError: by GTSAM, where the factors leave a direction open.
+    """
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams())
+    cost = optimizer.error()
+    for _ in range(iterations):  # ``optimize`` would keep Python's other threads waiting until its end
+        optimizer.iterate()
+        before, cost = cost, optimizer.error()
+        if before - cost <= _TOLERANCE * before:
+            break
+    return optimizer.values()
 
 
 def sight_errors(problem: BundleProblem, poses: Float64, points: Float64) -> Float64:

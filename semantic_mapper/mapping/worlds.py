@@ -117,7 +117,7 @@ class MapWorlds:
         return f"{len(self._held)} frames are held until their place in the map is known: {self.reason or 'looking'}"
 
     def take(self, frame: PosedFrame) -> Taken:
-        """Take the next frame. One whose pose is none goes on to where it is refused."""
+        """Take the next frame. One whose pose is not valid goes on to where it is refused."""
         try:
             check_pose(frame.T_world_camera, "")
         except PoseError:

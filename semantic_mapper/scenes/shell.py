@@ -160,7 +160,7 @@ def shell_between(
 
 
 def _draw_opening(size_m: tuple[float, float, float], rng: np.random.Generator) -> _Opening:
-    """``wall`` is -1 where there is none."""
+    """``wall`` is -1 without a wall."""
     wall = int(rng.integers(4)) if rng.uniform() < OPENING_SHARE else -1
     length = size_m[wall % 2]
     has_leaf = rng.uniform() < 0.5

@@ -153,7 +153,7 @@ def test_what_is_left_out_is_no_free_space_for_a_sensor_whose_missing_depth_is()
             p.step(replace(frame, depth_m=np.where(thing, np.float32(left_out), frame.depth_m)))
         cleared.append(p.voxel_map.cleared)
         told, _ = scene(12, 60)
-        assert p.step(told).depth_m.max() < 10, "nothing that stands for no return is told as depth"
+        assert p.step(told).depth_m.max() < 10, "depth that stands for no return is not reported"
     assert cleared[0] > 100 and cleared[1] == 0
 
 

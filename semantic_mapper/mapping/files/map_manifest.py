@@ -79,7 +79,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
         scale: Whether lengths are metres; not written where they are, so older releases read such maps.
         refined: Digest of the weights that refined the map; empty, and not written, where none did.
         instances: Which voxels belong to which thing, of maps that were refined so; not written for others.
-        places: What it is found again by; not written where there are none.
+        places: What it is found again by; not written when empty.
     """
 
     format: str = FORMAT

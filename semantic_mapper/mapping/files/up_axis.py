@@ -12,8 +12,8 @@ from semantic_mapper.types import Float64
 
 FLOOR = "floor"  # the class whose points say where down is
 LEAST_SHARE = 0.01  # of a map's points that have to be floor
-FLAT_M = 0.1  # the middle half of the floor's points lies within so much of height, or it is none
-LEVEL_SHARE = 0.8  # of the floor's points on several storeys, each within so much of height, or it is none
+FLAT_M = 0.1  # the middle half of the floor's points lies within so much of height
+LEVEL_SHARE = 0.8  # of the floor's points on several storeys, each within so much of height
 STOREY_M = 1.8  # storeys are at least so far apart
 
 

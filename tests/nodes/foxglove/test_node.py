@@ -162,7 +162,11 @@ def test_a_mapper_with_keys_answers_who_has_the_same(port: int, tmp_path: Path) 
         robot.mapped(robot_keys),
         FoxgloveClient(f"ws://127.0.0.1:{port}", {"/map/info"}) as client,
     ):
-        gather(client, None, {"/map/info"})
+        found = gather(client, None, {"/map/info"})
+    info = json.loads(found["/map/info"].data)
+    assert info["points"] == len(surface_points(whole(), surface_voxels(whole())).xyz), (
+        "the map came through the sockets with keys"
+    )
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
