@@ -36,7 +36,8 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig, RoomConfig, room_views
-from semantic_mapper.scenes.moving import PERSON, make_moving_room, moving_views
+from semantic_mapper.scenes.moving import make_moving_room, moving_views
+from semantic_mapper.scenes.primitives import PERSON
 from semantic_mapper.types import (
     Bool,
     CameraIntrinsics,
@@ -301,7 +302,7 @@ def total(stretches: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str,
 def room_stretch(seed: int, count: int, camera: CameraIntrinsics, people: int, *, exact: bool) -> Stretch:
     """A generated room."""
     noise = None if exact else NoiseConfig()
-    room = make_moving_room(seed, count, people=people, person_class=True, room=ROOM, path=PATH)
+    room = make_moving_room(seed, count, people=people, room=ROOM, path=PATH)
     poses = [thing.T_world_rest for thing in room.things]
     stays = [
         (T[-1] == T).all((1, 2)) & t.there & t.there[-1] & (t.name != PERSON)

@@ -206,7 +206,7 @@ _NYU40 = (
 _SCANNET20_IDS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 24, 28, 33, 34, 36, 39)
 _ROOMS = (
     "wall floor ceiling cabinet bed chair sofa table door window bookshelf picture counter desk curtain refrigerator "
-    "toilet sink bathtub otherfurniture otherprop"
+    "toilet sink bathtub otherfurniture otherprop person"
 ).split()
 _CAMVID11 = "sky building pole road pavement tree signsymbol fence car pedestrian bicyclist".split()
 _KITTI360 = (

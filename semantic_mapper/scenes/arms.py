@@ -1,4 +1,4 @@
-"""Arms of the person who wears the camera: before it in every frame of a sequence, with the ignore id."""
+"""Arms of the person who wears the camera: before it in every frame of a sequence."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from semantic_mapper.scenes.config import SUITE_VERSION
 from semantic_mapper.scenes.materials import Material, material_table
 from semantic_mapper.scenes.people import cloth_material, skin_material
-from semantic_mapper.scenes.primitives import BEING, Part, Primitives, Shape, pack
+from semantic_mapper.scenes.primitives import PERSON, Part, Primitives, Shape, pack
 from semantic_mapper.scenes.scene import Scene, add_primitives
 from semantic_mapper.types import Float64
 
@@ -64,7 +64,7 @@ def _arm(rng: np.random.Generator, side: int) -> list[Part]:
 
     def part(shape: Shape, material: int, own: tuple[float, float, float], size: tuple[float, float, float]) -> Part:
         half = np.array(size) / 2
-        return Part(shape, wrist + R @ np.array(own), half, R, BEING, material, item=side + 1, casts_shadow=False)
+        return Part(shape, wrist + R @ np.array(own), half, R, PERSON, material, item=side + 1, casts_shadow=False)
 
     fist = rng.uniform(0.4, 1.0)
     return [

@@ -28,7 +28,7 @@ class RoomConfig(Config, frozen=True):
     camouflage: Fraction = (
         0.3  # of the rooms, for each pair of classes of ``materials.CAMOUFLAGE``: one material for both
     )
-    people: Fraction = 0.0  # of the rooms with people or animals, whose pixels carry the ignore id; half of them move
+    people: Fraction = 0.0  # of the rooms with people or animals (the ignore id); half of them move
     # Of the rooms, that hold what benchmark rooms lack: pieces of other sizes, doors that stand open, counters round a
     # corner, tables of any height, refrigerators of any finish, arms before the camera. See ``furniture.varied``.
     variety: Fraction = 0.0

@@ -10,20 +10,18 @@ import numpy as np
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import transform
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import SUITE_VERSION, TRAIN_SEEDS, CameraPathConfig, NoiseConfig, RoomConfig
 from semantic_mapper.scenes.furniture import FURNITURE
 from semantic_mapper.scenes.materials import Palette
 from semantic_mapper.scenes.people import make_person
-from semantic_mapper.scenes.primitives import BEING, Assembly, Primitives, pack, place_parts
+from semantic_mapper.scenes.primitives import PERSON, Assembly, Primitives, pack, place_parts
 from semantic_mapper.scenes.room import make_room
 from semantic_mapper.scenes.scene import Scene, add_primitives
 from semantic_mapper.scenes.sequence import RoomView, render_views
 from semantic_mapper.scenes.tracks import FRAME_HZ, Floor, Push, Stay, Track, Walk, open_door
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, UInt8
 
-PERSON = "person"  # class of people, where they have one
 MOST_PEOPLE = 3
 _MOVING_STREAM = 6
 
@@ -91,7 +89,6 @@ def make_moving_room(
     count: int,
     *,
     people: int = 2,
-    person_class: bool = False,
     room: RoomConfig = RoomConfig(),
     path: CameraPathConfig = CameraPathConfig(),
 ) -> MovingRoom:
@@ -104,7 +101,6 @@ def make_moving_room(
         count: Frames.
         people: Who walk to and fro where the camera sees them, 0 to 3. The first turns at once at either end of the
             way, others may stand there for a while.
-        person_class: Label people with the class "person" that the scene's label set then has; else with the ignore id.
         room, path: As for ``room_views``; ``room.people`` and arms are not for this.
 
     Raises:
@@ -133,7 +129,7 @@ def make_moving_room(
     chair, box = (_centred(FURNITURE[kind].make(rng, palette)) for kind in ("chair", "carton"))
     place("chair", chair, floor.best(Push(_radius(chair), rng, count)))
     place("box", box, floor.best(Stay(_radius(box), rng, count)))
-    return _assemble(still, poses, palette, placed, door, person_class)
+    return _assemble(still, poses, palette, placed, door)
 
 
 def moving_views(
@@ -169,16 +165,11 @@ def _assemble(
     palette: Palette,
     placed: list[tuple[str, Assembly, Track]],
     door: tuple[Bool, Float64] | None,
-    person_class: bool,
 ) -> MovingRoom:
-    label_set = ROOMS.with_names((PERSON,)) if person_class else ROOMS
-    groups = [
-        [replace(part, label=PERSON) if person_class and part.label == BEING else part for part in assembly.parts]
-        for _, assembly, _ in placed
-    ]
-    scene = replace(still, label_set=label_set)
+    groups = [assembly.parts for _, assembly, _ in placed]
+    scene = still
     if groups:
-        scene = add_primitives(scene, pack(groups, label_set), palette.table())
+        scene = add_primitives(scene, pack(groups), palette.table())
     p, first = scene.primitives, int(still.primitives.group.max()) + 1
     things = [
         MovingThing(name, p.group == first + index, track.poses(), track.there)

@@ -1,4 +1,4 @@
-"""People and animals: whom a camera meets, but no map should hold. Their pixels carry the ignore id."""
+"""People and animals: whom a camera meets, but no map should hold. Animals carry the ignore id."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from semantic_mapper.scenes.layout import Layout
 from semantic_mapper.scenes.materials import Material, Palette, Pattern
-from semantic_mapper.scenes.primitives import BEING, Assembly, Shape
+from semantic_mapper.scenes.primitives import ANIMAL, PERSON, Assembly, Shape
 from semantic_mapper.types import Float64
 
 _MOVING = 0.5  # fraction of them
@@ -63,7 +63,7 @@ def _stand(layout: Layout, rng: np.random.Generator, being: Assembly) -> bool:
 
 def make_person(rng: np.random.Generator, palette: Palette, *, casts_shadow: bool) -> Assembly:
     """Upright, facing y; the arms hang, or are bent as at work."""
-    a, h = Assembly(BEING), rng.uniform(1.5, 1.9) / 1.75
+    a, h = Assembly(PERSON), rng.uniform(1.5, 1.9) / 1.75
     wide, bend = rng.uniform(0.36, 0.5), rng.uniform(0.0, 1.5)
     skin, hair = palette.add(skin_material(rng)), palette.add(_hair(rng))
     shirt, trousers, shoe = (
@@ -98,7 +98,7 @@ def make_person(rng: np.random.Generator, palette: Palette, *, casts_shadow: boo
 
 def _animal(rng: np.random.Generator, palette: Palette, *, casts_shadow: bool) -> Assembly:
     """A cat or a dog, facing y."""
-    a, size, fur = Assembly(BEING), rng.uniform(0.25, 0.65), palette.add(_hair(rng))
+    a, size, fur = Assembly(ANIMAL), rng.uniform(0.25, 0.65), palette.add(_hair(rng))
     for shape, center, extents in (
         (Shape.PILLOW, (0.0, 0.0, 0.62), (0.34, 1.0, 0.4)),
         (Shape.ELLIPSOID, (0.0, 0.58, 0.86), (0.26, 0.36, 0.3)),

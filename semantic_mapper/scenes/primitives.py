@@ -16,7 +16,8 @@ from semantic_mapper.types import Float64, UInt8
 
 Vector = tuple[float, float, float]
 
-BEING = "being"  # label of people and animals: no class, their pixels are to be ignored
+PERSON = "person"  # label of people and their arms: the class of that name, else ignored
+ANIMAL = "animal"  # likewise
 
 
 class Shape(IntEnum):
@@ -40,7 +41,7 @@ class Part:
         center: (3,) metres.
         half: (3,) half extents along its own axes.
         rotation: (3, 3) own axes -> assembly axes.
-        label: Class name of the scene's label set, or ``BEING``.
+        label: Class name of the scene's label set, ``PERSON`` or ``ANIMAL``.
         material: Number in the palette.
         item: Separate objects of one assembly (a cushion on a sofa) have numbers of their own.
         casts_shadow: False for what light comes from or through.
@@ -256,10 +257,12 @@ def pack(groups: list[list[Part]], label_set: LabelSet = ROOMS) -> Primitives:
     """Parts in world coordinates -> arrays; each (group, item) becomes one instance, numbered from 1.
 
     Args:
-        groups: Parts of each assembly; their labels are names of ``label_set``, or ``BEING``.
+        groups: Parts of each assembly. Labels: names of ``label_set``, ``PERSON`` or ``ANIMAL`` (ignored where it has
+            no such class).
         label_set: Gives the ids.
     """
-    label_id = {**dict(zip(label_set.names, label_set.ids, strict=True)), BEING: label_set.ignore_id}
+    ignored = dict.fromkeys((PERSON, ANIMAL), label_set.ignore_id)
+    label_id = ignored | dict(zip(label_set.names, label_set.ids, strict=True))
     instances: dict[tuple[int, int], int] = {}
     flat: list[Part] = []
     numbers: list[int] = []

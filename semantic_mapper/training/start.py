@@ -13,7 +13,7 @@ from torch import nn
 
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.checkpoint import adapt_model, load_checkpoint
 from semantic_mapper.fields.efficientnet import imagenet_state
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.log_events import get_logger
@@ -25,18 +25,20 @@ _log = get_logger(__name__)
 
 
 def take_over(field: LearnedField, path: Path) -> dict[str, Any]:
-    """Copy all weights of a file into ``field``; returns its ``recipe.origin``.
+    """Copy all weights of a file into ``field``, which may have more classes; returns the file's ``recipe.origin``.
 
     Raises:
         WeightsError: they cannot be read.
-        ConfigError: they are of another kind, shape or label set.
+        ConfigError: they are of another kind or shape, or have classes that the field has not.
     """
     checkpoint = load_checkpoint(path)
     start = checkpoint.model
-    own = (field.kind, _shape(field), field.label_set)
-    if (start.kind, _shape(start), start.label_set) != own:
-        raise ConfigError(f"{path}: weights of another field than the config names, or of other classes")
-    field.load_state_dict(start.state_dict())
+    if (start.kind, _shape(start)) != (field.kind, _shape(field)):
+        raise ConfigError(f"{path}: weights of another field than the config names")
+    unknown = sorted(set(start.label_set.names) - set(field.label_set.names))
+    if unknown:
+        raise ConfigError(f"{path}: weights of other classes, {unknown} among them")
+    field.load_state_dict(adapt_model(start, field.label_set).state_dict())
     _log.info("training_starts_from", weights=path.name)
     return origin(path, checkpoint.recipe)
 

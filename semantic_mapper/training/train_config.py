@@ -37,7 +37,7 @@ class TrainConfig(Config, frozen=True):
     field: dict[str, Any] = msgspec.field(
         default_factory=dict
     )  # settings of that kind; what is left out keeps its default
-    start: str = ""  # weights file to start from, of this very shape; empty = random weights
+    start: str = ""  # weights file to start from, of this shape, maybe of fewer classes; empty = random weights
     encoder_from: str = ""  # weights file of any kind whose image encoder is taken over; empty = random weights
     imagenet: bool = False  # an encoder with backbone = "efficientnet-lite0" starts from ImageNet weights there
     seconds: float = 1500.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit on a CPU)

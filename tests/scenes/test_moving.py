@@ -10,7 +10,8 @@ import pytest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, room_views
-from semantic_mapper.scenes.moving import PERSON, MovingRoom, make_moving_room, moving_scene_at, moving_views
+from semantic_mapper.scenes.moving import MovingRoom, make_moving_room, moving_scene_at, moving_views
+from semantic_mapper.scenes.primitives import PERSON
 from semantic_mapper.scenes.tracks import FRAME_HZ
 from semantic_mapper.types import CameraIntrinsics
 
@@ -62,10 +63,10 @@ def test_people_walk_on_free_floor_at_a_walking_pace(room: MovingRoom) -> None:
         for frame in range(0, FRAMES, 10):
             p = moving_scene_at(room, frame).primitives
             low, high = p.bounds()
-            body = low[np.flatnonzero(p.label == ROOMS.ignore_id)]
+            body = low[np.flatnonzero(p.label == ROOMS.id_of(PERSON))]
             assert (body > -0.05).all() and (body < np.array(room.scene.size_m)).all()
             x, y = person.T_world_rest[frame, :2, 3]
-            tall = (p.label != ROOMS.ignore_id) & (p.group > 1) & (low[:, 2] < 1.5) & (high[:, 2] > 0.1)
+            tall = (p.label != ROOMS.id_of(PERSON)) & (p.group > 1) & (low[:, 2] < 1.5) & (high[:, 2] > 0.1)
             inside = (low[:, 0] < x) & (x < high[:, 0]) & (low[:, 1] < y) & (y < high[:, 1])
             assert not (tall & inside).any()
 
@@ -79,16 +80,11 @@ def test_everything_follows_from_the_seed(room: MovingRoom) -> None:
     np.testing.assert_array_equal(a.view.frame.rgb, b.view.frame.rgb)
 
 
-def test_people_are_ignored_or_a_class_of_their_own(room: MovingRoom) -> None:
-    named = make_moving_room(SEED, FRAMES, room=ROOM, path=PATH, person_class=True)
-    labels = named.scene.label_set
-    assert labels.names == (*ROOMS.names, PERSON) and room.scene.label_set == ROOMS
+def test_people_have_a_class_of_their_own(room: MovingRoom) -> None:
     people = 0
-    for a, b in zip(*(islice(moving_views(r, CAMERA), 40) for r in (room, named)), strict=True):
-        person = (a.thing == 1) | (a.thing == 2)
-        np.testing.assert_array_equal(a.view.rendered.label == ROOMS.ignore_id, person)
-        np.testing.assert_array_equal(b.view.rendered.label == labels.id_of(PERSON), person)
-        np.testing.assert_array_equal(a.view.rendered.label[~person], b.view.rendered.label[~person])
+    for view in islice(moving_views(room, CAMERA), 40):
+        person = (view.thing == 1) | (view.thing == 2)
+        np.testing.assert_array_equal(view.view.rendered.label == ROOMS.id_of(PERSON), person)
         people += int(person.sum())
     assert people > 100
 
