@@ -233,7 +233,7 @@ def degrade_view(sources: SourceViews, index: int, generator: torch.Generator) -
 def blurred(rgb: torch.Tensor, sigma: float) -> torch.Tensor:
     """(3, H, W) with a Gaussian of ``sigma`` pixels."""
     radius = max(1, round(2.5 * sigma))
-    x = torch.arange(-radius, radius + 1, dtype=rgb.dtype)
+    x = torch.arange(-radius, radius + 1, dtype=rgb.dtype, device=rgb.device)
     kernel = torch.exp(-(x**2) / (2 * sigma**2))
     kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
     padded = functional.pad(rgb[None], (radius, radius, radius, radius), mode="replicate")
