@@ -13,7 +13,7 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -182,6 +182,22 @@ class Nesf(nn.Module):
             self.net.head.bias[-5] += 1 - fraction
             self.net.head.bias[-4] -= 1 - fraction
 
+    def extended(self, label_set: LabelSet) -> Nesf:
+        """The same network for maps of more classes behind its own: votes for those are smoothed."""
+        own, more = len(self.label_set), len(label_set) - len(self.label_set)
+        found = Nesf(label_set, self.config)
+        state = self.state_dict()
+        for name, axis, at in (
+            ("net.stem.weight", 1, SHAPE_CHANNELS + own),
+            ("net.head.weight", 0, own),
+            ("net.head.bias", 0, own),
+        ):
+            before, after = state[name].tensor_split((at,), dim=axis)
+            new = before.narrow(axis, 0, 1).expand(*(more if n == axis else -1 for n in range(before.ndim)))
+            state[name] = torch.cat((before, torch.zeros_like(new), after), dim=axis)
+        found.load_state_dict(state)
+        return found.eval()
+
     def forward(self, cells: Cells) -> torch.Tensor:
         """(M, L + 4) of each cell: residual, how much more the map's log-probabilities count, and the way to its
         object's centre, in units of ``FARTHEST_M``."""
@@ -234,6 +250,7 @@ def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
 
     Args:
         weights: File or name; ``SMOOTHING``; None = the weights that ship, or smoothing where the classes are others.
+            Weights also refine maps of more classes behind their own, such as ``person`` behind those of rooms.
 
     Raises:
         WeightsError: no such file, damaged, or weights of another kind.
@@ -241,7 +258,10 @@ def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
     if weights == SMOOTHING:
         return smoothed_votes(label_set)
     found = load_nesf(weights or SHIPPED)
-    return found if weights or found.model.label_set == label_set else smoothed_votes(label_set)
+    own = found.model.label_set
+    if len(own) < len(label_set) and (own.ids, own.names) == (label_set.ids[: len(own)], label_set.names[: len(own)]):
+        return replace(found, model=found.model.extended(label_set))
+    return found if weights or own == label_set else smoothed_votes(label_set)
 
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:

@@ -11,8 +11,17 @@ import torch
 from msgspec.structs import replace
 
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.nesf import CELL_M, FARTHEST_M, NesfConfig, load_nesf, pool, save_nesf, smoothed_votes
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.fields.nesf import (
+    CELL_M,
+    FARTHEST_M,
+    NesfConfig,
+    find_nesf,
+    load_nesf,
+    pool,
+    save_nesf,
+    smoothed_votes,
+)
+from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.replay.map_grids import training_map
 from semantic_mapper.training.nesf import NesfTrainConfig, TrainingMap, VoxelLabels, _crop, train_nesf, withhold
 from tests.mapping.test_refine import UP, make_map
@@ -152,3 +161,18 @@ def test_no_maps_and_no_budget_are_refused(noisy: TrainingMap) -> None:
         train_nesf(TINY, ROOMS, [], [noisy])
     with pytest.raises(ConfigError, match="budget"):
         train_nesf(NesfTrainConfig(steps=0), ROOMS, [noisy], [noisy])
+
+
+def test_maps_of_more_classes_are_refined_as_those_of_fewer(noisy: TrainingMap, tmp_path: Path) -> None:
+    trained = train_nesf(replace(TINY, steps=10), ROOMS, [noisy], [noisy])
+    save_nesf(trained, tmp_path / "w.safetensors")
+    more = ROOMS.with_names(("robot",))
+    model = find_nesf(tmp_path / "w.safetensors", more).model
+    assert model.label_set == more
+    own, cells = load_nesf(tmp_path / "w.safetensors").model, pool(noisy.points)
+    wide = cells._replace(x=torch.cat((cells.x, torch.zeros(len(cells.x), 1)), dim=1))
+    with torch.no_grad():
+        expected, found = own(cells), model(wide)
+    kept = [*range(len(ROOMS)), *range(len(more), len(more) + 4)]
+    torch.testing.assert_close(found[:, kept], expected)
+    assert find_nesf(tmp_path / "w.safetensors", make_label_set("two", ("a", "b"))).model.label_set == ROOMS
