@@ -90,7 +90,7 @@ class _MapShow:
             return
         self._graph = self._graph or GraphTracker()
         try:
-            self._log.log_graph(self._graph.update(snapshot))
+            self._log.log_graph(self._graph.update(snapshot), self._graph.gone)
         except MapError as error:
             _log.debug("graph_not_shown", reason=str(error))
         self._graph_at = time.monotonic() + GRAPH_S

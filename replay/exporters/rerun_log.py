@@ -6,7 +6,9 @@ The same is written to a recording (.rrd) and sent to a viewer that watches, so 
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.plots import UNKNOWN
 from semantic_mapper.queries.graph import SceneGraph
+from semantic_mapper.queries.instances import Instance
 from semantic_mapper.replay.exporters.camera_path import CameraPath
 from semantic_mapper.replay.exporters.rerun_layout import (
     AGE_SCALE,
@@ -43,6 +46,7 @@ REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
 MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
 ROOM_COLOR, DOOR_RADIUS_M = (255, 255, 255), 0.06
+GONE_COLOR = (150, 150, 150)
 
 
 def recording_file(path: Path) -> rr.RecordingStream:
@@ -171,25 +175,35 @@ class RerunLog:
         legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None, computed=computed)
         self._stream.log("legend", rr.Image(legend))
 
-    def log_graph(self, graph: SceneGraph) -> None:
-        """Rooms, doors and things of the map as it is now, in the view that is coloured by class."""
+    def log_graph(self, graph: SceneGraph, gone: Sequence[Instance] = ()) -> None:
+        """Rooms, doors and things of the map as it is now, in the view that is coloured by class.
+
+        Args:
+            graph: Of the map.
+            gone: Things that have left; where they were is drawn in grey, with the stamp of when they went.
+        """
         rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
         names = [f"room {room.id}, {room.area_m2:.1f} m²" for room in graph.rooms]
         self._stream.log("world/graph/rooms", rr.LineStrips3D(rooms, colors=ROOM_COLOR, labels=names, show_labels=True))
         doors = np.array([door.center for door in graph.doors]).reshape(-1, 3)
         widths = [f"door, {door.width_m:.2f} m" for door in graph.doors]
         self._stream.log("world/graph/doors", rr.Points3D(doors, radii=DOOR_RADIUS_M, colors=ROOM_COLOR, labels=widths))
-        boxes = [thing.box for thing in graph.things]
+        classes = [thing.class_id for thing in graph.things]
+        labels = [f"{thing.class_name} {thing.id}" for thing in graph.things]
+        self._log_boxes("things", graph.things, class_ids=classes, labels=labels, show_labels=False)
+        left = [f"{thing.class_name} {thing.id}, gone at {(thing.gone_ns or 0) / 1e9:.1f} s" for thing in gone]
+        self._log_boxes("gone", gone, colors=GONE_COLOR, labels=left, show_labels=True)
+
+    def _log_boxes(self, name: str, things: Sequence[Instance], **look: Any) -> None:
+        boxes = [thing.box for thing in things]
         turns = [Rotation.from_matrix(box.R_world_box).as_quat() for box in boxes]
         self._stream.log(
-            "world/graph/things",
+            f"world/graph/{name}",
             rr.Boxes3D(
                 centers=np.array([box.center for box in boxes]).reshape(-1, 3),
                 sizes=np.array([box.size for box in boxes]).reshape(-1, 3),
                 quaternions=np.array(turns).reshape(-1, 4),
-                class_ids=[thing.class_id for thing in graph.things],
-                labels=[f"{thing.class_name} {thing.id}" for thing in graph.things],
-                show_labels=False,
+                **look,
             ),
         )
 

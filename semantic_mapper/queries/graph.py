@@ -144,6 +144,12 @@ class GraphTracker:
         self._next_floor = self._next_room = 1
         self._lock = threading.Lock()
 
+    @property
+    def gone(self) -> tuple[Instance, ...]:
+        """The things that had gone by the last update; none where another finds the things."""
+        with self._lock:
+            return () if self._things is None else self._things.gone
+
     def up_in(self, snapshot: MapSnapshot) -> Float64:
         """Unit vector up (3,) in the world, found by the floor of this map where it is not known yet.
 

@@ -14,8 +14,12 @@ from semantic_mapper.geometry import look_at
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.graph import find_graph
+from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.replay.exporters.map_files import AXES, ExportRequest, export_map, format_of, parse_up
 from semantic_mapper.replay.exporters.rerun_layout import COMPUTED_COLOR, MEASURED_COLOR
+from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
 from tests.mapping.files.test_formats import read_glb
 from tests.mapping.rendered_views import frame, plane_depth, small_map, sure
 from tests.queries.test_measured import part_measured
@@ -202,3 +206,15 @@ def test_rerun_gets_a_cloud_for_each_colouring(corner: VoxelMap, tmp_path: Path)
     np.testing.assert_array_equal(clouds["class"]["class_ids"], points.label)
     rgb = np.stack([(clouds["colour"]["colors"] >> shift) & 255 for shift in (24, 16, 8)], axis=1)
     np.testing.assert_array_equal(rgb, points.rgb)
+
+
+def test_a_recording_shows_where_things_were_that_have_gone(corner: VoxelMap, tmp_path: Path) -> None:
+    box = OrientedBox(np.array((1.0, 2.0, 3.0)), np.ones(3), np.eye(3))
+    thing = Instance(7, 5, "table", 0.9, box.center, box, np.zeros((1, 3), np.int32), gone_ns=2_500_000_000)
+    log = RerunLog(recording_file(tmp_path / "a.rrd"), corner.label_set, corner.config.voxel_size_m)
+    log.log_graph(find_graph(corner), [thing])
+    log.close()
+    chunks = {chunk.entity_path: chunk for chunk in rerun.chunk.RrdReader(tmp_path / "a.rrd").stream()}
+    found = chunks["/world/graph/gone"].to_record_batch()
+    assert found.column("Boxes3D:labels").to_pylist() == [["table 7, gone at 2.5 s"]]
+    np.testing.assert_allclose(found.column("Boxes3D:centers").to_pylist()[0], [(1, 2, 3)])
