@@ -84,16 +84,16 @@ def test_a_second_run_of_a_counter_stands_at_its_left_end() -> None:
         assert all(p.center[0] + p.half[0] < low[0] + 0.7 for p in beyond)
 
 
-def test_arms_move_with_the_camera_and_have_no_class() -> None:
+def test_arms_move_with_the_camera_and_are_a_persons() -> None:
     with_arms = [seed for seed in range(40) if draw_arms(seed, 1.0) is not None]
     assert 4 <= len(with_arms) <= 24
     assert all(draw_arms(seed, 0.0) is None for seed in range(40))
     seen = 0
     for seed in with_arms[:4]:
         for view in room_views(seed, 3, CAMERA, room=VARIED):
-            ignored = view.rendered.label == ROOMS.ignore_id
-            seen += int(ignored.sum())
-            assert (view.rendered.exact_depth_m[ignored] < 1.0).all()
+            arms = view.rendered.label == ROOMS.id_of("person")
+            seen += int(arms.sum())
+            assert (view.rendered.exact_depth_m[arms] < 1.0).all()
     assert seen > 100
 
 
@@ -108,4 +108,4 @@ def test_held_arms_leave_the_scene_alone(rooms: list[Scene]) -> None:
     assert len(scene.primitives.center) == before < len(held.primitives.center)
     np.testing.assert_allclose(held.primitives.center[before:], arms.primitives.center + pose[:3, 3])
     assert held.primitives.material.max() < len(held.materials.pattern)
-    assert (held.primitives.label[before:] == ROOMS.ignore_id).all()
+    assert (held.primitives.label[before:] == ROOMS.id_of("person")).all()
