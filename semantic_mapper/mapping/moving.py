@@ -6,11 +6,11 @@ has come there. So a thing that stays becomes part of the map after this time, w
 
 A cell of ``CELLS`` across the image has the nearest depth of its pixels. It contradicts a view where all that the view
 measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things and depth edges
-say nothing. Poses that are off by a few centimetres would look like motion: the frame is first aligned with views of
+say nothing. Poses that are off by a few centimetres would look like motion: a frame is first aligned with views of
 these seconds (``view_alignment.py``). Where that does not fit, or what it changes leaps from frame to frame, the poses
-are wrong and nothing is found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows, cell
-by cell, along its own surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside, which it
-hid itself.
+are wrong and nothing is found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows,
+cell by cell, along its own surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside,
+which it hid itself.
 
 Not found: what moves away along the line of sight (it hid the space where it is now), what had moved before it was seen
 for the first time, and what is slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through
