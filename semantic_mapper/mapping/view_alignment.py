@@ -19,7 +19,7 @@ CUTS = (2.0, 1.0, 0.5)  # margins within which residuals count, by iteration
 SIGMA_M, SIGMA_RAD = 0.05, 0.026
 _SIGMA_DEPTH_M, _INDEPENDENT = 0.03, 60.0  # of depth, and how many residuals are as good as independent
 _EDGE = 0.1  # change of depth from cell to cell, as a fraction of it, from which on it is no surface
-LEAST_POINTS, LEAST_FRACTION = 30, 0.2  # of points that lie before or on what views saw, that have to be on it
+LEAST_POINTS, LEAST_FRACTION = 30, 0.2  # on surfaces that views saw: to judge at all; of those compared, to fit
 _NEAREST_M = 0.1
 
 
@@ -27,10 +27,10 @@ class Alignment(NamedTuple):
     """Outcome.
 
     Args:
-        T_world_camera: (4, 4) put right; as given where too little agrees.
+        T_world_camera: (4, 4) put right; as given where it does not fit or cannot be compared.
         moved: (6,) by how much: translation, metres, and rotation, radians, in the camera.
         misfit: Median distance of points from the surface that views saw, in margins; points in front of it by more
-            than a margin do not count. inf where too little agrees.
+            than a margin do not count. inf where most is elsewhere, 0 where there is too little to compare with.
     """
 
     T_world_camera: Float64
@@ -81,7 +81,7 @@ def align_pose(points: Float32, T_world_camera: Float64, views: SlopedViews, mar
     prior = np.repeat((SIGMA_M**-2, SIGMA_RAD**-2), 3)
     for cut in CUTS:
         jacobian, residual, weight, misfit = _residuals(points, T, views, margin, cut)
-        if not np.isfinite(misfit):
+        if not len(residual):
             return Alignment(T_world_camera, np.zeros(6), misfit)
         scale = _INDEPENDENT / (weight.sum() * _SIGMA_DEPTH_M**2)
         weighted = (scale * weight)[:, None] * jacobian
@@ -111,9 +111,9 @@ def _residuals(
     q = p[view, :, number]  # M 3
     residual = depth + along_x * off[:, 0] + along_y * off[:, 1] - q[:, 2]  # NaN at edges
     relative = residual / (margin[0] + margin[1] * q[:, 2])
-    near = np.abs(relative) < 1
-    if near.sum() < max(LEAST_POINTS, LEAST_FRACTION * np.isfinite(relative).sum()):
-        return np.empty((0, 6)), np.empty(0), np.empty(0), np.inf
+    fits, compared = int((np.abs(relative) < 1).sum()), int(np.isfinite(relative).sum())
+    if fits < max(LEAST_POINTS, LEAST_FRACTION * compared):
+        return np.empty((0, 6)), np.empty(0), np.empty(0), np.inf if compared >= LEAST_POINTS else 0.0
     misfit = float(np.median(np.abs(relative[relative < 1])))
     use = np.abs(relative) < cut
     q, view, number, residual = q[use], view[use], number[use], residual[use]
