@@ -40,6 +40,7 @@ MARGIN_M, MARGIN_PER_M = 0.1, 0.03
 LEAST_CELLS = 4
 MOST_MISFIT = 0.25  # median distance from surfaces seen before, in margins; where it is more, the pose is wrong
 LEAP_M, LEAP_RAD, LEAPS = 0.11, 0.035, 9  # change of what a pose is off by; where the median of so many is more, noise
+FAR = 2.0  # ranges of the map: what is measured up to there shows free space; beyond, it may be no measurement
 ALIGN_VIEWS, ALIGN_STRIDE = 4, 3  # views to align with; of cells that are used for it
 GROWTH = 6  # cells
 HOLES, LEAST_AROUND = 3, 5  # rounds in which cells are filled that have so many moving ones of the eight around
@@ -197,7 +198,7 @@ def _points(frame: PosedFrame, cells: _Cells, v: Int64, u: Int64) -> Float64:
 def _cells(depth: Float32, depth_max_m: float) -> _Cells:
     size = max(1, round(max(depth.shape) / CELLS))
     h, w = depth.shape[0] // size, depth.shape[1] // size
-    known = (depth > 0) & (depth < np.inf)  # not NaN
+    known = (depth > 0) & (depth <= FAR * depth_max_m)  # not NaN
     values = np.where(known, depth, np.float32(np.inf))[: h * size, : w * size]
     near = values.reshape(h, size, w * size).min(axis=1).reshape(h, w, size).min(axis=2)
     count = known[: h * size, : w * size].reshape(h, size, w * size).sum(axis=1, dtype=np.uint16)
