@@ -23,7 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from benchmarks.ghosts import Thing, place_thing, sees_through, with_thing
 from semantic_mapper.config import MapperConfig, convert_config
@@ -53,6 +55,7 @@ FIRST = 15  # frames before answers count: the map has to see free space first
 NEAR_M, APART_M = 0.05, 0.06  # a ghost is this near to where a thing was, and this far from all that stays
 BEFORE, EVERY = 45, 3  # "seen free" is what one of so many frames before, of every third, looked through
 HIDDEN = 0.1  # fraction of the pictures of a log that the one who walks hides
+MOST_FRAMES, SLOW_FRAMES = 1000, 30  # with pose noise, at most; time constant of a drift
 CELL_M, STRIDE = 0.02, 3  # of the true surfaces: a point a cell, of every third pixel
 LEAST_DEPTH_M = 0.1
 ROOM, PATH = RoomConfig(min_side_m=4.5, max_side_m=7.0), CameraPathConfig(step_m=0.03)
@@ -322,6 +325,26 @@ def room_stretch(seed: int, count: int, camera: CameraIntrinsics, people: int, *
     return Stretch(label, room.scene.label_set, names, np.array(stays), moving(), still())
 
 
+def with_wrong_poses(stretch: Stretch, sigma_cm: float, sigma_deg: float, *, slow: bool) -> Stretch:
+    """The same with errors of the poses, standard deviation an axis; ``slow``: a drift that changes within two seconds.
+
+    Points are placed by these poses, too: only what is said of pixels holds then.
+    """
+
+    def wrong(frames: Iterator[Seen]) -> Iterator[Seen]:
+        noise = np.random.default_rng(0).normal(size=(MOST_FRAMES, 6))
+        if slow:
+            noise = gaussian_filter1d(noise, SLOW_FRAMES, axis=0)
+            noise /= noise.std(axis=0)
+        for seen, error in zip(frames, noise, strict=False):
+            T = seen.frame.T_world_camera.copy()
+            T[:3, 3] += sigma_cm / 100 * error[:3]
+            T[:3, :3] = T[:3, :3] @ Rotation.from_euler("xyz", sigma_deg * error[3:], degrees=True).as_matrix()
+            yield seen._replace(frame=replace(seen.frame, T_world_camera=T))
+
+    return stretch._replace(moving=wrong(stretch.moving), still=wrong(stretch.still))
+
+
 def log_stretch(path: Path, start: int, count: int) -> Stretch:
     """A recording, and a cylinder that walks through it to and fro."""
     with open_log(path) as log:
@@ -404,6 +427,8 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640, help="of the pictures of rooms")
     parser.add_argument("--exact", action="store_true", help="rooms without noise and holes in depth")
     parser.add_argument("--modes", nargs="+", choices=tuple(MODES), default=["off", "motion", "truth"])
+    parser.add_argument("--pose-noise", nargs=2, type=float, metavar=("CM", "DEG"), help="of each frame by itself")
+    parser.add_argument("--slow", action="store_true", help="pose noise that drifts")
     parser.add_argument("--picture", type=Path, help="PNG of the first room")
     given = parser.parse_args()
     if "off" not in given.modes:
@@ -421,6 +446,8 @@ def main() -> None:
         stretches = (log_stretch(Path(given.what), start, given.frames) for start in (0, given.frames))
     result: list[dict[str, dict[str, Any]]] = []
     for stretch in stretches:
+        if given.pose_noise:
+            stretch = with_wrong_poses(stretch, *given.pose_noise, slow=given.slow)
         figures, runs, static = map_stretch(stretch, given.modes)
         if given.picture and not result:
             draw(given.picture, runs, static)

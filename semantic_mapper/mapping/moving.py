@@ -38,7 +38,7 @@ SURE_S = 0.8  # a surface that a view of so long ago saw at the same place does 
 MOST_VIEWS = 48  # of all cameras together
 MARGIN_M, MARGIN_PER_M = 0.1, 0.03
 LEAST_CELLS = 4
-MOST_MISFIT = 0.25  # median distance from surfaces seen before, in margins; where it is more, the pose is wrong
+MOST_MISFIT = 0.4  # median distance from surfaces seen before, in margins; where it is more, the pose is wrong
 LEAP_M, LEAP_RAD, LEAPS = 0.11, 0.035, 9  # change of what a pose is off by; where the median of so many is more, noise
 FAR = 2.0  # ranges of the map: what is measured up to there shows free space; beyond, it may be no measurement
 ALIGN_VIEWS, ALIGN_STRIDE = 4, 3  # views to align with; of cells that are used for it
@@ -232,21 +232,21 @@ def _view(frame: PosedFrame, cells: _Cells) -> _View:
 def _seen_before(frame: PosedFrame, cells: _Cells, views: list[_View]) -> tuple[Bool, Bool]:
     """Cells (h, w) where a view saw free space, and where one of some time ago saw a surface."""
     v, u = np.nonzero(cells.inside)
-    points = transform(frame.T_world_camera, _points(frame, cells, v, u)).astype(np.float32)
+    points = np.ascontiguousarray(transform(frame.T_world_camera, _points(frame, cells, v, u)).T, np.float32)
     free, seen = np.zeros(len(u), np.bool_), np.zeros(len(u), np.bool_)
     for view in views:
         T = view.T_camera_world.astype(np.float32)
-        p = points @ T[:3, :3].T + T[:3, 3]
+        px, py, depth = T[:3, :3] @ points + T[:3, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            x = np.rint(p[:, 0] / p[:, 2] * view.focal[0] + view.centre[0])
-            y = np.rint(p[:, 1] / p[:, 2] * view.focal[1] + view.centre[1])
-        inside = (p[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < view.near.shape[1]) & (y < view.near.shape[0])
-        at = np.flatnonzero(inside)
-        yi, xi, depth = y[at].astype(np.int64), x[at].astype(np.int64), p[at, 2]
+            x = np.rint(px / depth * view.focal[0] + view.centre[0])
+            y = np.rint(py / depth * view.focal[1] + view.centre[1])
+        h, w = view.near.shape
+        at = np.flatnonzero((depth > 0) & (x >= 0) & (y >= 0) & (x < w) & (y < h))
+        cell, depth = y[at].astype(np.int64) * w + x[at].astype(np.int64), depth[at]
         margin = MARGIN_M + MARGIN_PER_M * depth
-        free[at] |= view.around[yi, xi] > depth + margin
+        free[at] |= view.around.ravel()[cell] > depth + margin
         if frame.stamp_ns - view.stamp_ns >= SURE_S * _SECOND:
-            seen[at] |= np.abs(view.near[yi, xi] - depth) <= margin
+            seen[at] |= np.abs(view.near.ravel()[cell] - depth) <= margin
     images = np.zeros((2, *cells.near.shape), np.bool_)
     images[0, v, u], images[1, v, u] = free, seen
     return images[0], images[1]

@@ -15,7 +15,7 @@ import numpy as np
 
 from semantic_mapper.types import Float32, Float64
 
-CUTS = (2.0, 1.0, 0.5)  # margins within which residuals count, by iteration
+CUTS = (1.0, 1.0, 0.5)  # margins within which residuals count, by iteration
 SIGMA_M, SIGMA_RAD = 0.05, 0.026
 _SIGMA_DEPTH_M, _INDEPENDENT = 0.03, 60.0  # of depth, and how many residuals are as good as independent
 _EDGE = 0.1  # change of depth from cell to cell, as a fraction of it, from which on it is no surface
