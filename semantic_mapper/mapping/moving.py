@@ -137,7 +137,8 @@ class MotionDetector:
             frame: With measured depth and a rigid pose.
         """
         assert frame.depth_m is not None
-        cells = _cells(frame.depth_m, self._depth_max_m)
+        depth = frame.depth_m
+        cells = _cells(depth, self._depth_max_m)
         latest = max((v.stamp_ns for v in self._views), default=frame.stamp_ns)
         if latest - frame.stamp_ns > SETTLED_S * _SECOND:
             self.clear()  # stamps have gone back
@@ -150,7 +151,7 @@ class MotionDetector:
         aligned = _align(frame, cells, views)
         self.poses_fit = aligned is None or aligned.misfit <= MOST_MISFIT
         if not self.poses_fit:
-            return np.zeros(frame.depth_m.shape, np.bool_)
+            return np.zeros(depth.shape, np.bool_)
         if aligned is not None:
             frame = replace(frame, T_world_camera=aligned.T_world_camera)
             self.poses_fit = self._is_steady(frame.camera_id, aligned.moved)
@@ -160,7 +161,7 @@ class MotionDetector:
         last = max((v.stamp_ns for v in kept if v.camera_id == frame.camera_id), default=None)
         if last is None or frame.stamp_ns // _EVERY_NS > last // _EVERY_NS:  # whichever frame was the first one
             self._views.append(_view(frame, cells))
-        return _pixels(moving, cells, frame.depth_m)
+        return _pixels(moving, cells, depth)
 
     def _is_steady(self, camera_id: str, moved: Float64) -> bool:
         """Whether what poses of a camera are off by does not leap from frame to frame, as noise does."""

@@ -195,7 +195,9 @@ def test_a_correction_of_poses_decides_again_what_moved() -> None:
     assert all(np.array_equal(ours[name], theirs[name]) for name in ("keys", "tsdf", "weight"))
     frame, _ = scene(12, 150, shift_m=0.36)
     told, expected = corrected.step(frame).moving, right.step(frame).moving
-    assert expected is not None and expected.any() and np.array_equal(told, expected), "and goes on with what it knows"
+    assert told is not None and expected is not None and expected.any() and np.array_equal(told, expected), (
+        "and goes on with what it knows"
+    )
 
 
 def shifted(T_world_camera: np.ndarray, by_m: np.ndarray) -> np.ndarray:
