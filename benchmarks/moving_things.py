@@ -3,7 +3,7 @@
 ``rooms`` maps generated rooms in which these move, and the same rooms without them, with the camera's way and noise the
 same. A log is mapped as it is and with a cylinder of the size of a person that walks through its depth and colour.
 Each is mapped with ``moving`` off, on (``motion``, ``classes``, ``both``), and as by a mapper that knows the ``truth``.
-The field knows the true class of each pixel of the frame, "person" too.
+The field knows the true class of each pixel of the frame, "person" too; with ``--weights`` it is S-Ray.
 
 Example: python -m benchmarks.moving_things rooms --modes off motion truth --picture moving.png
          python -m benchmarks.moving_things kitchen.mcap
@@ -23,7 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from benchmarks.ghosts import Thing, place_thing, sees_through, with_thing
 from semantic_mapper.config import MapperConfig, convert_config
@@ -32,6 +34,7 @@ from semantic_mapper.evaluation.upright import camera_up, upright_rotation
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.sequence import open_log
@@ -54,6 +57,7 @@ FIRST = 15  # frames before answers count: the map has to see free space first
 NEAR_M, APART_M = 0.05, 0.06  # a ghost is this near to where a thing was, and this far from all that stays
 BEFORE, EVERY = 45, 3  # "seen free" is what one of so many frames before, of every third, looked through
 HIDDEN = 0.1  # fraction of the pictures of a log that the one who walks hides
+MOST_FRAMES, SLOW_FRAMES = 1000, 30  # with pose noise, at most; time constant of a drift
 CELL_M, STRIDE = 0.02, 3  # of the true surfaces: a point a cell, of every third pixel
 LEAST_DEPTH_M = 0.1
 ROOM, PATH = RoomConfig(min_side_m=4.5, max_side_m=7.0), CameraPathConfig(step_m=0.03)
@@ -135,14 +139,19 @@ class Run:
     Args:
         mode: Of ``MODES``.
         stretch: That it maps.
+        weights: File or name of weights of the field; None = true classes.
     """
 
-    def __init__(self, mode: str, stretch: Stretch) -> None:
+    def __init__(self, mode: str, stretch: Stretch, weights: Path | None = None) -> None:
         motion, classes = MODES[mode]
         changes = {"moving": {"motion": motion, "classes": classes}}
-        self._knows, self._field = mode == "truth", FrameLabels(stretch.labels)
+        self._knows, self._true = mode == "truth", FrameLabels(stretch.labels)
         config = convert_config(changes, MapperConfig, f"benchmark, mode {mode}")
-        self.pipeline = MappingPipeline(config, self._field, stretch.labels)
+        self._weights = weights
+        if weights is None:
+            self.pipeline = MappingPipeline(config, self._true, stretch.labels)
+        else:
+            self.pipeline = Mapper.load(weights, config).pipeline
         self.cpu_s: list[float] = []
         self.hit = self.false = self.missed = self.measured = 0
         self.on_still = 0  # false pixels on what never moves
@@ -157,7 +166,8 @@ class Run:
         assert depth_m is not None
         if self._knows:
             frame = replace(frame, depth_m=np.where(seen.moving, 0, depth_m).astype(np.float32))
-        self._field.frame = frame
+        self._true.frame = frame
+        frame = frame if self._weights is None else replace(frame, label=None)
         start = time.process_time()
         update = self.pipeline.step(frame)
         self.cpu_s.append(time.process_time() - start)
@@ -225,9 +235,11 @@ class Surface:
         return KDTree(np.array(list(self._cells.values()))).query(xyz)[0]
 
 
-def map_stretch(stretch: Stretch, modes: Sequence[str]) -> tuple[dict[str, dict[str, Any]], dict[str, Run], Surface]:
+def map_stretch(
+    stretch: Stretch, modes: Sequence[str], weights: Path | None = None
+) -> tuple[dict[str, dict[str, Any]], dict[str, Run], Surface]:
     """Figures by mode, the runs with things that move, and the surfaces that stay."""
-    runs, bare = ({mode: Run(mode, stretch) for mode in modes} for _ in range(2))
+    runs, bare = ({mode: Run(mode, stretch, weights) for mode in modes} for _ in range(2))
     things, static = [Surface() for _ in stretch.things], Surface()
     before: deque[Seen] = deque(maxlen=BEFORE // EVERY)
     for number, (seen, still) in enumerate(zip(stretch.moving, stretch.still, strict=True)):
@@ -323,6 +335,26 @@ def room_stretch(seed: int, count: int, camera: CameraIntrinsics, people: int, *
     return Stretch(label, room.scene.label_set, names, np.array(stays), moving(), still())
 
 
+def with_wrong_poses(stretch: Stretch, sigma_cm: float, sigma_deg: float, *, slow: bool) -> Stretch:
+    """The same with errors of the poses, standard deviation an axis; ``slow``: a drift that changes within two seconds.
+
+    Points are placed by these poses, too: only what is said of pixels holds then.
+    """
+
+    def wrong(frames: Iterator[Seen]) -> Iterator[Seen]:
+        noise = np.random.default_rng(0).normal(size=(MOST_FRAMES, 6))
+        if slow:
+            noise = gaussian_filter1d(noise, SLOW_FRAMES, axis=0)
+            noise /= noise.std(axis=0)
+        for seen, error in zip(frames, noise, strict=False):
+            T = seen.frame.T_world_camera.copy()
+            T[:3, 3] += sigma_cm / 100 * error[:3]
+            T[:3, :3] = T[:3, :3] @ Rotation.from_euler("xyz", sigma_deg * error[3:], degrees=True).as_matrix()
+            yield seen._replace(frame=replace(seen.frame, T_world_camera=T))
+
+    return stretch._replace(moving=wrong(stretch.moving), still=wrong(stretch.still))
+
+
 def log_stretch(path: Path, start: int, count: int) -> Stretch:
     """A recording, and a cylinder that walks through it to and fro."""
     with open_log(path) as log:
@@ -405,6 +437,11 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640, help="of the pictures of rooms")
     parser.add_argument("--exact", action="store_true", help="rooms without noise and holes in depth")
     parser.add_argument("--modes", nargs="+", choices=tuple(MODES), default=["off", "motion", "truth"])
+    parser.add_argument(
+        "--weights", type=Path, help="S-Ray with these weights tells the classes"
+    )
+    parser.add_argument("--pose-noise", nargs=2, type=float, metavar=("CM", "DEG"), help="of each frame by itself")
+    parser.add_argument("--slow", action="store_true", help="pose noise that drifts")
     parser.add_argument("--picture", type=Path, help="PNG of the first room")
     given = parser.parse_args()
     if "off" not in given.modes:
@@ -422,7 +459,9 @@ def main() -> None:
         stretches = (log_stretch(Path(given.what), start, given.frames) for start in (0, given.frames))
     result: list[dict[str, dict[str, Any]]] = []
     for stretch in stretches:
-        figures, runs, static = map_stretch(stretch, given.modes)
+        if given.pose_noise:
+            stretch = with_wrong_poses(stretch, *given.pose_noise, slow=given.slow)
+        figures, runs, static = map_stretch(stretch, given.modes, given.weights)
         if given.picture and not result:
             draw(given.picture, runs, static)
         result.append(figures)

@@ -381,7 +381,7 @@ QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling
 class MovingConfig(Config, frozen=True):
     """What moves is left out of the map (``mapping/moving.py``): it would be a wall where it has gone by."""
 
-    motion: bool = False  # where measured depth shows something in space that was free within the last seconds
+    motion: bool = True  # where measured depth shows something in space that was free within the last seconds
     classes: bool = False  # where the rendered class moves by itself (``labels.MOVING_NAMES``)
 
 

@@ -208,7 +208,7 @@ class _Mapper:
                     if self._end(message):
                         return
                 case _:
-                    pass
+                    self._forget_what_moves()
             self._note_correction()
             self._correction.carry_on(self._session, mapped=isinstance(message, PosedFrame))
             if self._weights is not None:
@@ -222,6 +222,14 @@ class _Mapper:
                 give_back_freed_memory()
                 self._last_trim = time.monotonic()
         self._ended_by = self._context.stop.name
+
+    def _forget_what_moves(self) -> None:
+        """Where frames have ceased, nothing is known any more of where what moves is."""
+        from semantic_mapper.mapping.moving import KEPT_S
+
+        silent_s = self._frames.silent_s
+        if silent_s is not None and silent_s > KEPT_S:
+            self._bundle.pipeline.moving.space.clear()
 
     def finish(self) -> None:
         """Write what there is."""
@@ -381,8 +389,9 @@ class _Mapper:
         pictures = self._bundle.pipeline.picture_check
         counters |= pictures.counters
         degraded += pictures.warnings
-        if self._bundle.pipeline.pose_check.warning:
-            degraded += (self._bundle.pipeline.pose_check.warning,)
+        degraded += tuple(
+            w for w in (self._bundle.pipeline.pose_check.warning, self._bundle.pipeline.moving.warning) if w
+        )
         if self._queries is not None:
             counters |= {"answered": self._queries.answered, "abandoned": self._queries.abandoned}
             if not self._queries.alive:

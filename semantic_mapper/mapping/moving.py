@@ -5,10 +5,12 @@ seconds, kept as small depth images, and no layer of the map: where a view of th
 has come there. So a thing that stays becomes part of the map after this time, whatever it is, and memory is bounded.
 
 A cell of ``CELLS`` across the image has the nearest depth of its pixels. It contradicts a view where all that the view
-measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things, depth edges and
-poses that are a little off say nothing. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then
-grows, cell by cell, along its own surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its
-inside, which it hid itself.
+measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things and depth edges
+say nothing. Poses that are off by a few centimetres would look like motion: a frame is first aligned with views of
+these seconds (``view_alignment.py``). Where that does not fit, or what it changes leaps from frame to frame, the poses
+are wrong and nothing is found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows,
+cell by cell, along its own surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside,
+which it hid itself.
 
 Not found: what moves away along the line of sight (it hid the space where it is now), what had moved before it was seen
 for the first time, and what is slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through
@@ -18,6 +20,7 @@ it (``fusion/clearing.py``).
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -25,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.geometry import invert_pose, transform
-from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
+from semantic_mapper.mapping.view_alignment import Alignment, SlopedViews, align_pose, depth_slopes
+from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame
 
 BEYOND_M = np.float32(1e4)  # depth of what is left out, where no depth would mean free space
 CELLS = 80  # across the longer side of the image
@@ -34,7 +38,10 @@ SURE_S = 0.8  # a surface that a view of so long ago saw at the same place does 
 MOST_VIEWS = 48  # of all cameras together
 MARGIN_M, MARGIN_PER_M = 0.1, 0.03
 LEAST_CELLS = 4
-MOST_MOVING = 0.5  # fraction of the measured cells: where more contradict, it is the pose that is wrong
+MOST_MISFIT = 0.4  # median distance from surfaces seen before, in margins; where it is more, the pose is wrong
+LEAP_M, LEAP_RAD, LEAPS = 0.11, 0.035, 9  # change of what a pose is off by; where the median of so many is more, noise
+FAR = 2.0  # ranges of the map: what is measured up to there shows free space; beyond, it may be no measurement
+ALIGN_VIEWS, ALIGN_STRIDE = 4, 3  # views to align with; of cells that are used for it
 GROWTH = 6  # cells
 HOLES, LEAST_AROUND = 3, 5  # rounds in which cells are filled that have so many moving ones of the eight around
 STEP_M, STEP_PER_M = 0.1, 0.02  # between neighbouring cells of one surface
@@ -62,8 +69,9 @@ class MovingSpace:
             moving: (H, W) pixels of it; every ``STRIDE``-th along rows and columns is kept.
         """
         assert frame.depth_m is not None
-        since = frame.stamp_ns - KEPT_S * _SECOND
-        parts = [(stamp, points) for stamp, points in self._parts if since <= stamp <= frame.stamp_ns]
+        latest = max((stamp for stamp, _ in self._parts), default=frame.stamp_ns)
+        latest = frame.stamp_ns if latest - frame.stamp_ns > KEPT_S * _SECOND else max(latest, frame.stamp_ns)
+        parts = [(stamp, points) for stamp, points in self._parts if 0 <= latest - stamp <= KEPT_S * _SECOND]
         v, u = (STRIDE * i for i in np.nonzero(moving[::STRIDE, ::STRIDE]))
         if len(v):
             k, z = frame.intrinsics, frame.depth_m[v, u].astype(np.float64)
@@ -85,7 +93,8 @@ class MovingSpace:
 class _Cells(NamedTuple):
     """Nearest depth of cells (h, w), metres, 0 = none, and whether most of it is measured."""
 
-    near: Float32
+    near: Float32  # beyond the range of the map, too: what is before it is free
+    inside: Float32  # the same within the range of the map
     full: Bool
     size: int  # pixels across
 
@@ -100,18 +109,26 @@ class _View(NamedTuple):
     centre: tuple[float, float]
     near: Float32
     around: Float32  # 0 where not all of it is measured
+    slopes: Float32  # of ``depth_slopes``
 
 
 class MotionDetector:
-    """Finds what moves by depth alone. Deterministic; the only clock is the frames' stamps."""
+    """Finds what moves by depth alone. Deterministic; the only clock is the frames' stamps.
+
+    Attributes:
+        poses_fit: Whether the pose of the last frame does, and those before it; else nothing is found.
+    """
 
     def __init__(self, depth_max_m: float) -> None:
         self._depth_max_m = depth_max_m
         self._views: deque[_View] = deque(maxlen=MOST_VIEWS)
+        self._corrections: dict[str, deque[Float64]] = {}  # of the poses of a camera, metres and radians
+        self.poses_fit = True
 
     def clear(self) -> None:
         """Forget what was seen, where poses of frames to come are in another world."""
         self._views.clear()
+        self._corrections.clear()
 
     def find(self, frame: PosedFrame) -> Bool:
         """Pixels (H, W) of what moves; what the frame sees is remembered for later ones.
@@ -120,29 +137,75 @@ class MotionDetector:
             frame: With measured depth and a rigid pose.
         """
         assert frame.depth_m is not None
-        cells = _cells(frame.depth_m, self._depth_max_m)
-        views = [v for v in self._views if 0 <= frame.stamp_ns - v.stamp_ns <= SETTLED_S * _SECOND]
-        self._views = deque(views, MOST_VIEWS)
+        depth = frame.depth_m
+        cells = _cells(depth, self._depth_max_m)
+        latest = max((v.stamp_ns for v in self._views), default=frame.stamp_ns)
+        if latest - frame.stamp_ns > SETTLED_S * _SECOND:
+            self.clear()  # stamps have gone back
+            latest = frame.stamp_ns
+        latest = max(latest, frame.stamp_ns)
+        kept = [v for v in self._views if latest - v.stamp_ns <= SETTLED_S * _SECOND]
+        self._views = deque(kept, MOST_VIEWS)
+        views = [v for v in kept if v.stamp_ns <= frame.stamp_ns]
         moving = np.zeros(cells.near.shape, np.bool_)
-        if views and (cells.near > 0).any():
+        aligned = _align(frame, cells, views)
+        self.poses_fit = aligned is None or aligned.misfit <= MOST_MISFIT
+        if not self.poses_fit:
+            return np.zeros(depth.shape, np.bool_)
+        if aligned is not None:
+            frame = replace(frame, T_world_camera=aligned.T_world_camera)
+            self.poses_fit = self._is_steady(frame.camera_id, aligned.moved)
+        if self.poses_fit and views and (cells.inside > 0).any():
             free, seen = _seen_before(frame, cells, views)
-            if free.sum() <= MOST_MOVING * (cells.near > 0).sum():
-                moving = _filled(_grown(_without_specks(free), cells.near, ~(free | seen)), cells.near)
-        last = max((v.stamp_ns for v in views if v.camera_id == frame.camera_id), default=None)
+            moving = _filled(_grown(_without_specks(free), cells.inside, ~(free | seen)), cells.inside)
+        last = max((v.stamp_ns for v in kept if v.camera_id == frame.camera_id), default=None)
         if last is None or frame.stamp_ns // _EVERY_NS > last // _EVERY_NS:  # whichever frame was the first one
             self._views.append(_view(frame, cells))
-        return _pixels(moving, cells, frame.depth_m)
+        return _pixels(moving, cells, depth)
+
+    def _is_steady(self, camera_id: str, moved: Float64) -> bool:
+        """Whether what poses of a camera are off by does not leap from frame to frame, as noise does."""
+        last = self._corrections.setdefault(camera_id, deque(maxlen=LEAPS + 1))
+        last.append(moved)
+        leaps = np.abs(np.diff(np.array(last), axis=0))
+        far = np.maximum(np.linalg.norm(leaps[:, :3], axis=1) / LEAP_M, np.linalg.norm(leaps[:, 3:], axis=1) / LEAP_RAD)
+        return len(far) == 0 or float(np.median(far)) <= 1
+
+
+def _align(frame: PosedFrame, cells: _Cells, views: list[_View]) -> Alignment | None:
+    """Where views of its camera say that the frame was; None where there are none."""
+    views = [v for v in views if v.camera_id == frame.camera_id and v.near.shape == cells.near.shape]
+    if not views:
+        return None
+    views = [views[i] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, ALIGN_VIEWS)})]
+    v, u = (ALIGN_STRIDE * i for i in np.nonzero(cells.inside[::ALIGN_STRIDE, ::ALIGN_STRIDE]))
+    points = _points(frame, cells, v, u).astype(np.float32)
+    sloped = SlopedViews(
+        np.stack([v.T_camera_world for v in views]),
+        np.array([v.focal for v in views], np.float32),
+        np.array([v.centre for v in views], np.float32),
+        np.stack([v.slopes for v in views]),
+    )
+    return align_pose(points, frame.T_world_camera, sloped, (MARGIN_M, MARGIN_PER_M))
+
+
+def _points(frame: PosedFrame, cells: _Cells, v: Int64, u: Int64) -> Float64:
+    """(N, 3) in the camera, of cells at rows ``v`` and columns ``u``."""
+    focal, centre = _intrinsics(frame, cells.size)
+    rays = np.stack(((u - centre[0]) / focal[0], (v - centre[1]) / focal[1], np.ones(len(u))), axis=1)
+    return cells.inside[v, u][:, None] * rays
 
 
 def _cells(depth: Float32, depth_max_m: float) -> _Cells:
     size = max(1, round(max(depth.shape) / CELLS))
     h, w = depth.shape[0] // size, depth.shape[1] // size
-    known = (depth > 0) & (depth <= depth_max_m)  # not NaN
+    known = (depth > 0) & (depth <= FAR * depth_max_m)  # not NaN
     values = np.where(known, depth, np.float32(np.inf))[: h * size, : w * size]
     near = values.reshape(h, size, w * size).min(axis=1).reshape(h, w, size).min(axis=2)
     count = known[: h * size, : w * size].reshape(h, size, w * size).sum(axis=1, dtype=np.uint16)
     full = count.reshape(h, w, size).sum(axis=2) >= _FULL * size * size
-    return _Cells(np.where(np.isfinite(near), near, 0).astype(np.float32), full, size)
+    near = np.where(np.isfinite(near), near, 0).astype(np.float32)
+    return _Cells(near, np.where(near <= depth_max_m, near, np.float32(0)), full, size)
 
 
 def _intrinsics(frame: PosedFrame, size: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -163,30 +226,28 @@ def _view(frame: PosedFrame, cells: _Cells) -> _View:
         centre,
         cells.near,
         np.asarray(around, np.float32),
+        depth_slopes(cells.inside),
     )
 
 
 def _seen_before(frame: PosedFrame, cells: _Cells, views: list[_View]) -> tuple[Bool, Bool]:
     """Cells (h, w) where a view saw free space, and where one of some time ago saw a surface."""
-    v, u = np.nonzero(cells.near)
-    z = cells.near[v, u]
-    focal, centre = _intrinsics(frame, cells.size)
-    rays = np.stack(((u - centre[0]) / focal[0], (v - centre[1]) / focal[1], np.ones(len(u))), axis=1)
-    points = ((z[:, None] * rays) @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]).astype(np.float32)
+    v, u = np.nonzero(cells.inside)
+    points = np.ascontiguousarray(transform(frame.T_world_camera, _points(frame, cells, v, u)).T, np.float32)
     free, seen = np.zeros(len(u), np.bool_), np.zeros(len(u), np.bool_)
     for view in views:
         T = view.T_camera_world.astype(np.float32)
-        p = points @ T[:3, :3].T + T[:3, 3]
+        px, py, depth = T[:3, :3] @ points + T[:3, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            x = np.rint(p[:, 0] / p[:, 2] * view.focal[0] + view.centre[0])
-            y = np.rint(p[:, 1] / p[:, 2] * view.focal[1] + view.centre[1])
-        inside = (p[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < view.near.shape[1]) & (y < view.near.shape[0])
-        at = np.flatnonzero(inside)
-        yi, xi, depth = y[at].astype(np.int64), x[at].astype(np.int64), p[at, 2]
+            x = np.rint(px / depth * view.focal[0] + view.centre[0])
+            y = np.rint(py / depth * view.focal[1] + view.centre[1])
+        h, w = view.near.shape
+        at = np.flatnonzero((depth > 0) & (x >= 0) & (y >= 0) & (x < w) & (y < h))
+        cell, depth = y[at].astype(np.int64) * w + x[at].astype(np.int64), depth[at]
         margin = MARGIN_M + MARGIN_PER_M * depth
-        free[at] |= view.around[yi, xi] > depth + margin
+        free[at] |= view.around.ravel()[cell] > depth + margin
         if frame.stamp_ns - view.stamp_ns >= SURE_S * _SECOND:
-            seen[at] |= np.abs(view.near[yi, xi] - depth) <= margin
+            seen[at] |= np.abs(view.near.ravel()[cell] - depth) <= margin
     images = np.zeros((2, *cells.near.shape), np.bool_)
     images[0, v, u], images[1, v, u] = free, seen
     return images[0], images[1]
@@ -239,9 +300,9 @@ def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> NDArray[np.bool_]:
     """Pixels (H, W) of moving cells and those beside them that are as near as what moves there."""
     if not moving.any():
         return np.zeros(depth.shape, np.bool_)
-    farthest = np.where(moving, cells.near * (1 + STEP_PER_M) + STEP_M, 0).astype(np.float32)
+    farthest = np.where(moving, cells.inside * (1 + STEP_PER_M) + STEP_M, 0).astype(np.float32)
     farthest = np.asarray(cv2.dilate(farthest, np.ones((3, 3), np.uint8)))
-    nearest = np.where(moving, cells.near * (1 - STEP_PER_M) - STEP_M, np.float32(np.inf)).astype(np.float32)
+    nearest = np.where(moving, cells.inside * (1 - STEP_PER_M) - STEP_M, np.float32(np.inf)).astype(np.float32)
     nearest = np.asarray(cv2.erode(nearest, np.ones((3, 3), np.uint8)))
     found = np.zeros(depth.shape, np.bool_)
     h, w = moving.shape[0] * cells.size, moving.shape[1] * cells.size

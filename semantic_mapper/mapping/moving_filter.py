@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 import cv2
@@ -10,10 +11,24 @@ import numpy as np
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import MOVING_NAMES, LabelSet
+from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.mapping.moving import BEYOND_M, EVERY_S, SETTLED_S, MotionDetector, MovingSpace
 from semantic_mapper.types import Bool, PosedFrame, UInt8
 
+_log = get_logger(__name__)
+
 EDGE_PX = 2  # around what moves, where depth may be between it and what is behind
+
+RECENT = 30  # frames that a warning is about
+MUCH = 0.3  # fraction of the pixels; where half of the frames leave out more, people are warned
+POSES_OFF = (
+    "moving: poses do not fit the depth of the seconds before, so nothing is left out as moving: check their stamps, "
+    "T_world_camera or T_base_camera and the calibration; moving.motion = false ends the search"
+)
+MUCH_LEFT_OUT = (
+    f"moving: more than {MUCH:.0%} of the pixels are left out as moving and not mapped: either something fills the "
+    "picture, or poses drift: check them against the map; moving.motion = false maps what does not move by its class"
+)
 
 
 class MovingFilter:
@@ -27,6 +42,7 @@ class MovingFilter:
         pixels: Left out so far.
         space: Where what moves was within the last second.
         uses_classes: Whether classes of ``label_set`` move.
+        warning: What is wrong with the last ``RECENT`` frames and how to mend it, for people; empty where all is well.
 
     Raises:
         ConfigError: ``moving.classes``, and none of the classes does.
@@ -43,6 +59,9 @@ class MovingFilter:
                 "weights that know one, or moving.motion"
             )
         self.pixels = 0
+        self.warning = ""
+        self._recent: deque[tuple[bool, float]] = deque(maxlen=RECENT)  # whether poses fit; fraction that moves
+        self._warned = 0
         self.space = MovingSpace()
 
     @property
@@ -69,6 +88,20 @@ class MovingFilter:
         """Count what was left out of a frame (its depth as it came), and keep for a second where that was."""
         self.pixels += int(moving.sum())
         self.space.add(frame, moving)
+        self._recent.append((self._motion.poses_fit, float(moving.mean())))
+        before, self.warning = self.warning, self._judge()
+        if self.warning and self.warning != before:
+            self._warned += 1
+            if is_power_of_two(self._warned):
+                _log.warning("motion_is_in_doubt", seq=frame.seq, camera=frame.camera_id, reason=self.warning)
+
+    def _judge(self) -> str:
+        fit, fraction = np.array(self._recent).T
+        if len(fit) < RECENT:
+            return ""
+        if fit.mean() < 0.5:
+            return POSES_OFF
+        return MUCH_LEFT_OUT if np.median(fraction) > MUCH else ""
 
     def leave_out(self, frame: PosedFrame, moving: Bool) -> PosedFrame:
         """The frame without depth where it shows what moves, and at its edges: neither surface nor seen through."""
@@ -81,6 +114,8 @@ class MovingFilter:
         """Forget the last seconds: poses of frames to come are in another world."""
         self._motion.clear()
         self.space.clear()
+        self._recent.clear()
+        self.warning = ""
 
     def again(self, *, whole: bool) -> MovingAgain:
         """What decides once more in a rebuild; ``whole``: it begins with the first frame of the map."""

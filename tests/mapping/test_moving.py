@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import CARLA, NYU40, ROOMS
 from semantic_mapper.mapping.moving import BEYOND_M, SETTLED_S, MotionDetector, MovingSpace
+from semantic_mapper.mapping.moving_filter import MUCH_LEFT_OUT, POSES_OFF, MovingFilter
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.types import Bool, CameraIntrinsics, PosedFrame
+from semantic_mapper.types import Bool, CameraIntrinsics, Float64, PosedFrame
 from tests.small import tiny_config, tiny_field
 
 CAMERA = CameraIntrinsics(130.0, 130.0, 79.5, 59.5, 160, 120)
@@ -78,7 +80,70 @@ def test_a_pose_that_jumps_is_no_motion() -> None:
     detector.find(scene(0, None)[0])
     frame, _ = scene(3, None)
     assert frame.depth_m is not None
-    assert not detector.find(replace(frame, depth_m=frame.depth_m - 1)).any()
+    assert not detector.find(replace(frame, depth_m=frame.depth_m - 1)).any() and not detector.poses_fit
+
+
+def corner(number: int, pose: Float64, thing_m: float | None = None) -> PosedFrame:
+    """Two walls and a floor that meet before the camera, and a thing as wide as half of the picture, exact."""
+    v, u = np.mgrid[:120, :160]
+    rays = np.stack(((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones((120, 160))), axis=-1)
+    rays, origin = rays @ pose[:3, :3].T, pose[:3, 3]
+    depth = np.full((120, 160), np.inf)
+    for normal, distance in (((0.6, 0.0, 0.8), 2.6), ((-0.6, 0.0, 0.8), 2.4), ((0.0, 1.0, 0.0), 1.0)):
+        with np.errstate(divide="ignore"):
+            z = (distance - origin @ np.array(normal)) / (rays @ np.array(normal))
+        depth = np.where(z > 0, np.minimum(depth, z), depth)
+    if thing_m is not None:
+        depth[:, 20:120] = thing_m
+    rgb = np.zeros((120, 160, 3), np.uint8)
+    return PosedFrame(number * 10**9 // HZ, number, "front", rgb, depth.astype(np.float32), None, CAMERA, pose)
+
+
+def off_by(sigma_m: float, sigma_deg: float, rng: np.random.Generator) -> Float64:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rng.normal(0, np.deg2rad(sigma_deg), 3)).as_matrix()
+    T[:3, 3] = rng.normal(0, sigma_m, 3)
+    return T
+
+
+@pytest.mark.parametrize(("sigma_m", "sigma_deg", "fit"), [(0.02, 0.5, True), (0.1, 3.0, False)])
+def test_poses_that_are_off_are_put_right_or_known_to_be_wrong(sigma_m: float, sigma_deg: float, fit: bool) -> None:
+    detector, rng, found, fits = MotionDetector(6.0), np.random.default_rng(3), 0, 0
+    for number in range(40):
+        frame = corner(number, np.eye(4))
+        found += int(detector.find(replace(frame, T_world_camera=off_by(sigma_m, sigma_deg, rng))).sum())
+        fits += detector.poses_fit
+    assert found < 0.01 * 40 * 120 * 160 and (fits == 40 if fit else fits < 10)
+
+
+def test_what_fills_most_of_the_picture_is_found() -> None:
+    detector = MotionDetector(6.0)
+    for number in range(5):
+        assert not detector.find(corner(number, np.eye(4))).any()
+    found = detector.find(corner(5, np.eye(4), thing_m=0.8))
+    assert found[:, 22:118].mean() > 0.9 and found[:, 130:].mean() < 0.05
+
+
+def test_before_a_background_beyond_the_range_of_the_map_motion_is_found() -> None:
+    detector = MotionDetector(WALL_M - 0.3)
+    detector.find(scene(0, None)[0])
+    frame, thing = scene(3, 60)
+    found = detector.find(frame)
+    assert (found & thing).sum() > 0.8 * thing.sum() and (found & ~thing).sum() < 0.1 * thing.sum()
+
+
+def test_a_late_frame_keeps_what_newer_ones_saw_and_stamps_that_go_back_do_not() -> None:
+    detector = MotionDetector(6.0)
+    for number in range(9, 12):
+        detector.find(scene(number, None)[0])
+    detector.find(scene(1, None)[0])  # late
+    frame, thing = scene(13, 60)
+    assert (detector.find(frame) & thing).sum() > 0.8 * thing.sum()
+    detector = MotionDetector(6.0)
+    detector.find(scene(100, None)[0])
+    for number in range(3):
+        assert not detector.find(scene(number, 60)[0]).any()
+    assert not detector.find(scene(3, 60)[0]).any(), "the log has begun again, with the thing in it"
 
 
 def pipeline(**moving: bool) -> MappingPipeline:
@@ -130,7 +195,9 @@ def test_a_correction_of_poses_decides_again_what_moved() -> None:
     assert all(np.array_equal(ours[name], theirs[name]) for name in ("keys", "tsdf", "weight"))
     frame, _ = scene(12, 150, shift_m=0.36)
     told, expected = corrected.step(frame).moving, right.step(frame).moving
-    assert expected is not None and expected.any() and np.array_equal(told, expected), "and goes on with what it knows"
+    assert told is not None and expected is not None and expected.any() and np.array_equal(told, expected), (
+        "and goes on with what it knows"
+    )
 
 
 def shifted(T_world_camera: np.ndarray, by_m: np.ndarray) -> np.ndarray:
@@ -167,8 +234,26 @@ def test_where_it_moved_is_kept_for_a_second() -> None:
     space.add(frame, thing)
     x = space.points[:, 0]
     assert np.abs(space.points[:, 2] - THING_M).max() < 0.2 and -0.3 < x.min() < x.max() < 0.2
+    space.add(scene(48, None)[0], np.zeros_like(thing))  # late
+    assert len(space.points)
     space.add(scene(1, None)[0], np.zeros_like(thing))  # stamps that go back start over
     assert not len(space.points)
+
+
+def test_what_is_in_doubt_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("semantic_mapper.mapping.moving_filter.RECENT", 10)
+    filter_, rng = MovingFilter(tiny_config(), ROOMS), np.random.default_rng(3)
+
+    def told(number: int, T_world_camera: Float64, thing_m: float | None = None) -> str:
+        frame = corner(number, np.eye(4), thing_m)
+        frame = replace(frame, T_world_camera=T_world_camera)
+        filter_.note(frame, filter_.find(frame))
+        return filter_.warning
+
+    assert [told(n, off_by(0.1, 3.0, rng)) for n in range(20)][-1] == POSES_OFF
+    filter_.clear()
+    assert not filter_.warning and {told(n, np.eye(4)) for n in range(20, 32)} == {""}
+    assert [told(n, np.eye(4), 0.8) for n in range(32, 46)][-1] == MUCH_LEFT_OUT
 
 
 def test_classes_that_move_by_themselves_have_names() -> None:

@@ -283,7 +283,7 @@ def test_fewer_rays_give_nearly_the_same_view_and_a_map_that_repeats():
 
 def test_every_stage_is_timed():
     update = make_pipeline().step(tiny_frames()[0])
-    assert set(update.stage_ms) == {"encode", "choose", "render", "lift", "fuse", "keyframe"}
+    assert set(update.stage_ms) == {"encode", "choose", "render", "motion", "lift", "fuse", "keyframe"}
     assert all(v >= 0 for v in update.stage_ms.values())
 
 
