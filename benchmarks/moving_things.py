@@ -437,9 +437,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640, help="of the pictures of rooms")
     parser.add_argument("--exact", action="store_true", help="rooms without noise and holes in depth")
     parser.add_argument("--modes", nargs="+", choices=tuple(MODES), default=["off", "motion", "truth"])
-    parser.add_argument(
-        "--weights", type=Path, help="S-Ray with these weights tells the classes"
-    )
+    parser.add_argument("--weights", type=Path, help="S-Ray with these weights tells the classes")
     parser.add_argument("--pose-noise", nargs=2, type=float, metavar=("CM", "DEG"), help="of each frame by itself")
     parser.add_argument("--slow", action="store_true", help="pose noise that drifts")
     parser.add_argument("--picture", type=Path, help="PNG of the first room")
