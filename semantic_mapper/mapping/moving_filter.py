@@ -56,7 +56,7 @@ class MovingFilter:
             names = ", ".join(sorted(MOVING_NAMES))
             raise ConfigError(
                 f"moving.classes: none of the classes of '{label_set.name}' moves by itself ({names} would); use "
-                "weights that know one, or moving.motion"
+                "weights that know one (`rooms-people` ship), or moving.motion"
             )
         self.pixels = 0
         self.warning = ""

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray_streaming import StreamingSRay
-from semantic_mapper.labels import CARLA, NYU40, ROOMS
+from semantic_mapper.labels import CARLA, KITTI360, NYU40, ROOMS
 from semantic_mapper.mapping.moving import BEYOND_M, SETTLED_S, MotionDetector, MovingSpace
 from semantic_mapper.mapping.moving_filter import MUCH_LEFT_OUT, POSES_OFF, MovingFilter
 from semantic_mapper.mapping.pipeline import MappingPipeline
@@ -258,7 +258,8 @@ def test_what_is_in_doubt_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_classes_that_move_by_themselves_have_names() -> None:
     assert [NYU40.names[NYU40.ids.index(i)] for i in NYU40.moving_ids()] == ["person"]
-    assert [CARLA.names[CARLA.ids.index(i)] for i in CARLA.moving_ids()] == ["pedestrian"] and not ROOMS.moving_ids()
+    assert [CARLA.names[CARLA.ids.index(i)] for i in CARLA.moving_ids()] == ["pedestrian"]
+    assert ROOMS.moving_ids() == (ROOMS.id_of("person"),) and not KITTI360.moving_ids()
 
 
 def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,8 +267,8 @@ def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPat
     off = pipeline(motion=False)
     label = np.concatenate([off.step(f).label.ravel() for f in frames])
     common = int(np.bincount(label[label != ROOMS.ignore_id]).argmax())
-    with pytest.raises(ConfigError, match="none of the classes of 'rooms' moves"):
-        pipeline(classes=True)
+    with pytest.raises(ConfigError, match="none of the classes of 'kitti360' moves"):
+        MovingFilter(tiny_config(moving={"classes": True}), KITTI360)
     monkeypatch.setattr("semantic_mapper.labels.MOVING_NAMES", {ROOMS.names[ROOMS.ids.index(common)]})
     on = pipeline(classes=True, motion=False)
     updates = [on.step(f) for f in frames]
