@@ -23,6 +23,7 @@ from semantic_mapper.errors import CodecError, MapError, NodeError, SemanticMapp
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
+from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import BridgeOptions
 from semantic_mapper.nodes.streams import Streams
@@ -61,12 +62,12 @@ class Outlet(Protocol):
         """Whether anybody receives what messages of a camera on this topic hold: else they are not even decoded."""
         ...
 
-    def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
-        """Where a camera was, of every frame."""
+    def note_pose(self, camera_id: str, T_map_camera: Float64) -> None:
+        """Where a camera was in the map, of every frame of which that is known."""
         ...
 
-    def send_frame(self, frame: PosedFrame) -> None:
-        """One camera image with its pose."""
+    def send_frame(self, frame: PosedFrame, T_map_camera: Float64 | None) -> None:
+        """One camera image with its pose in the map; None while that is not known."""
         ...
 
     def send_update(self, update: MapUpdate) -> None:
@@ -107,7 +108,7 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
         follower = stack.enter_context(_MapFollower(client, outlet, options))
         messages = stack.enter_context(NewestSubscriber(endpoints, ("frame", "map", "status", "end")))
         told = _Told(context.name, publisher, messages, follower)
-        streams = Streams(len(options.cameras))
+        streams, poses = Streams(len(options.cameras)), MapPoses()
         context.heartbeat.ready()
         while not context.stop and not streams.ended:
             context.heartbeat.turn()
@@ -115,7 +116,7 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
                 raise NodeError("the map is no longer sent: the thread that does so has ended; its error is above")
             if (parts := messages.receive_parts(POLL_S)) is not None:
                 try:
-                    _hand_on(parts, outlet, follower, streams)
+                    _hand_on(parts, outlet, follower, streams, poses)
                 except CodecError as error:  # of what its sender itself could not read
                     _log.warning("message_left_out", reason=str(error))
             told.tell("running")
@@ -124,7 +125,7 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
         told.tell("ended", now=True)
 
 
-def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams: Streams) -> None:
+def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams: Streams, poses: MapPoses) -> None:
     """One message of a node.
 
     Raises:
@@ -135,10 +136,13 @@ def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams
         case "frame":
             follower.stamp_ns = envelope.stamp_ns
             follower.frames += 1
-            outlet.note_pose(envelope.source, np.array(envelope.T_world_camera, np.float64).reshape(4, 4))
+            T_map_camera = poses.place(envelope.world, envelope.T_world_camera)
+            if T_map_camera is not None:
+                outlet.note_pose(envelope.source, T_map_camera)
             if outlet.wants("frame", envelope.source):
-                outlet.send_frame(decode_as(PosedFrame, parts))
+                outlet.send_frame(decode_as(PosedFrame, parts), T_map_camera)
         case "map":
+            poses.note(envelope.world, envelope.T_map_world)
             if outlet.wants("map", envelope.source):
                 outlet.send_update(decode_as(MapUpdate, parts))
         case "status":

@@ -116,6 +116,10 @@ class MapWorlds:
             return ""
         return f"{len(self._held)} frames are held until their place in the map is known: {self.reason or 'looking'}"
 
+    def where(self, world: int) -> Float64:
+        """T_map_world (4, 4) of a known world, for frames that come now."""
+        return move(self._motion(), self.known[world])
+
     def take(self, frame: PosedFrame) -> Taken:
         """Take the next frame. One whose pose is not valid goes on to where it is refused."""
         try:

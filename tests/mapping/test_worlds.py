@@ -80,6 +80,9 @@ def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
             assert last.T_map_camera is None and last.reason
         else:
             assert last.T_map_camera is not None and off(last.T_map_camera, frame.T_world_camera)[0] < 0.05
+            told = results[-1]
+            assert isinstance(told, MapUpdate) and told.world == 7
+            np.testing.assert_allclose(told.T_map_world @ abroad(frame).T_world_camera, last.T_map_camera, atol=1e-9)
     assert held >= 2 and session.worlds.found == 1 and not session.worlds.held
     moved, turned = off(session.worlds.known[7], invert_pose(other_world()))
     assert moved < 0.1 and turned < 1.0  # where the map's origin lies, metres away
