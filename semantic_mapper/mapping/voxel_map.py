@@ -391,19 +391,28 @@ class VoxelMap:
             return MapSaving(self.locked, manifest, self.instances, self.places.places)
 
     @classmethod
-    def load(cls, path: Path, memory_mb: int | None = None) -> VoxelMap:
+    def load(cls, path: Path, memory_mb: int | None = None, config: VoxelMapConfig | None = None) -> VoxelMap:
         """Read a saved map; it is the saved one bit for bit and can go on integrating.
 
         Args:
             path: What ``save`` wrote.
             memory_mb: In place of the saved setting, for a machine with less memory, say; 0 = no limit.
+            config: In place of all saved settings.
 
         Raises:
+            ConfigError: ``config`` contradicts what is stored (``VoxelMapConfig.stored``).
             MapError: no such file, not a map, of another format version, or damaged (and what is).
         """
         with open_map(path) as reader:
             saved = reader.manifest
-            config = saved.config if memory_mb is None else replace(saved.config, memory_mb=memory_mb)
+            config = config or saved.config
+            for name in VoxelMapConfig.stored:
+                if getattr(config, name) != (kept := getattr(saved.config, name)):
+                    raise ConfigError(
+                        f"{path}: was made with voxel_map.{name} = {kept!r} and cannot go on with "
+                        f"{getattr(config, name)!r}: leave that out"
+                    )
+            config = config if memory_mb is None else replace(config, memory_mb=memory_mb)
             try:
                 loaded = cls(config, saved.label_set)
                 loaded._grid.reserve(saved.blocks)
