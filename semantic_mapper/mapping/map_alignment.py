@@ -9,7 +9,7 @@ import numpy as np
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import project
-from semantic_mapper.localization.consensus import AGREEING, agreed, agreeing_with, best_consensus, sighting
+from semantic_mapper.localization.consensus import agreed, find_consensus, sighting
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import Place
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
@@ -20,7 +20,6 @@ from semantic_mapper.types import CameraIntrinsics, Float64
 
 LOOKED_FOR = 60  # places, at most
 SURE = 0.7  # confidence from which on a class counts
-_RIVAL = 0.5  # of the places that agree: so many that say something else are too many
 _VIEW = CameraIntrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 _WAY_OUT = 'Give it: --transform "x y z yaw_deg", or "0 0 0 0" where both are in one world'
 
@@ -64,20 +63,14 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
             reasons[found.reason] += 1
         else:
             seen.append(sighting(found.T_map_camera, place.T_world_camera, found.inliers))
-    best = best_consensus(seen)
-    if len(best) < AGREEING:
+    consensus = find_consensus(seen)
+    if consensus.refusal:
         told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         raise MapError(
-            f"where the maps lie cannot be found: {len(best)} of {len(chosen)} places of the second are at one with "
-            f"the first, {AGREEING} have to be ({told}). {_WAY_OUT}"
+            f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
+            f"first ({told or 'none was refused'}), and {consensus.refusal}. {_WAY_OUT}"
         )
-    rival = best_consensus([s for s in seen if not agreeing_with(s, best)])
-    if len(rival) > _RIVAL * len(best):
-        raise MapError(
-            f"where the maps lie cannot be told: {len(best)} places say one thing and {len(rival)} another, as of "
-            f"rooms that look alike. {_WAY_OUT}"
-        )
-    return MapAlignment(agreed(best), len(best), len(chosen))
+    return MapAlignment(agreed(consensus.agreeing), len(consensus.agreeing), len(chosen))
 
 
 def _find(finder: Relocalizer, other: VoxelMap, place: Place) -> Relocalized | NotFound:

@@ -16,7 +16,7 @@ import numpy as np
 
 from semantic_mapper.errors import PoseError
 from semantic_mapper.geometry import check_pose, invert_pose
-from semantic_mapper.localization.consensus import AGREEING, Sighting, agreed, agreeing_with, sighting
+from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction.pose_correction import move
@@ -164,14 +164,14 @@ class MapWorlds:
             self.refused[found.reason] += 1
             self.reason = found.detail
             return False
-        new = sighting(found.T_map_camera, frame.T_world_camera, found.inliers)
         seen = self._sightings.setdefault(frame.world, deque(maxlen=REMEMBERED))
-        seen.append(new)
-        agreeing = agreeing_with(new, seen)
-        if len(agreeing) < AGREEING:
+        seen.append(sighting(found.T_map_camera, frame.T_world_camera, found.inliers))
+        consensus = find_consensus(seen)
+        if consensus.refusal:
             self.refused["alone"] += 1
-            self.reason = f"{len(agreeing)} of {AGREEING} frames agree on it"
+            self.reason = consensus.refusal
             return False
+        agreeing = consensus.agreeing
         self.known[frame.world] = move(invert_pose(self._motion()), agreed(agreeing))
         self.found += 1
         del self._sightings[frame.world]
