@@ -79,7 +79,7 @@ class MapSession:
             self.pipeline.classify,
             own_first=own_first,
             whereabouts=self.pipeline.whereabouts,
-            motion=lambda: self.pipeline.corrector.motion,
+            motion=self.pipeline.corrector.motion,
         )
         self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
         self.published = 0
