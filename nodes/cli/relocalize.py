@@ -31,12 +31,18 @@ def relocalize(
     Example: semantic-mapper relocalize runs/yesterday today.mcap
     """
     output = Output.guarded()
+    from semantic_mapper.errors import MapError
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.saved_maps import map_path
     from semantic_mapper.replay.log.sequence import open_log
     from semantic_mapper.replay.relocalize import relocalize_frames
 
     voxel_map = VoxelMap.load(map_path(saved))
+    if not len(voxel_map.places):
+        raise MapError(
+            f"{saved}: has nothing to find oneself by: it was made without depth, by an older release, or with "
+            "keyframes.save_places = false; map its log again"
+        )
     with open_log((log,)) as frames:
         count = -(-len(frames) // every)
         count = min(count, max_frames or count)

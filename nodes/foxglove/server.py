@@ -155,9 +155,9 @@ class FoxgloveServer:
             camera.semantics.log(_picture(picture, "png", name, when), log_time=when)
         if camera.moving.has_sinks():
             camera.moving.log(_picture(to_png(moving_mask(update)), "png", name, when), log_time=when)
-        if self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
+        paths = {name: camera.path.poses for name, camera in self._cameras.items() if camera.path.poses}
+        if paths and self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
             self._path_sent = time.monotonic()
-            paths = {name: camera.path.poses for name, camera in self._cameras.items()}
             self._path.log(draw_path(paths, when), log_time=when)
 
     def send_status(self, status: Status) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from semantic_mapper.localization.consensus import agreed, find_consensus, sight
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import Place
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.merge import check_fit
 from semantic_mapper.mapping.map_scale import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -39,6 +41,32 @@ class MapAlignment:
     looked_for: int
 
 
+def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
+    """Refuse two saved maps without reading their blocks.
+
+    Args:
+        path, other: Of the first and the second.
+        find: Where the second lies in the first is to be found.
+
+    Raises:
+        MapError: they are the same map, or what is to be found cannot be; or one cannot be read.
+    """
+    with open_map(path) as one, open_map(other) as two:
+        manifests = one.manifest, two.manifest
+    if manifests[0].chunks and manifests[0].chunks == manifests[1].chunks:
+        raise MapError(f"{path} and {other} are the same map: all that it has seen would count twice")
+    for manifest, which in zip(manifests, ("first", "second"), strict=True):
+        if find and not (manifest.places and manifest.places.places):
+            raise MapError(_nothing_to_find(which))
+
+
+def _nothing_to_find(which: str) -> str:
+    return (
+        f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without depth, by an "
+        f"older release, or with keyframes.save_places = false). {_WAY_OUT}"
+    )
+
+
 def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     """Where another map lies in this one.
 
@@ -49,10 +77,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
         if not len(one.places):
-            raise MapError(
-                f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without "
-                f"depth, by an older release, or with keyframes.save_places = false). {_WAY_OUT}"
-            )
+            raise MapError(_nothing_to_find(which))
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
     seen = []

@@ -16,7 +16,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.localization.places import PlaceStore, moved_place
+from semantic_mapper.localization.places import PlaceStore, moved_place, shared_places
 from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.map_manifest import MapManifest
@@ -444,13 +444,18 @@ class VoxelMap:
             T_self_other: (4, 4) float64, where its frame lies in this map's.
 
         Raises:
-            MapError: the maps do not fit each other, only one is in metres, or the new one would grow past
-                ``max_blocks``.
+            MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or the new
+                one would grow past ``max_blocks``.
             PoseError: the pose is not a rigid transform.
         """
         check_pose(T_self_other, "merge")
         check_fit(self.config, self.label_set, other.config, other.label_set)
         require_same_scale(self.scale_known, other.scale_known, "merge")
+        if shared := shared_places(self.places.places, other.places.places):
+            raise MapError(
+                f"both maps were made with the same frames ({shared} of their places are of the same ones), which "
+                "would count twice; make one map of all logs instead"
+            )
         joined = VoxelMap(self.config, self.label_set)
         joined.note_scale(self.scale_known)
         joined.refined = self.refined or other.refined

@@ -155,6 +155,8 @@ def test_two_maps_of_a_room_find_each_other_and_others_do_not() -> None:
     for frame in walk()[1::2]:
         session.process(abroad(frame))
     found = find_alignment(even_map(), session.pipeline.voxel_map)
+    with pytest.raises(MapError, match="would count twice"):
+        even_map().merged(even_map(), np.eye(4))
     moved, turned = off(found.T_map_other @ other_world(), np.eye(4))
     assert found.agreeing >= 3 and moved < 0.04 and turned < 1.0
     elsewhere = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)

@@ -76,7 +76,7 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, address: str) ->
     frame, heard = tiny_frames()[2], Heard()
     camera = f"lab/robot/{frame.camera_id}"
     keys = {f"{camera}/{kind}" for kind in ("rgb", "depth", "semantics", "moving", "pose")}
-    keys |= {"lab/robot/map/points", "lab/robot/graph", "lab/robot/status/mapper"}
+    keys |= {"lab/robot/map/points", "lab/robot/graph", "lab/robot/status/mapper", "lab/robot/status/zenoh"}
     with robot.mapped(), session(address) as client:
         client.declare_subscriber("lab/robot/**", heard)
 
