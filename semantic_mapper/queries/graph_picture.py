@@ -22,7 +22,10 @@ LETTER_PX, PLAN_FRACTION = 7, 0.8  # width of a letter; how much of a picture it
 
 @rendered
 def draw_graph(title: str, graph: SceneGraph) -> Figure:
-    """Rooms in colours with id and area, doors as white dots with their width, things as dots, the large with class."""
+    """Rooms in colours with id and area, doors as white dots with their width, things as dots, the large with class.
+
+    A name that would cover another is left out.
+    """
     count = max(len(graph.floors), 1)
     figure = new_figure(FLOOR_WIDTH * count, FLOOR_HEIGHT, layout="constrained")
     figure.suptitle(cut(title, FLOOR_WIDTH * count - 30, TITLE_PT, "bold"), x=0.012, ha="left")
