@@ -2,7 +2,8 @@
 
 ``kitchen`` maps frames 0 to 99 of a log and looks for frames 100 to 199, whose poses are withheld. ``rooms`` maps test
 rooms and looks for views beside the mapped way in other light, and for views of other rooms, and of the same room
-mirrored, in which nothing may be found. Every frame counts alone: a live mapper waits for several that agree.
+mirrored, in which nothing may be found. Every frame counts alone: a live mapper waits for several that agree, and
+``kitchen`` tells where that would put a camera that starts at any of its frames.
 
 Example: python -m benchmarks.relocalization kitchen kitchen.mcap
          python -m benchmarks.relocalization rooms --rooms 20 --out rooms.json
@@ -26,10 +27,12 @@ from benchmarks.ghosts import map_frame
 from semantic_mapper.config import VoxelMapConfig, convert_config
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import MAX_FEATURES, PlaceStore, make_place
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.mapping.worlds import REMEMBERED
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import (
     TEST_SEEDS,
@@ -52,6 +55,7 @@ SPLITS = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS, "train": TRAIN_SEE
 PLACES = 20  # looked for in each room, and from other rooms
 NOISE = NoiseConfig()
 OTHER_LIGHT = NoiseConfig(exposure_stops=0.8, white_balance=0.25)
+AHEAD_M = 3.0  # errors of a locked-in world are told so far before the camera
 WITHIN_M, WITHIN_DEG = 0.10, 3.0  # of the truth: further off, a frame that was "found" was found falsely
 
 
@@ -85,11 +89,33 @@ def look_for(mapped: Mapped, frame: PosedFrame, truth: Float64 | None) -> dict[s
     if found.fit is not None:
         row |= {n: getattr(found.fit, n) for n in ("overlap", "agree", "through", "before", "likeness", "classes")}
     if truth is not None and found.T_map_camera is not None:
+        row["T_map_camera"] = found.T_map_camera.tolist()
         off = invert_pose(truth) @ found.T_map_camera
         row["off_m"] = float(np.linalg.norm(off[:3, 3]))
         row["off_deg"] = float(np.rad2deg(np.linalg.norm(rotation_vector(off))))
     row["false"] = row["found"] and not (row.get("off_m", 9.0) <= WITHIN_M and row.get("off_deg", 99) <= WITHIN_DEG)
     return row
+
+
+def locked_in(rows: list[dict[str, Any]], frames: list[PosedFrame]) -> dict[str, Any]:
+    """How far off a mapper would lock in the world of a camera that starts at any of these frames."""
+    seen = [
+        sighting(np.array(row["T_map_camera"]), frame.T_world_camera, row["inliers"]) if row["found"] else None
+        for row, frame in zip(rows, frames, strict=True)
+    ]
+    errors: list[float] = []
+    for start in range(len(seen)):
+        found: list[Sighting] = []
+        for one in filter(None, seen[start:]):
+            found.append(one)
+            consensus = find_consensus(found[-REMEMBERED:])
+            if not consensus.refusal:
+                ahead = np.array([f.T_world_camera @ (0, 0, AHEAD_M, 1) for f in frames])
+                off = np.linalg.norm((ahead @ agreed(consensus.agreeing).T - ahead)[:, :3], axis=1)
+                errors.append(float(np.median(off)))
+                break
+    p50, p95, worst = np.percentile(errors, (50, 95, 100)).round(4).tolist()
+    return {"starts": len(errors), "ahead_m_p50": p50, "ahead_m_p95": p95, "ahead_m_worst": worst}
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -127,7 +153,8 @@ def kitchen(log_path: Path, places: int) -> dict[str, Any]:
     ]
     relocalizer = Relocalizer((*own, *shuffled), mapped.voxel_map, ROOMS.ignore_id)
     mapped = replace(mapped, relocalizer=relocalizer)
-    return {"kitchen": summary([look_for(mapped, f, f.T_world_camera) for f in plain[100:]])}
+    rows = [look_for(mapped, f, f.T_world_camera) for f in plain[100:]]
+    return {"kitchen": summary(rows) | locked_in(rows, plain[100:])}
 
 
 def beside(scene: Scene, pose: Float64, rng: np.random.Generator) -> Float64:

@@ -109,6 +109,7 @@ def correct_session(session: MapSession, trajectory: Trajectory) -> int:
         )
     if len(poses) < given:
         _log.warning("corrections_without_a_frame", left_out=given - len(poses), used=len(poses), frozen=frozen)
+    poses = session.worlds.in_map(poses, session.pipeline.corrector.worlds())
     session.pipeline.correct_poses(poses, until_ns=ALWAYS)  # the whole log was recorded in the old world
     while session.pipeline.advance_correction(_PORTION):
         pass

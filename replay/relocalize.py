@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from semantic_mapper.localization.consensus import AGREEING, agreed, best_consensus, sighting
+from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.localization.relocalizer import NotFound, Relocalizer
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.sequence import Log
@@ -20,28 +20,43 @@ def relocalize_frames(
     """Look for every n-th frame, ``count`` of them; plain data, as of ``relocalize --json``."""
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     rows: list[dict[str, Any]] = []
-    seen = []
+    unreadable: list[dict[str, Any]] = []
+    seen: dict[int, list[Sighting]] = {}
     for number, frame in enumerate(log.frames_or_errors(count * every)):
-        if number % every or not isinstance(frame, PosedFrame):
+        if number % every:
             continue
+        if not isinstance(frame, PosedFrame):
+            unreadable.append({"number": number, "reason": str(frame)})
+            continue
+        of_world = seen.setdefault(frame.world, [])
         began = time.perf_counter()
         depth = None if frame.depth_sigma_m is not None else frame.depth_m
         found = finder.find(frame.rgb, depth, frame.intrinsics)
         row: dict[str, Any] = {"seq": frame.seq, "camera_id": frame.camera_id, "stamp_ns": frame.stamp_ns}
-        row |= {"ms": round((time.perf_counter() - began) * 1e3, 1), "features": found.inliers}
+        row |= {"world": frame.world, "ms": round((time.perf_counter() - began) * 1e3, 1), "features": found.inliers}
         if isinstance(found, NotFound):
             row |= {"reason": found.reason, "detail": found.detail}
         else:
             row["T_map_camera"] = found.T_map_camera.tolist()
-            seen.append(sighting(found.T_map_camera, frame.T_world_camera, found.inliers))
+            of_world.append(sighting(found.T_map_camera, frame.T_world_camera, found.inliers))
         rows.append(row)
-        on_frame(len(rows))
-    best = best_consensus(seen)
+        on_frame(len(rows) + len(unreadable))
     return {
         "frames": len(rows),
-        "found": len(seen),
-        "agreeing": len(best),
+        "found": sum(map(len, seen.values())),
         "refused": dict(Counter(row["reason"] for row in rows if "reason" in row).most_common()),
-        "T_map_world": agreed(best).tolist() if len(best) >= AGREEING else None,
+        "unreadable": unreadable,
+        "worlds": [_describe_world(world, sightings) for world, sightings in seen.items()],
         "looks": rows,
+    }
+
+
+def _describe_world(world: int, seen: list[Sighting]) -> dict[str, Any]:
+    consensus = find_consensus(seen)
+    return {
+        "world": world,
+        "found": len(seen),
+        "agreeing": len(consensus.agreeing),
+        "disagreement": consensus.refusal,
+        "T_map_world": None if consensus.refusal else agreed(consensus.agreeing).tolist(),
     }

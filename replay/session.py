@@ -79,7 +79,7 @@ class MapSession:
             self.pipeline.classify,
             own_first=own_first,
             whereabouts=self.pipeline.whereabouts,
-            motion=lambda: self.pipeline.corrector.motion,
+            motion=self.pipeline.corrector.motion,
         )
         self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
         self.published = 0
@@ -165,7 +165,7 @@ class MapSession:
         self._keep_snapshot(self._score(frame, update), update)
         if self._rerun is not None:
             self._rerun.log_step(frame, update)
-        return update
+        return replace(update, world=frame.world, T_map_world=self.worlds.where(frame.world))
 
     def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
         """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""

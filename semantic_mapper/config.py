@@ -270,6 +270,8 @@ class VoxelMapConfig(Config, frozen=True):
     no_return_range_m: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0
     evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
+    stored: ClassVar = ("voxel_size_m", "truncation_voxels", "evidence")  # what the data of a saved map means
+
 
 class PoseRefinerConfig(Config, frozen=True):
     """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""

@@ -270,6 +270,8 @@ class MapUpdate:
         stage_ms: Wall time of each stage.
         moving: (H, W) bool, what was left out of the map because it moves; None where that is off, and over sockets
             also where nothing moves.
+        world: In which the frame's pose came; see ``PosedFrame``.
+        T_map_world: (4, 4) float64, where the map has that world: its cameras are at ``T_map_world @ T_world_camera``.
     """
 
     stamp_ns: int
@@ -287,3 +289,5 @@ class MapUpdate:
     samples: int = 0
     stage_ms: dict[str, float] = field(default_factory=dict[str, float])
     moving: Bool | None = None
+    world: int = 0
+    T_map_world: Float64 = field(default_factory=lambda: np.eye(4))

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, MapError, NodeError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_scale import MEND
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
+from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import BridgeOptions
 from semantic_mapper.nodes.streams import Streams
@@ -61,12 +63,12 @@ class Outlet(Protocol):
         """Whether anybody receives what messages of a camera on this topic hold: else they are not even decoded."""
         ...
 
-    def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
-        """Where a camera was, of every frame."""
+    def note_pose(self, camera_id: str, T_map_camera: Float64) -> None:
+        """Where a camera was in the map, of every frame of which that is known."""
         ...
 
-    def send_frame(self, frame: PosedFrame) -> None:
-        """One camera image with its pose."""
+    def send_frame(self, frame: PosedFrame, T_map_camera: Float64 | None) -> None:
+        """One camera image with its pose in the map; None while that is not known."""
         ...
 
     def send_update(self, update: MapUpdate) -> None:
@@ -107,7 +109,7 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
         follower = stack.enter_context(_MapFollower(client, outlet, options))
         messages = stack.enter_context(NewestSubscriber(endpoints, ("frame", "map", "status", "end")))
         told = _Told(context.name, publisher, messages, follower)
-        streams = Streams(len(options.cameras))
+        streams, poses = Streams(len(options.cameras)), MapPoses()
         context.heartbeat.ready()
         while not context.stop and not streams.ended:
             context.heartbeat.turn()
@@ -115,16 +117,17 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
                 raise NodeError("the map is no longer sent: the thread that does so has ended; its error is above")
             if (parts := messages.receive_parts(POLL_S)) is not None:
                 try:
-                    _hand_on(parts, outlet, follower, streams)
+                    _hand_on(parts, outlet, follower, streams, poses)
                 except CodecError as error:  # of what its sender itself could not read
                     _log.warning("message_left_out", reason=str(error))
-            told.tell("running")
+            if told.due:
+                outlet.send_status(told.tell("running"))
         messages.close()  # a camera that has ended waits for its listeners to leave
         context.heartbeat.ending()
-        told.tell("ended", now=True)
+        outlet.send_status(told.tell("ended"))
 
 
-def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams: Streams) -> None:
+def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams: Streams, poses: MapPoses) -> None:
     """One message of a node.
 
     Raises:
@@ -135,10 +138,13 @@ def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams
         case "frame":
             follower.stamp_ns = envelope.stamp_ns
             follower.frames += 1
-            outlet.note_pose(envelope.source, np.array(envelope.T_world_camera, np.float64).reshape(4, 4))
+            T_map_camera = poses.place(envelope.world, envelope.T_world_camera)
+            if T_map_camera is not None:
+                outlet.note_pose(envelope.source, T_map_camera)
             if outlet.wants("frame", envelope.source):
-                outlet.send_frame(decode_as(PosedFrame, parts))
+                outlet.send_frame(decode_as(PosedFrame, parts), T_map_camera)
         case "map":
+            poses.note(envelope.world, envelope.T_map_world)
             if outlet.wants("map", envelope.source):
                 outlet.send_update(decode_as(MapUpdate, parts))
         case "status":
@@ -159,10 +165,13 @@ class _Told:
         self._follower = follower
         self._last = 0.0
 
-    def tell(self, state: NodeState, *, now: bool = False) -> None:
-        """Tell, if it is time to."""
-        if not now and time.monotonic() - self._last < STATUS_PERIOD_S:
-            return
+    @property
+    def due(self) -> bool:
+        """Whether it is time to."""
+        return time.monotonic() - self._last >= STATUS_PERIOD_S
+
+    def tell(self, state: NodeState) -> Status:
+        """Publish it; for the clients, too."""
         self._last = time.monotonic()
         counters = {
             "frames": self._follower.frames,
@@ -172,8 +181,10 @@ class _Told:
         counters |= {"rejected": self._messages.rejected, "overwritten": self._messages.overwritten}
         silent = self._messages.silent_s
         ages = {} if silent is None else {"frame": silent}
-        degraded = (self._follower.trouble,) if self._follower.trouble else ()
-        self._publisher.publish(encode(Status(self._node, state, time.monotonic_ns(), counters, ages, degraded)))
+        degraded = tuple(filter(None, (self._follower.trouble, self._follower.no_graph)))
+        status = Status(self._node, state, time.monotonic_ns(), counters, ages, degraded)
+        self._publisher.publish(encode(status))
+        return status
 
 
 class _MapFollower:
@@ -189,6 +200,7 @@ class _MapFollower:
         self.frames, self.stamp_ns = 0, 0  # heard of, and stamp of the newest one
         self.sent: dict[Subject, int] = {"map": 0, "graph": 0}
         self.trouble = ""  # why the last look failed
+        self.no_graph = ""  # why somebody who wants one has none
         self._client = client
         self._outlet = outlet
         self._options = options
@@ -240,7 +252,9 @@ class _MapFollower:
             points = surface_points(snapshot, surface_voxels(snapshot))
             self._outlet.send_map(thinned(points), describe_map(snapshot, len(points.xyz), self.stamp_ns))
             self.sent["map"] += 1
-        if snapshot.scale_known and self._is_new("graph", asked["graph"], snapshot):
+        if asked["graph"] and not snapshot.scale_known:
+            self.no_graph = f"no graph: lengths of the map are not metres: {MEND}"
+        elif self._is_new("graph", asked["graph"], snapshot):
             if self._graphs is None or self._graphs[0] is not mirror:  # of a mapper that was restarted
                 self._graphs = mirror, GraphTracker()
             self._send_graph(self._graphs[1], snapshot)
@@ -249,8 +263,9 @@ class _MapFollower:
         try:
             graph = tracker.update(snapshot)
         except MapError as error:  # which way is up shows once there is a floor
-            _log.debug("graph_not_sent", reason=str(error))
+            self.no_graph = f"no graph: {error}"
             return
+        self.no_graph = "" if graph.floors else "no graph: no floor was found"
         self._outlet.send_graph(graph, self.stamp_ns)
         self.sent["graph"] += 1
 

@@ -10,7 +10,7 @@ import numpy as np
 from semantic_mapper.errors import FrameError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.types import MapUpdate, PosedFrame, UInt8
+from semantic_mapper.types import Float64, MapUpdate, PosedFrame, UInt8
 
 MAX_POINTS = 400_000  # of a map that is shown again and again: of a larger one every second point, or third, ...
 JPEG_QUALITY = 80
@@ -71,14 +71,14 @@ def describe_map(snapshot: MapSnapshot, count: int, stamp_ns: int) -> dict[str, 
     }
 
 
-def describe_pose(frame: PosedFrame) -> dict[str, Any]:
-    """Where a frame was taken, and with which lens, for JSON."""
+def describe_pose(frame: PosedFrame, T_map_camera: Float64 | None) -> dict[str, Any]:
+    """Where a frame was taken in the map (None = that is not known), and with which lens, for JSON."""
     k = frame.intrinsics
     return {
         "stamp_ns": frame.stamp_ns,
         "seq": frame.seq,
         "camera": frame.camera_id,
-        "T_world_camera": frame.T_world_camera.tolist(),
+        "T_map_camera": None if T_map_camera is None else T_map_camera.tolist(),
         "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "width": k.width, "height": k.height},
         "pose_source": frame.pose_source,
     }

@@ -125,7 +125,7 @@ def merge(
     """
     output = Output.guarded()
     from semantic_mapper.mapping.files.merge import count_empty
-    from semantic_mapper.mapping.map_alignment import find_alignment
+    from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.outputs import prepare_file
     from semantic_mapper.nodes.cli.saved_maps import map_path, parse_transform, refuse_overwriting
@@ -134,10 +134,13 @@ def merge(
     sources = map_path(a), map_path(b)
     refuse_overwriting(out, *sources)
     prepare_file(out)
+    check_mergeable(*sources, find=T_a_b is None)
     one, other = map(VoxelMap.load, sources)
     if T_a_b is None:
         found = find_alignment(one, other)
-        output.print(f"{found.agreeing} of {found.looked_for} places of B are at one on where it lies in A")
+        output.print(f"{found.agreeing} of {found.looked_for} places of B are at one on where it lies in A, T_A_B:")
+        for row in found.T_map_other:
+            output.print("  " + " ".join(f"{value:9.4f}" for value in row))
         T_a_b = found.T_map_other
     joined = one.merged(other, T_a_b)
     joined.save(out)

@@ -75,6 +75,7 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
 
 
 UP = (0.0, 0.0, 1.0)  # of the boxes of instances, where nothing else is given
+NO_FLOOR = "no floor was found: too little level surface, or another way is up (--up)"
 CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned"
 
 
@@ -194,7 +195,7 @@ def _instance_table(found: dict[str, Any], width: int) -> Table:
 def _graph_table(found: dict[str, Any]) -> Table:
     table = Table(title=found["map"], title_justify="left")
     if not found["floors"]:
-        table.caption = "no floor was found: too little level surface, or another way is up (--up)"
+        table.caption = NO_FLOOR
     for name in ("room", "floor", "area, m2", "doors to", "objects"):
         table.add_column(name, overflow="fold", min_width=len(name))
     class_of = {thing["id"]: thing["class"] for thing in found["objects"]}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
@@ -16,6 +17,7 @@ from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 
 if TYPE_CHECKING:
     from semantic_mapper.queries.graph import SceneGraph
+    from semantic_mapper.queries.snapshot import MapSnapshot
 
 
 class Question(StrEnum):
@@ -63,7 +65,8 @@ def query(
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="instances, graph: which way is up in the world.  [default: 0 0 1; graph: away from the floor]",
+            help="instances, graph: which way is up in the world.  [default: away from the floor; instances of a "
+            "running mapper, or where no floor was seen: 0 0 1]",
         ),
     ] = None,
     min_confidence: Annotated[
@@ -156,10 +159,21 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
             return map_answers.answer_nearest(asked.class_name, asked.point, hit)
         case Question.INSTANCES:
             by = map_answers.CONNECTED if snapshot.instances is None else map_answers.LEARNED
-            up = asked.up or map_answers.UP
+            up = asked.up or _find_up(snapshot)
             return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot), by)
         case Question.GRAPH:
             return _answer_graph(source, GraphTracker(asked.up).update(snapshot), asked.picture)
+
+
+def _find_up(snapshot: MapSnapshot) -> tuple[float, ...]:
+    """Away from the floor, as in the graph; z of the world where no floor shows it, which the answer tells (``up``)."""
+    from semantic_mapper.nodes.cli.map_answers import UP
+    from semantic_mapper.queries.graph import GraphTracker
+
+    try:
+        return tuple(GraphTracker().up_in(snapshot).tolist())
+    except MapError:
+        return UP
 
 
 def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
@@ -191,14 +205,21 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
 
 
 def _answer_graph(source: str, graph: SceneGraph, picture: Path | None) -> dict[str, Any]:
-    from semantic_mapper.nodes.cli.map_answers import answer_graph
+    """Also draws it.
+
+    Raises:
+        MapError: there is no floor to draw.
+    """
+    from semantic_mapper.nodes.cli import map_answers
 
     if picture is not None:
         from semantic_mapper.plots import write_picture
         from semantic_mapper.queries.graph_picture import draw_graph
 
+        if not graph.floors:
+            raise MapError(f"{source}: there is nothing to draw: {map_answers.NO_FLOOR}")
         write_picture(picture, draw_graph(source, graph))
-    return answer_graph(graph)
+    return map_answers.answer_graph(graph)
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+
+_NAMED = 10  # frames that cannot be read
 
 
 @verb
@@ -23,18 +25,24 @@ def relocalize(
 ) -> int:
     """Find the frames of a log in a map, each by itself; their poses are used only to see whether they agree.
 
-    A frame is found where features, depth and brightness agree with the map. Exit code 1 where fewer than three frames
-    agree on where the world of the log lies in the map.
+    A frame is found where features, depth and brightness agree with the map. Exit code 1 where it is not known
+    where a world of the log lies: three frames, and most of those that are found, have to agree on it.
 
     Example: semantic-mapper relocalize runs/yesterday today.mcap
     """
     output = Output.guarded()
+    from semantic_mapper.errors import MapError
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.saved_maps import map_path
     from semantic_mapper.replay.log.sequence import open_log
     from semantic_mapper.replay.relocalize import relocalize_frames
 
     voxel_map = VoxelMap.load(map_path(saved))
+    if not len(voxel_map.places):
+        raise MapError(
+            f"{saved}: has nothing to find oneself by: it was made without depth, by an older release, or with "
+            "keyframes.save_places = false; map its log again"
+        )
     with open_log((log,)) as frames:
         count = -(-len(frames) // every)
         count = min(count, max_frames or count)
@@ -44,11 +52,23 @@ def relocalize(
     if json:
         output.json(found)
     else:
-        output.print(f"{found['found']} of {found['frames']} frames found, {found['agreeing']} at one with each other")
-        for reason, times in found["refused"].items():
-            output.print(f"  {times} not: {reason}")
-        if found["T_map_world"] is not None:
-            output.print("the log's world in the map, T_map_world:")
-            for row in found["T_map_world"]:
-                output.print("  " + " ".join(f"{value:9.4f}" for value in row))
-    return 0 if found["T_map_world"] is not None else EXIT_FAILED
+        _print(found, output)
+    return 0 if all(world["T_map_world"] is not None for world in found["worlds"]) and found["worlds"] else EXIT_FAILED
+
+
+def _print(found: dict[str, Any], output: Output) -> None:
+    output.print(f"{found['found']} of {found['frames']} frames found")
+    for reason, times in found["refused"].items():
+        output.print(f"  {times} not: {reason}")
+    if found["unreadable"]:
+        output.print(f"{len(found['unreadable'])} more cannot be read:")
+    for frame in found["unreadable"][:_NAMED]:
+        output.print(f"  frame {frame['number']}: {frame['reason']}")
+    for world in found["worlds"]:
+        name = f"world {world['world']} of the log" if len(found["worlds"]) > 1 else "the log's world"
+        if world["disagreement"]:
+            output.print(f"where {name} lies in the map is not known: {world['disagreement']}")
+            continue
+        output.print(f"{name} in the map, on which {world['agreeing']} of {world['found']} agree, T_map_world:")
+        for row in world["T_map_world"]:
+            output.print("  " + " ".join(f"{value:9.4f}" for value in row))

@@ -13,7 +13,7 @@ from semantic_mapper.queries.instances import Instance
 from semantic_mapper.replay.exporters.base import quaternion
 from semantic_mapper.types import Float64
 
-WORLD = "world"
+WORLD = "world"  # that of the map
 TEXT_M = 0.12  # height of letters
 LINE_M = 0.03
 PATH_COLOR = messages.Color(r=1.0, g=0.85, b=0.2, a=1.0)
@@ -32,9 +32,9 @@ def stamp(stamp_ns: int) -> messages.Timestamp:
     return messages.Timestamp(stamp_ns // 10**9, stamp_ns % 10**9)
 
 
-def transform(T_world_camera: Float64, child: str, stamp_ns: int) -> messages.FrameTransform:
+def transform(T_map_camera: Float64, child: str, stamp_ns: int) -> messages.FrameTransform:
     """Where a camera is."""
-    pose = _pose(T_world_camera[:3, :3], T_world_camera[:3, 3])
+    pose = _pose(T_map_camera[:3, :3], T_map_camera[:3, 3])
     return messages.FrameTransform(
         timestamp=stamp(stamp_ns), parent_frame_id=WORLD, child_frame_id=child, translation=pose[0], rotation=pose[1]
     )

@@ -124,15 +124,15 @@ class FoxgloveServer:
         wanted = (c.rgb, c.depth, c.calibration, self._tf) if topic == "frame" else (c.semantics, c.moving, self._path)
         return any(channel.has_sinks() for channel in wanted)
 
-    def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
+    def note_pose(self, camera_id: str, T_map_camera: Float64) -> None:
         """See ``Outlet``."""
-        self._camera(camera_id).path.add(T_world_camera)
+        self._camera(camera_id).path.add(T_map_camera)
 
-    def send_frame(self, frame: PosedFrame) -> None:
+    def send_frame(self, frame: PosedFrame, T_map_camera: Float64 | None) -> None:
         """See ``Outlet``."""
         camera, when, name = self._camera(frame.camera_id), frame.stamp_ns, camera_frame(frame.camera_id)
-        if self._tf.has_sinks():
-            moved = transform(frame.T_world_camera, name, when)
+        if T_map_camera is not None and self._tf.has_sinks():
+            moved = transform(T_map_camera, name, when)
             self._tf.log(messages.FrameTransforms(transforms=[moved]), log_time=when)
         if camera.calibration.has_sinks():
             camera.calibration.log(_calibration(frame.intrinsics, name, when), log_time=when)
@@ -155,9 +155,9 @@ class FoxgloveServer:
             camera.semantics.log(_picture(picture, "png", name, when), log_time=when)
         if camera.moving.has_sinks():
             camera.moving.log(_picture(to_png(moving_mask(update)), "png", name, when), log_time=when)
-        if self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
+        paths = {name: camera.path.poses for name, camera in self._cameras.items() if camera.path.poses}
+        if paths and self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
             self._path_sent = time.monotonic()
-            paths = {name: camera.path.poses for name, camera in self._cameras.items()}
             self._path.log(draw_path(paths, when), log_time=when)
 
     def send_status(self, status: Status) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
 from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.worlds import MapWorlds
 from semantic_mapper.replay.corrected_poses import match_frames
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.query_messages import CorrectPosesRequest
@@ -40,7 +41,7 @@ class LiveCorrection:
         self._ended = False
         self._followed = 0  # corrections that the session knows of
         self._since_step = 0  # frames of the history
-        self._moved_worlds = False  # whether frames of another world have been brought into the map's
+        self._worlds: MapWorlds | None = None  # of the session
 
     @property
     def running(self) -> bool:
@@ -96,8 +97,8 @@ class LiveCorrection:
             mapped: A frame was mapped since the last call: then the history goes on by as much as it must, which is
                 nothing where there was time to spare before this frame. Otherwise no frame waits.
         """
-        if session is not None and any(not np.allclose(T, np.eye(4)) for T in session.worlds.known.values()):
-            self._moved_worlds = True
+        if session is not None:
+            self._worlds = session.worlds
         if self.running:
             self._advance(max(0, HISTORY_A_STEP - self._since_step) if mapped else 1)
         self._since_step = 0 if mapped else self._since_step + 1
@@ -134,12 +135,9 @@ class LiveCorrection:
             _log.error("correction_unfinished", reason=session.unfinished_correction)
 
     def _begin(self, request: CorrectPosesRequest) -> tuple[int, int]:
-        if self._moved_worlds:
-            raise MapError(
-                "poses cannot be corrected: a camera of another world was found in this map, and corrected poses do "
-                "not say of which world they are"
-            )
         poses = self._to_frames(request)
+        if self._worlds is not None:
+            poses = self._worlds.in_map(poses, self._pipeline.corrector.worlds())
         known = self._pipeline.corrector.poses()
         stamps = {stamp_ns for _, stamp_ns in known}
         used = sum((key in known) if isinstance(key, tuple) else (key in stamps) for key in poses)

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-import msgspec
 import structlog
 
 from semantic_mapper.errors import SemanticMapperError
@@ -54,12 +53,11 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     from semantic_mapper.nodes.cli.saved_maps import MAP_NAME, map_path
     from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
     from semantic_mapper.nodes.mapper.live_weights import taking_weights
-    from semantic_mapper.nodes.mapper.resume import go_on, take_up
+    from semantic_mapper.nodes.mapper.resume import go_on, stored_settings, take_up
     from semantic_mapper.nodes.public_publisher import PublicPublisher
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 
     prepare_folder(Path(options.out))
-    saved = VoxelMap.load(map_path(Path(options.map))) if options.map else None
     config = mapper_config(
         Path(options.config) if options.config else None,
         options.voxel_size_m or None,
@@ -67,8 +65,10 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         live=options.delivery == "newest",
         history_frames=options.history_frames,
     )
-    if saved is not None:
-        config = msgspec.structs.replace(config, voxel_map=saved.config)
+    saved = None
+    if options.map:
+        config = stored_settings(config, _given(options), map_path(Path(options.map)))
+        saved = VoxelMap.load(map_path(Path(options.map)), config=config.voxel_map)
     bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
     taken_up = take_up(context, Path(options.out) / MAP_NAME, bundle.pipeline.voxel_map)
     if saved is not None:
@@ -99,6 +99,14 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         context.heartbeat.ending()
         frames.close()  # the camera waits until all have left
         mapper.finish()
+
+
+def _given(options: MapperOptions) -> set[str]:
+    """Names in ``voxel_map`` that the user has set."""
+    from semantic_mapper.config import MapperConfig, read_toml, rename_settings
+
+    told = rename_settings(read_toml(Path(options.config)), MapperConfig, options.config) if options.config else {}
+    return {*told.get("voxel_map", {}), *(("voxel_size_m",) if options.voxel_size_m else ())}
 
 
 def _answering(

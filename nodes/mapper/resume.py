@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import structlog
 
+from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.outputs import free_name
 from semantic_mapper.nodes.node import NodeContext
@@ -87,6 +90,23 @@ def go_on(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
             "keyframes.save_places = false; map its log again, or begin a new map"
         )
     _log.info("going_on", map=name, frames=voxel_map.frames, places=len(voxel_map.places))
+
+
+def stored_settings(config: MapperConfig, given: Collection[str], path: Path) -> MapperConfig:
+    """The settings of a run that goes on in a saved map: what its data means is the map's, the rest is this run's.
+
+    Args:
+        config: Of this run.
+        given: Names in ``voxel_map`` that the user has set: they are not replaced, so that they may be refused.
+        path: The map.
+
+    Raises:
+        MapError: it cannot be read.
+    """
+    with open_map(path) as reader:
+        saved = reader.manifest.config
+    kept = {name: getattr(saved, name) for name in VoxelMapConfig.stored if name not in given}
+    return msgspec.structs.replace(config, voxel_map=msgspec.structs.replace(config.voxel_map, **kept))
 
 
 def note_worlds(context: NodeContext, known: Mapping[int, Float64]) -> None:

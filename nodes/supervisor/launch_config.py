@@ -15,7 +15,7 @@ import msgspec
 import structlog
 
 from semantic_mapper.config import Config, convert_config, load_config
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.nodes.camera.ids import check_camera_ids
 from semantic_mapper.nodes.options import (
     CAMERA_KINDS,
@@ -29,8 +29,10 @@ from semantic_mapper.nodes.options import (
     NodeOptions,
     Positive,
     RecorderOptions,
+    ZenohOptions,
     check_tracking,
 )
+from semantic_mapper.nodes.zenoh.addresses import zenoh_settings
 
 Value = str | int | float | bool
 STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
@@ -201,9 +203,15 @@ def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
     """A bridge to other tools asks a mapper of its launch about the map.
 
     Raises:
-        ConfigError: it would ask where none answers.
+        ConfigError: it would ask where none answers, or an invalid address.
+        TransportError: of Zenoh, see ``zenoh_settings``.
     """
     for name, own in options.items():
+        if isinstance(own, ZenohOptions):
+            try:
+                zenoh_settings(own)
+            except SemanticMapperError as error:
+                raise type(error)(f"{path}: node '{name}': {error}") from error
         if isinstance(own, BridgeOptions):
             mapper = options[own.mapper]
             if not isinstance(mapper, MapperOptions):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from semantic_mapper.errors import MapError, SemanticMapperError, TransportError
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.bridge.packing import thinned, thinning
+from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.queries.ages import BlockAges
@@ -247,7 +248,7 @@ class _Following:
 def _follow_nodes(live: Live, log: RerunLog, following: _Following, stop: StopRequest) -> None:
     """Show frames and what was rendered for them until all streams have ended: cameras wait for their listeners."""
     intrinsics: dict[str, CameraIntrinsics] = {}
-    streams = Streams(live.streams)
+    streams, poses = Streams(live.streams), MapPoses()
     with NewestSubscriber(live.nodes, ("frame", "map", "end")) as messages:
         while not stop and not streams.ended:
             message = messages.receive(POLL_S)
@@ -255,9 +256,15 @@ def _follow_nodes(live: Live, log: RerunLog, following: _Following, stop: StopRe
                 case PosedFrame():
                     intrinsics[message.camera_id] = message.intrinsics
                     following.stamp_ns = message.stamp_ns
-                    log.log_frame(message)
-                case MapUpdate() if message.camera_id in intrinsics:
-                    log.log_update(message, intrinsics[message.camera_id])
+                    pose = poses.place(message.world, message.T_world_camera)
+                    if pose is None:  # the mapper does not know yet where in the map it was taken
+                        log.log_frame(message, placed=False)
+                    else:
+                        log.log_frame(replace(message, T_world_camera=pose))
+                case MapUpdate():
+                    poses.note(message.world, message.T_map_world)
+                    if message.camera_id in intrinsics:
+                        log.log_update(message, intrinsics[message.camera_id])
                 case EndOfStream():
                     streams.end(message)
                 case _:

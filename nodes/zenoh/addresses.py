@@ -11,6 +11,7 @@ from semantic_mapper.nodes.options import ZenohOptions
 from semantic_mapper.transport.endpoints import is_loopback
 
 AUTHORITY, CERTIFICATE, KEY = "ca.pem", "own.pem", "own.key"  # in the folder of certificates
+MAX_PORT = 65535
 _ADDRESS = re.compile(r"(tcp|tls)/((?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):\d{1,5})")
 
 
@@ -50,6 +51,8 @@ def _check(address: str, folder: Path | None) -> None:
             f"'{address}' is no address of Zenoh that is taken here; write tcp/127.0.0.1:PORT, or with certificates "
             "tls/ADDRESS:PORT"
         )
+    if int(found[2].rpartition(":")[2]) > MAX_PORT:
+        raise ConfigError(f"'{address}': ports end at {MAX_PORT}")
     if found[1] == "tcp" and not is_loopback(found[2]):
         raise TransportError(
             f"{address}: other machines would be at the other end, which needs certificates on both sides: give "

@@ -96,14 +96,14 @@ class ZenohSession:
         kinds = ("rgb", "depth", "pose") if topic == "frame" else ("semantics", "moving")
         return any(self._wanted(f"{camera_id}/{kind}") is not None for kind in kinds)
 
-    def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
+    def note_pose(self, camera_id: str, T_map_camera: Float64) -> None:
         """Poses go out with the frames."""
 
-    def send_frame(self, frame: PosedFrame) -> None:
+    def send_frame(self, frame: PosedFrame, T_map_camera: Float64 | None) -> None:
         """See ``Outlet``."""
-        about = describe_pose(frame)
+        about = describe_pose(frame, T_map_camera)
         camera = frame.camera_id
-        if (pose := self._wanted(f"{camera}/pose")) is not None:
+        if T_map_camera is not None and (pose := self._wanted(f"{camera}/pose")) is not None:
             pose.put(_json(about), encoding=JSON)
         if (rgb := self._wanted(f"{camera}/rgb")) is not None:
             rgb.put(to_jpeg(frame.rgb), encoding=JPEG, attachment=_json(about))

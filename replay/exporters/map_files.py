@@ -214,7 +214,10 @@ def read_costs(path: Path, label_set: LabelSet) -> NDArray[np.int64]:
     """
     ids = dict(zip((*label_set.names, "unknown"), (*label_set.ids, label_set.ignore_id), strict=True))
     costs = np.full(256, -1, np.int64)
-    for name, value in read_toml(path).items():
+    given = read_toml(path)
+    if not given:
+        raise ConfigError(f"{path}: has no costs; write lines CLASS = COST, from 0 to 100, of {', '.join(sorted(ids))}")
+    for name, value in given.items():
         if name not in ids:
             raise ConfigError(f"{path}: '{name}' is no class of the map; it has {', '.join(sorted(ids))}")
         if type(value) is not int or not 0 <= value <= OCCUPIED:

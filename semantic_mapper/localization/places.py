@@ -104,6 +104,13 @@ def moved_place(place: Place, T_other_world: Float64) -> Place:
     return replace(place, T_world_camera=T_other_world @ place.T_world_camera)
 
 
+def shared_places(ours: Iterable[Place], theirs: Iterable[Place]) -> int:
+    """How many places are of the same frame in both: its camera, stamp and features."""
+    known = {(p.camera_id, p.stamp_ns): p.descriptors for p in ours}
+    same = ((known.get((p.camera_id, p.stamp_ns)), p.descriptors) for p in theirs)
+    return sum(a is not None and len(a) > 0 and np.array_equal(a, b) for a, b in same)
+
+
 class PlaceStore:
     """The places of a map, oldest first; bounded.
 

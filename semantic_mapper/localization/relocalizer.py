@@ -26,7 +26,15 @@ from semantic_mapper.localization.places import MAX_FEATURES, Place, PlaceIndex
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 Reason = Literal[
-    "no-places", "no-depth", "unknown", "few-features", "contradicted", "looks-different", "classes", "ambiguous"
+    "no-places",
+    "no-depth",
+    "unknown",
+    "few-features",
+    "calibration",
+    "contradicted",
+    "looks-different",
+    "classes",
+    "ambiguous",
 ]
 _CANDIDATES = 12  # places that are looked at
 _GROUP_M, _GROUP_RAD = 1.2, np.deg2rad(50.0)  # places this near to a candidate lend it their matches
@@ -39,6 +47,8 @@ _FAR_M = 10.0  # from the place that it is about, no pose is believed
 _REACH_M = 1.5  # places whose views are this near may show what the frame shows; a radian counts like a metre
 _DEPTH_M, _DEPTH = 0.06, 0.04  # by which the depths of a feature may differ
 _ALIKE = 0.75 * 512.0  # distance of descriptors
+_APART_M, _FLAT = 0.3, 0.8  # features that tell sizes are so far apart, most of it across the view
+_PAIRS = 30  # of such features, at least
 _SAME_M, _SAME_RAD = 0.3, np.deg2rad(10.0)  # poses further apart are two
 
 
@@ -56,6 +66,8 @@ class Limits:
         min_overlap, min_agree, min_likeness, min_classes: See ``DepthFit``.
         sure_inliers: With fewer features than these, the depth has to agree by ``sure_agree``.
         max_rival: Features of another pose, as a fraction of those of the best.
+        max_stretch: By which fraction sizes across the view may differ from the map's. In the kitchen it is 1 % at
+            most; a focal length that is 15 % too long makes it 11 %.
     """
 
     min_inliers: int = 12
@@ -67,6 +79,7 @@ class Limits:
     sure_inliers: int = 40
     sure_agree: float = 0.92
     max_rival: float = 0.6
+    max_stretch: float = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,7 +194,7 @@ class Relocalizer:
         tried.sort(key=lambda t: -len(t.support.points))
         best = tried[0]
         count = len(best.support.points)
-        refusal = self._refusal(best, tried, intrinsics)
+        refusal = self._refusal(best, tried, depth_m, intrinsics)
         if refusal is not None:
             return NotFound(refusal[0], refusal[1], best.pose, count, best.fit)
         return Relocalized(best.pose, count, best.fit)
@@ -196,13 +209,20 @@ class Relocalizer:
             return NotFound("classes", _other_classes(fit), found.T_map_camera, found.inliers, fit)
         return replace(found, fit=fit)
 
-    def _refusal(self, best: _Tried, tried: list[_Tried], intrinsics: CameraIntrinsics) -> tuple[Reason, str] | None:
+    def _refusal(
+        self, best: _Tried, tried: list[_Tried], depth_m: Float32, intrinsics: CameraIntrinsics
+    ) -> tuple[Reason, str] | None:
         limits, fit, count = self._limits, best.fit, len(best.support.points)
         if count < limits.min_inliers:
             return "few-features", f"{count} features agree on a pose, {limits.min_inliers} have to"
         diagonal = float(np.hypot(intrinsics.width, intrinsics.height))
         if float(np.sqrt(best.support.pixels.var(axis=0).sum())) < limits.min_spread * diagonal:
             return "few-features", "the features that agree on a pose are all of one small thing"
+        size = _relative_size(best.guess.landmarks, depth_m, intrinsics)
+        if abs(size - 1) > limits.max_stretch:  # false for NaN
+            return "calibration", (
+                f"the frame shows things {size:.2f} times as large as the map has them: focal length or depth is wrong"
+            )
         sure = count >= limits.sure_inliers
         if fit.overlap < limits.min_overlap or fit.agree < (limits.min_agree if sure else limits.sure_agree):
             return "contradicted", (
@@ -269,6 +289,22 @@ class Relocalizer:
     def _world_points(self, key: int, which: np.ndarray) -> Float64:
         place = self._places[key]
         return transform(place.T_world_camera, place.points[which].astype(np.float64))
+
+
+def _relative_size(landmarks: Landmarks, depth_m: Float32, intrinsics: CameraIntrinsics) -> float:
+    """Median of distances between features, as the frame has them against those in the map; NaN where too few tell."""
+    u, v = np.rint(landmarks.pixels).astype(np.intp).T
+    z = depth_m[v.clip(0, intrinsics.height - 1), u.clip(0, intrinsics.width - 1)].astype(np.float64)
+    x, y = ((landmarks.pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy) * z[:, None]).T
+    known = np.isfinite(z) & (z > 0)
+    own, theirs = np.stack((x, y, z), axis=1)[known], landmarks.points[known]
+    i, j = np.triu_indices(len(own), 1)
+    apart = own[i] - own[j]
+    length = np.linalg.norm(apart, axis=1)
+    use = (length > _APART_M) & (np.linalg.norm(apart[:, :2], axis=1) > _FLAT * length)
+    if use.sum() < _PAIRS:
+        return float("nan")
+    return float(np.median(length[use] / np.linalg.norm(theirs[i[use]] - theirs[j[use]], axis=1)))
 
 
 def _other_classes(fit: DepthFit) -> str:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import project
-from semantic_mapper.localization.consensus import AGREEING, agreed, agreeing_with, best_consensus, sighting
+from semantic_mapper.localization.consensus import agreed, find_consensus, sighting
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import Place
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.merge import check_fit
 from semantic_mapper.mapping.map_scale import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -20,7 +22,6 @@ from semantic_mapper.types import CameraIntrinsics, Float64
 
 LOOKED_FOR = 60  # places, at most
 SURE = 0.7  # confidence from which on a class counts
-_RIVAL = 0.5  # of the places that agree: so many that say something else are too many
 _VIEW = CameraIntrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 _WAY_OUT = 'Give it: --transform "x y z yaw_deg", or "0 0 0 0" where both are in one world'
 
@@ -40,6 +41,32 @@ class MapAlignment:
     looked_for: int
 
 
+def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
+    """Refuse two saved maps without reading their blocks.
+
+    Args:
+        path, other: Of the first and the second.
+        find: Where the second lies in the first is to be found.
+
+    Raises:
+        MapError: they are the same map, or what is to be found cannot be; or one cannot be read.
+    """
+    with open_map(path) as one, open_map(other) as two:
+        manifests = one.manifest, two.manifest
+    if manifests[0].chunks and manifests[0].chunks == manifests[1].chunks:
+        raise MapError(f"{path} and {other} are the same map: all that it has seen would count twice")
+    for manifest, which in zip(manifests, ("first", "second"), strict=True):
+        if find and not (manifest.places and manifest.places.places):
+            raise MapError(_nothing_to_find(which))
+
+
+def _nothing_to_find(which: str) -> str:
+    return (
+        f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without depth, by an "
+        f"older release, or with keyframes.save_places = false). {_WAY_OUT}"
+    )
+
+
 def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     """Where another map lies in this one.
 
@@ -50,10 +77,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
         if not len(one.places):
-            raise MapError(
-                f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without "
-                f"depth, by an older release, or with keyframes.save_places = false). {_WAY_OUT}"
-            )
+            raise MapError(_nothing_to_find(which))
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
     seen = []
@@ -64,20 +88,14 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
             reasons[found.reason] += 1
         else:
             seen.append(sighting(found.T_map_camera, place.T_world_camera, found.inliers))
-    best = best_consensus(seen)
-    if len(best) < AGREEING:
+    consensus = find_consensus(seen)
+    if consensus.refusal:
         told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         raise MapError(
-            f"where the maps lie cannot be found: {len(best)} of {len(chosen)} places of the second are at one with "
-            f"the first, {AGREEING} have to be ({told}). {_WAY_OUT}"
+            f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
+            f"first ({told or 'none was refused'}), and {consensus.refusal}. {_WAY_OUT}"
         )
-    rival = best_consensus([s for s in seen if not agreeing_with(s, best)])
-    if len(rival) > _RIVAL * len(best):
-        raise MapError(
-            f"where the maps lie cannot be told: {len(best)} places say one thing and {len(rival)} another, as of "
-            f"rooms that look alike. {_WAY_OUT}"
-        )
-    return MapAlignment(agreed(best), len(best), len(chosen))
+    return MapAlignment(agreed(consensus.agreeing), len(consensus.agreeing), len(chosen))
 
 
 def _find(finder: Relocalizer, other: VoxelMap, place: Place) -> Relocalized | NotFound:

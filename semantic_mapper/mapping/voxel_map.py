@@ -16,7 +16,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.localization.places import PlaceStore, moved_place
+from semantic_mapper.localization.places import PlaceStore, moved_place, shared_places
 from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.map_manifest import MapManifest
@@ -391,19 +391,28 @@ class VoxelMap:
             return MapSaving(self.locked, manifest, self.instances, self.places.places)
 
     @classmethod
-    def load(cls, path: Path, memory_mb: int | None = None) -> VoxelMap:
+    def load(cls, path: Path, memory_mb: int | None = None, config: VoxelMapConfig | None = None) -> VoxelMap:
         """Read a saved map; it is the saved one bit for bit and can go on integrating.
 
         Args:
             path: What ``save`` wrote.
             memory_mb: In place of the saved setting, for a machine with less memory, say; 0 = no limit.
+            config: In place of all saved settings.
 
         Raises:
+            ConfigError: ``config`` contradicts what is stored (``VoxelMapConfig.stored``).
             MapError: no such file, not a map, of another format version, or damaged (and what is).
         """
         with open_map(path) as reader:
             saved = reader.manifest
-            config = saved.config if memory_mb is None else replace(saved.config, memory_mb=memory_mb)
+            config = config or saved.config
+            for name in VoxelMapConfig.stored:
+                if getattr(config, name) != (kept := getattr(saved.config, name)):
+                    raise ConfigError(
+                        f"{path}: was made with voxel_map.{name} = {kept!r} and cannot go on with "
+                        f"{getattr(config, name)!r}: leave that out"
+                    )
+            config = config if memory_mb is None else replace(config, memory_mb=memory_mb)
             try:
                 loaded = cls(config, saved.label_set)
                 loaded._grid.reserve(saved.blocks)
@@ -435,13 +444,18 @@ class VoxelMap:
             T_self_other: (4, 4) float64, where its frame lies in this map's.
 
         Raises:
-            MapError: the maps do not fit each other, only one is in metres, or the new one would grow past
-                ``max_blocks``.
+            MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or the new
+                one would grow past ``max_blocks``.
             PoseError: the pose is not a rigid transform.
         """
         check_pose(T_self_other, "merge")
         check_fit(self.config, self.label_set, other.config, other.label_set)
         require_same_scale(self.scale_known, other.scale_known, "merge")
+        if shared := shared_places(self.places.places, other.places.places):
+            raise MapError(
+                f"both maps were made with the same frames ({shared} of their places are of the same ones), which "
+                "would count twice; make one map of all logs instead"
+            )
         joined = VoxelMap(self.config, self.label_set)
         joined.note_scale(self.scale_known)
         joined.refined = self.refined or other.refined

@@ -9,17 +9,18 @@ and those after them.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from semantic_mapper.errors import PoseError
 from semantic_mapper.geometry import check_pose, invert_pose
-from semantic_mapper.localization.consensus import AGREEING, Sighting, agreed, agreeing_with, sighting
+from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction.pose_correction import move
+from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses, move
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame, UInt8
 
@@ -74,7 +75,7 @@ class MapWorlds:
             classes are not looked at.
         own_first: The first world that comes is the map's own, as in a map that begins empty.
         whereabouts: Is told of every frame.
-        motion: By how much frames to come are moved later on, (4, 4); see ``MapCorrector.motion``.
+        motion: By how much frames to come of a world are moved later on, (4, 4); see ``MapCorrector.motion``.
 
     Attributes:
         known: T_map_world (4, 4) by world.
@@ -90,7 +91,7 @@ class MapWorlds:
         *,
         own_first: bool = True,
         whereabouts: Whereabouts | None = None,
-        motion: Callable[[], Float64] = lambda: np.eye(4),
+        motion: Callable[[int], Float64] = lambda world: np.eye(4),
     ) -> None:
         self._map = voxel_map
         self._classify = classify
@@ -115,6 +116,22 @@ class MapWorlds:
         if not self._held:
             return ""
         return f"{len(self._held)} frames are held until their place in the map is known: {self.reason or 'looking'}"
+
+    def where(self, world: int) -> Float64:
+        """T_map_world (4, 4) of a known world, for frames that come now."""
+        return move(self._motion(world), self.known[world])
+
+    def in_map(self, poses: CorrectedPoses, worlds: Mapping[tuple[str, int], int]) -> CorrectedPoses:
+        """Corrected poses, each in the world of its frame (``MapCorrector.worlds``), in that of the map.
+
+        Of frames that are not known the pose stays as it is.
+        """
+        by_stamp = {stamp_ns: world for (_, stamp_ns), world in worlds.items()}
+        moved: dict[Any, Float64] = {}
+        for key, pose in poses.items():
+            world = worlds.get(key) if isinstance(key, tuple) else by_stamp.get(key)
+            moved[key] = move(self.known[world], pose) if world in self.known else pose
+        return moved
 
     def take(self, frame: PosedFrame) -> Taken:
         """Take the next frame. One whose pose is not valid goes on to where it is refused."""
@@ -150,7 +167,7 @@ class MapWorlds:
         """A frame of a known world."""
         pose = move(self.known[frame.world], frame.T_world_camera)
         self.reason = ""
-        self._whereabouts.last = CameraPose(frame.camera_id, frame.stamp_ns, move(self._motion(), pose))
+        self._whereabouts.last = CameraPose(frame.camera_id, frame.stamp_ns, move(self._motion(frame.world), pose))
         return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
 
     def _look(self, frame: PosedFrame) -> bool:
@@ -160,15 +177,15 @@ class MapWorlds:
             self.refused[found.reason] += 1
             self.reason = found.detail
             return False
-        new = sighting(found.T_map_camera, frame.T_world_camera, found.inliers)
         seen = self._sightings.setdefault(frame.world, deque(maxlen=REMEMBERED))
-        seen.append(new)
-        agreeing = agreeing_with(new, seen)
-        if len(agreeing) < AGREEING:
+        seen.append(sighting(found.T_map_camera, frame.T_world_camera, found.inliers))
+        consensus = find_consensus(seen)
+        if consensus.refusal:
             self.refused["alone"] += 1
-            self.reason = f"{len(agreeing)} of {AGREEING} frames agree on it"
+            self.reason = consensus.refusal
             return False
-        self.known[frame.world] = move(invert_pose(self._motion()), agreed(agreeing))
+        agreeing = consensus.agreeing
+        self.known[frame.world] = move(invert_pose(self._motion(frame.world)), agreed(agreeing))
         self.found += 1
         del self._sightings[frame.world]
         _log.info("world_found", camera=frame.camera_id, seq=frame.seq, agreeing=len(agreeing), held=len(self._held))

@@ -94,7 +94,7 @@ _FORMS: dict[str, Any] = {  # of fields that stand otherwise in a header than in
     "label_set": LabelSetForm | None,
 }
 _UPDATE_SCALARS = (
-    "stamp_ns seq camera_id fused is_keyframe source_seqs blocks blocks_touched rays samples stage_ms".split()
+    "stamp_ns seq camera_id fused is_keyframe source_seqs blocks blocks_touched rays samples stage_ms world".split()
 )
 _WeightsBytes = Annotated[int, Meta(ge=1, le=MAX_WEIGHTS_BYTES)]
 _ERROR = "error"  # in the place of an answer's kind
@@ -112,6 +112,7 @@ _NOT_SENT_AS_0 = (
     "gone",
     "moving",
     "world",
+    "T_map_world",
 )  # came later: what does not need it is read by older releases, too
 _FRAME_BUFFERS = ("rgb", "depth", "label", "depth_sigma")  # fields of a frame's header, in the order of their buffers
 
@@ -135,6 +136,8 @@ class Envelope:
         topic: Name of the topic ("frame", "map", ...); ``source``: camera id or node.
         stamp_ns, seq: 0 where the message has none.
         T_world_camera: Of a frame, 16 numbers row by row; else empty.
+        world: Of a frame or map update.
+        T_map_world: Of a map update, 16 numbers; empty where it is no motion.
         has_depth, has_label: Of a frame.
         has_computed_depth, has_pseudo_label: Whether no sensor and no person has made them.
         rgb_encoding: Of a frame: "png", "jpeg" or "raw".
@@ -146,6 +149,8 @@ class Envelope:
     stamp_ns: int = 0
     seq: int = 0
     T_world_camera: tuple[float, ...] = ()
+    world: int = 0
+    T_map_world: tuple[float, ...] = ()
     has_depth: bool = False
     has_label: bool = False
     rgb_encoding: str = ""
@@ -202,6 +207,8 @@ class MapUpdateHeader(Wire, frozen=True, kw_only=True):
     confidence: ConfidenceSpec
     depth: DepthSpec
     moving: LabelSpec | None = None
+    world: Count = 0
+    T_map_world: Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)] | None = None  # None: no motion
 
     def __post_init__(self) -> None:
         if self.width * self.height > MAX_PIXELS:
@@ -410,7 +417,8 @@ def read_envelope(parts: Parts) -> Envelope:
             return _frame_envelope(row.name, header)
         case "map":
             update, _ = _open_map_update(parts)
-            return Envelope(row.name, source, update.stamp_ns, update.seq)
+            where = {"world": update.world, "T_map_world": update.T_map_world or ()}
+            return Envelope(row.name, source, update.stamp_ns, update.seq, **where)
         case "weights":
             _open_weights(parts)
             return Envelope(row.name, source)
@@ -566,6 +574,7 @@ def _frame_envelope(topic: str, header: FrameHeader) -> Envelope:
         stamp_ns=header.stamp_ns,
         seq=header.seq,
         T_world_camera=header.T_world_camera,
+        world=header.world,
         has_depth=header.depth is not None,
         has_label=header.label is not None,
         rgb_encoding=header.rgb.encoding,
@@ -621,7 +630,8 @@ def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
     if update.moving is not None and update.moving.any():
         specs["moving"], data = encode_label(update.moving.astype(np.uint8), options)
         buffers.append(data)
-    header = to_plain(MapUpdateHeader(width=width, height=height, **fields, **specs), what)
+    T = None if np.array_equal(update.T_map_world, np.eye(4)) else tuple(update.T_map_world.ravel().tolist())
+    header = to_plain(MapUpdateHeader(width=width, height=height, T_map_world=T, **fields, **specs), what)
     _leave_out_zeros(header)
     return [topic_bytes("map", update.camera_id), _pack(header, MapUpdateHeader, what), *buffers]
 
@@ -635,11 +645,13 @@ def _open_map_update(parts: Parts) -> tuple[MapUpdateHeader, Parts]:
 def _decode_map_update(header: MapUpdateHeader, buffers: Parts) -> MapUpdate:
     size, what = (header.height, header.width), header.name
     label, confidence, depth, *moving = buffers
+    T = header.T_map_world
     return MapUpdate(
         label=decode_label(label, size, what),
         confidence=decode_confidence(header.confidence, confidence, size, what),
         depth_m=decode_depth(header.depth, depth, size, what),
         moving=decode_label(moving[0], size, what) > 0 if moving else None,
+        T_map_world=np.eye(4) if T is None else np.array(T, np.float64).reshape(4, 4),
         **{name: getattr(header, name) for name in _UPDATE_SCALARS},
     )
 

@@ -80,6 +80,9 @@ def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
             assert last.T_map_camera is None and last.reason
         else:
             assert last.T_map_camera is not None and off(last.T_map_camera, frame.T_world_camera)[0] < 0.05
+            told = results[-1]
+            assert isinstance(told, MapUpdate) and told.world == 7
+            np.testing.assert_allclose(told.T_map_world @ abroad(frame).T_world_camera, last.T_map_camera, atol=1e-9)
     assert held >= 2 and session.worlds.found == 1 and not session.worlds.held
     moved, turned = off(session.worlds.known[7], invert_pose(other_world()))
     assert moved < 0.1 and turned < 1.0  # where the map's origin lies, metres away
@@ -110,6 +113,14 @@ def test_a_picture_without_measured_depth_proves_no_place() -> None:
     computed = replace(walk()[1], depth_sigma_m=np.full((120, 160), 0.01, np.float32))
     assert not worlds.take(blind).ready and not worlds.take(computed).ready
     assert worlds.refused["no-depth"] == 2
+
+
+def test_a_wrong_focal_length_is_refused() -> None:
+    worlds = MapWorlds(even_map(), own_first=False)
+    for frame in walk()[1:6]:
+        lens = replace(frame.intrinsics, fx=1.15 * frame.intrinsics.fx, fy=1.15 * frame.intrinsics.fy)
+        assert not worlds.take(replace(abroad(frame), intrinsics=lens)).ready
+    assert worlds.refused["calibration"] >= 3
 
 
 def test_classes_that_are_not_the_maps_are_refused() -> None:
@@ -144,12 +155,14 @@ def test_two_maps_of_a_room_find_each_other_and_others_do_not() -> None:
     for frame in walk()[1::2]:
         session.process(abroad(frame))
     found = find_alignment(even_map(), session.pipeline.voxel_map)
+    with pytest.raises(MapError, match="would count twice"):
+        even_map().merged(even_map(), np.eye(4))
     moved, turned = off(found.T_map_other @ other_world(), np.eye(4))
     assert found.agreeing >= 3 and moved < 0.04 and turned < 1.0
     elsewhere = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)
     for frame in walk(TRAIN_SEEDS[19], 8)[::3]:
         elsewhere.process(frame)
-    with pytest.raises(MapError, match="of the second are at one"):
+    with pytest.raises(MapError, match=r"of the second \d+ were found"):
         find_alignment(even_map(), elsewhere.pipeline.voxel_map)
     with pytest.raises(MapError, match="nothing to find itself by"):
         find_alignment(even_map(), VoxelMap(SETTINGS.voxel_map, even_map().label_set))

@@ -150,6 +150,16 @@ def test_what_moves_is_sent_where_something_does() -> None:
         encode(dataclasses.replace(update, moving=moving[1:]))
 
 
+def test_where_the_map_has_the_world_of_a_frame_is_sent_where_it_is_another() -> None:
+    update, T = samples.make_update(), np.eye(4)
+    T[:3, 3] = 1.25, -0.1, 1 / 3
+    assert np.array_equal(decode_as(MapUpdate, encode(update)).T_map_world, np.eye(4))
+    parts = encode(dataclasses.replace(update, world=7, T_map_world=T))
+    back, envelope = decode_as(MapUpdate, parts), read_envelope(parts)
+    assert back.world == envelope.world == 7 and np.array_equal(back.T_map_world, T)
+    assert envelope.T_map_world == tuple(T.ravel())
+
+
 @pytest.mark.parametrize("label_set", [None, NYU40, CAMVID11])
 def test_stream_info_survives(label_set) -> None:
     info = msgspec.structs.replace(samples.make_info(), label_set=label_set)

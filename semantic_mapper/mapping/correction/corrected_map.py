@@ -89,7 +89,7 @@ class _Rebuild:
     def place(self, entry: FrameEntry) -> Float64:
         T_world_camera = entry.T_world_camera
         for correction in self.corrections:
-            T_world_camera = correction.place(entry.camera_id, entry.stamp_ns, T_world_camera)
+            T_world_camera = correction.place(entry.camera_id, entry.stamp_ns, T_world_camera, entry.world)
         return T_world_camera
 
     def give_up(self) -> None:
@@ -128,12 +128,13 @@ class MapCorrector:
         self._history = FrameHistory(config.max_frames, config.max_disk_mb * 1_000_000) if config.max_frames else None
         self._why_none = "no frames are kept; set history.max_frames in the mapper's config"
         self._rebuild: _Rebuild | None = None
-        self._journal = MapJournal(voxel_map, 0) if config.max_frames else None  # of each segment's beginning
+        self._journal: MapJournal | None = None  # of each segment's beginning; from the first frame on
         self._journal_bytes = 0  # on disk, when last looked at
         self._frozen = FrozenFrames()
         self._lost = self._completed = self._poses = 0
         self._failure = ""
-        self._motion = np.eye(4)  # of frames to come, where their odometry goes on in the world before correction
+        # Of frames to come, by world, where their odometry goes on in the world before correction:
+        self._motions: dict[int, Float64] = {}
 
     @property
     def records(self) -> bool:
@@ -156,19 +157,23 @@ class MapCorrector:
             failure=self._failure,
         )
 
-    @property
-    def motion(self) -> Float64:
-        """By how much frames that come are moved, (4, 4); see ``place``."""
-        return self._motion
+    def motion(self, world: int) -> Float64:
+        """By how much frames of a world that come are moved, (4, 4); see ``place``."""
+        return self._motions.get(world, np.eye(4))
 
     def poses(self) -> dict[tuple[str, int], Float64]:
         """(camera_id, stamp_ns) -> T_world_camera (4, 4) of the frames that can be corrected, as the map has them."""
         entries = [] if self._history is None else self._history.entries()
         return {(e.camera_id, e.stamp_ns): e.T_world_camera.copy() for e in entries}
 
+    def worlds(self) -> dict[tuple[str, int], int]:
+        """(camera_id, stamp_ns) -> world in which its pose came, of the frames that can be corrected."""
+        entries = [] if self._history is None else self._history.entries()
+        return {(e.camera_id, e.stamp_ns): e.world for e in entries}
+
     def place(self, frame: PosedFrame) -> PosedFrame:
         """A frame that comes, at its pose in the map's world; see ``until_ns`` of ``start``."""
-        pose = move(self._motion, frame.T_world_camera)
+        pose = move(self.motion(frame.world), frame.T_world_camera)
         return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
 
     def record(self, fused: FusedFrame) -> None:
@@ -189,6 +194,12 @@ class MapCorrector:
         history = self._history
         if history is None:
             return
+        if self._journal is None:
+            try:
+                self._journal = MapJournal(self._map, 0)  # now, as the map may have become a saved one
+            except MapError as error:
+                self._end_history(str(error))
+                return
         self._write_journal()
         if not self._is_full(history) and (self._rebuild is not None or not self._segment_ends(history)):
             return
@@ -337,7 +348,8 @@ class MapCorrector:
             self._journal.belong_to(self._map)
         for correction in rebuild.corrections:
             if correction.until_ns == ALWAYS:
-                self._motion = move(correction.last_motion, self._motion)
+                for world, motion in correction.last_motions.items():
+                    self._motions[world] = move(motion, self.motion(world))
         rebuild.moving.adopt()
         self._completed += len(rebuild.corrections)
         self._poses += sum(len(correction) for correction in rebuild.corrections)

@@ -66,6 +66,7 @@ class FrameEntry:
         has_depth: Whether the frame has depth of its own.
         bytes: On disk.
         offset: Bytes of all frames that were kept before it.
+        world: In which its pose came.
     """
 
     number: int
@@ -78,6 +79,7 @@ class FrameEntry:
     has_depth: bool
     bytes: int
     offset: int
+    world: int = 0
 
 
 class FrameHistory:
@@ -185,6 +187,7 @@ class FrameHistory:
             has_depth=frame.depth_m is not None,
             bytes=sum(len(blob) for blob in blobs),
             offset=self._bytes_ever,
+            world=frame.world,
         )
         with self._lock:
             self._entries[number] = entry
@@ -261,6 +264,7 @@ def _unpack(entry: FrameEntry, T_world_camera: Float64, blobs: tuple[bytes, ...]
             intrinsics=entry.intrinsics,
             T_world_camera=T_world_camera,
             depth_sigma_m=unpack_floats(sigma, (height, width)) if sigma else None,
+            world=entry.world,
         ),
         probabilities=unpack_floats(probabilities, entry.shape),
         known=unpack_mask(known, *coarse),

@@ -25,16 +25,23 @@ CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
 
 
 class PosePair(NamedTuple):
-    """The pose of one frame before and after, both T_world_camera (4, 4) float64."""
+    """The pose of one frame before and after, both T_world_camera (4, 4) float64 in the map's world.
+
+    ``world`` is the one that the frame came in; see ``PosedFrame``.
+    """
 
     camera_id: str
     stamp_ns: int
     old: Float64
     new: Float64
+    world: int = 0
 
 
 class PoseCorrection:
     """How a correction moves frames. All cameras are taken to sit on one body: they follow the same motion in time.
+
+    A frame moves with given poses of its own world alone: a camera that came back in another world was found in the map
+    by itself.
 
     Args:
         pairs: At least one. Where several cameras have the same stamp, the first by name speaks for the others.
@@ -45,33 +52,37 @@ class PoseCorrection:
     def __init__(self, pairs: Sequence[PosePair], until_ns: int) -> None:
         self.until_ns = until_ns
         self._given: Mapping[tuple[str, int], Float64] = {(p.camera_id, p.stamp_ns): p.new for p in pairs}
-        motions: dict[int, Float64] = {}
+        motions: dict[int, dict[int, Float64]] = {}
         for pair in sorted(pairs, key=lambda p: (p.stamp_ns, p.camera_id)):
-            motions.setdefault(pair.stamp_ns, _motion(pair))
-        self._stamps = np.array(list(motions), np.int64)
-        self._motions = list(motions.values())
+            motions.setdefault(pair.world, {}).setdefault(pair.stamp_ns, _motion(pair))
+        self._motions = {
+            world: (np.array(list(of_world), np.int64), list(of_world.values())) for world, of_world in motions.items()
+        }
 
     def __len__(self) -> int:
         """Poses given."""
         return len(self._given)
 
     @property
-    def last_motion(self) -> Float64:
-        """(4, 4) ``T_new @ T_old^-1`` of the last given pose."""
-        return self._motions[-1]
+    def last_motions(self) -> dict[int, Float64]:
+        """(4, 4) ``T_new @ T_old^-1`` of the last given pose of each world."""
+        return {world: motions[-1] for world, (_, motions) in self._motions.items()}
 
-    def place(self, camera_id: str, stamp_ns: int, T_world_camera: Float64) -> Float64:
+    def place(self, camera_id: str, stamp_ns: int, T_world_camera: Float64, world: int = 0) -> Float64:
         """The corrected pose (4, 4) of a frame; the very one that was given, where it was."""
         given = self._given.get((camera_id, stamp_ns))
         if given is not None:
             return given
-        after = int(np.searchsorted(self._stamps, stamp_ns))
-        if after == len(self._stamps):
-            return T_world_camera if stamp_ns > self.until_ns else move(self._motions[-1], T_world_camera)
-        if after == 0 or self._stamps[after] == stamp_ns:
-            return move(self._motions[after], T_world_camera)
-        fraction = (stamp_ns - int(self._stamps[after - 1])) / int(self._stamps[after] - self._stamps[after - 1])
-        return _between(self._motions[after - 1], self._motions[after], fraction, T_world_camera)
+        if world not in self._motions:
+            return T_world_camera
+        stamps, motions = self._motions[world]
+        after = int(np.searchsorted(stamps, stamp_ns))
+        if after == len(stamps):
+            return T_world_camera if stamp_ns > self.until_ns else move(motions[-1], T_world_camera)
+        if after == 0 or stamps[after] == stamp_ns:
+            return move(motions[after], T_world_camera)
+        fraction = (stamp_ns - int(stamps[after - 1])) / int(stamps[after] - stamps[after - 1])
+        return _between(motions[after - 1], motions[after], fraction, T_world_camera)
 
 
 def move(motion: Float64, T_world_camera: Float64) -> Float64:

@@ -68,7 +68,7 @@ def pair_poses(
             names = ", ".join(sorted({e.camera_id for e in found}))
             raise MapError(f"{where}: cameras {names} have this stamp; give (camera_id, stamp_ns)")
         if found:
-            pairs.append(PosePair(found[-1].camera_id, stamp_ns, old_pose(found[-1]), new.copy()))
+            pairs.append(PosePair(found[-1].camera_id, stamp_ns, old_pose(found[-1]), new.copy(), found[-1].world))
         else:
             missing.append((camera_id, stamp_ns, where))
     _check_have_left(missing, frozen, list(by_stamp))

@@ -151,6 +151,35 @@ def test_unchanged_poses_give_the_same_map_to_the_bit_also_where_frames_have_lef
     assert same(pipeline.voxel_map, without.voxel_map)
 
 
+def test_a_saved_map_that_was_gone_on_in_stays_where_it_is_through_a_correction():
+    frames = tiny_frames(6)
+    saved, again = mapped(frames[:3], max_frames=0).voxel_map, mapped(frames[:3], max_frames=0).voxel_map
+    pipeline, other = make_pipeline(), make_pipeline(0)
+    pipeline.voxel_map.take_over(saved)
+    other.voxel_map.take_over(again)
+    for frame in frames[3:]:
+        pipeline.step(frame)
+        other.step(frame)
+    pipeline.correct_poses({frames[4].stamp_ns: frames[4].T_world_camera})
+    finish(pipeline)
+    assert pipeline.corrector.status.completed == 1 and pipeline.voxel_map.frames == 6
+    assert same(pipeline.voxel_map, other.voxel_map)
+
+
+def test_frames_move_with_given_poses_of_their_own_world_alone():
+    frames = [replace(f, world=int(i > 2)) for i, f in enumerate(tiny_frames(6))]
+    pipeline = mapped(frames)
+    pipeline.correct_poses({frames[4].stamp_ns: drift(0.5) @ frames[4].T_world_camera}, until_ns=ALWAYS)
+    finish(pipeline)
+    poses = pipeline.corrector.poses()
+    for frame in frames:
+        moved = drift(0.5) if frame.world else np.eye(4)
+        placed = poses[frame.camera_id, frame.stamp_ns]
+        np.testing.assert_allclose(placed, moved @ frame.T_world_camera, atol=1e-9)
+    assert np.array_equal(pipeline.corrector.motion(0), np.eye(4))
+    np.testing.assert_allclose(pipeline.corrector.motion(1), drift(0.5), atol=1e-9)
+
+
 def test_frames_that_come_during_the_rebuild_are_in_the_new_map():
     frames = tiny_frames(8)
     at_once, between = mapped(drifted(frames)[:5]), mapped(drifted(frames)[:5])

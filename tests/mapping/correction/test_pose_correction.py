@@ -59,7 +59,7 @@ def test_before_the_first_the_first_holds_and_after_the_last_only_up_to_the_stam
     np.testing.assert_allclose(until.place("a", 350, POSES[3]), D @ POSES[3], atol=1e-12)
     assert until.place("a", 351, POSES[4]) is POSES[4]
     np.testing.assert_allclose(always.place("a", 10**18, POSES[4]), D @ POSES[4], atol=1e-12)
-    np.testing.assert_allclose(always.last_motion, D, atol=1e-12)
+    np.testing.assert_allclose(always.last_motions[0], D, atol=1e-12)
 
 
 def test_another_camera_on_the_same_body_follows_in_time():

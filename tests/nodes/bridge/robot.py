@@ -6,7 +6,7 @@ import dataclasses
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status
 from semantic_mapper.transport.security import Keys
 from semantic_mapper.transport.sockets import Publisher
-from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.queries.scene import LABELS, whole_map
 from tests.small import tiny_frames
@@ -56,6 +56,8 @@ class Robot:
     stop: StopRequest
     endpoints: dict[str, str]
     failures: list[BaseException]
+    world: int = 0  # of the camera's frames
+    T_map_world: Float64 | None = field(default_factory=lambda: np.eye(4))  # None: its frames are held
 
     @contextmanager
     def mapped(self, keys: Keys | None = None) -> Iterator[QueryService]:
@@ -66,8 +68,12 @@ class Robot:
     def publish(self, number: int) -> PosedFrame:
         """One more frame, with what was rendered for it, and the mapper's status."""
         frame = tiny_frames()[number]
-        self.camera.publish(encode_frame(frame))
-        self.mapper.publish(encode(update_for(frame, LABELS.ids[1])))
+        self.camera.publish(encode_frame(dataclasses.replace(frame, world=self.world)))
+        if self.T_map_world is not None:
+            update = dataclasses.replace(
+                update_for(frame, LABELS.ids[1]), world=self.world, T_map_world=self.T_map_world
+            )
+            self.mapper.publish(encode(update))
         self.mapper.publish(encode(Status("mapper", "running", frame.stamp_ns, {"fused": number, "moving": 7})))
         return frame
 

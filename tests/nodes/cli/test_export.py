@@ -44,28 +44,50 @@ def test_what_cannot_be_exported_is_refused_in_one_line(results: Path, tmp_path:
     assert not list(tmp_path.iterdir())
 
 
-def test_two_maps_become_one(results: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of the same sphere, of one frame more."""
+    path = tmp_path_factory.mktemp("other") / "map.npz"
+    voxel_map = small_map(voxel_size_m=0.04)
+    fuse_sphere(voxel_map, 4)
+    voxel_map.save(path)
+    return path
+
+
+def test_two_maps_become_one(results: Path, other: Path, tmp_path: Path) -> None:
     out = tmp_path / "both.npz"
-    done = run("merge", results, results / "map.npz", "--transform", "4 0 -0.4 90", "--out", out)
+    done = run("merge", results, other, "--transform", "4 0 -0.4 90", "--out", out)
     assert done.returncode == 0, done.stderr
-    assert f"{out}: 6 frames" in done.stdout
-    one, both = VoxelMap.load(results / "map.npz").points().xyz, VoxelMap.load(out).points().xyz
-    assert len(both) == 2 * len(one)
-    moved = np.stack((4 - one[:, 1], one[:, 0], one[:, 2] - 0.4), axis=1)  # a quarter turn to the left, then the shift
+    assert f"{out}: 7 frames" in done.stdout
+    one, two, both = (VoxelMap.load(path).points().xyz for path in (results / "map.npz", other, out))
+    assert len(both) == len(one) + len(two)
+    moved = np.stack((4 - two[:, 1], two[:, 0], two[:, 2] - 0.4), axis=1)  # a quarter turn to the left, then the shift
     second = both[both[:, 0] > 2]
     np.testing.assert_allclose(np.sort(second, axis=0), np.sort(moved, axis=0), atol=1e-5)
 
 
-def test_merging_a_map_with_itself_says_where_its_blocks_have_gone(results: Path, tmp_path: Path) -> None:
-    voxel_map = VoxelMap.load(results / "map.npz")
-    measured = int((voxel_map.block_state()["weight"] > 0).any(axis=(1, 2, 3)).sum())
-    count, empty = voxel_map.block_count, voxel_map.block_count - measured
-    assert empty > 0
-    done = run("merge", results, results, "--transform", "0 0 0 0", "--out", tmp_path / "twice.npz")
+def test_merging_says_where_blocks_have_gone(results: Path, other: Path, tmp_path: Path) -> None:
+    loaded = [VoxelMap.load(path) for path in (results / "map.npz", other)]
+    measured = [int((one.block_state()["weight"] > 0).any(axis=(1, 2, 3)).sum()) for one in loaded]
+    counts = [one.block_count for one in loaded]
+    assert min(np.subtract(counts, measured)) > 0
+    done = run("merge", results, other, "--transform", "0 0 0 0", "--out", tmp_path / "both.npz")
     assert done.returncode == 0, done.stderr
+    joined = VoxelMap.load(tmp_path / "both.npz").block_count
     said = " ".join(done.stdout.split())
-    assert f"{count} and {count} made {measured} blocks; {2 * empty} empty blocks of the two" in said
-    assert VoxelMap.load(tmp_path / "twice.npz").block_count == measured
+    assert f"{counts[0]} and {counts[1]} made {joined} blocks; {sum(counts) - sum(measured)} empty blocks" in said
+
+
+def test_what_cannot_be_merged_is_refused_before_the_maps_are_read(results: Path, other: Path, tmp_path: Path) -> None:
+    for arguments, says in (
+        (
+            (results, results / "map.npz", "--transform", "0 0 0 0"),
+            "are the same map: all that it has seen would",
+        ),
+        ((results, other), "the first one has nothing to find itself by"),
+    ):
+        done = run("merge", *arguments, "--out", tmp_path / "both.npz")
+        assert done.returncode == 1 and says in error_line(done.stderr) and not list(tmp_path.iterdir())
 
 
 def test_a_transform_is_four_numbers_or_a_file(tmp_path: Path) -> None:

@@ -162,6 +162,12 @@ def test_graph_with_a_picture(map_file: Path, tmp_path: Path) -> None:
     assert run_here("query", map_file, "info", "--picture", "p.png")[0] == 2
 
 
+def test_a_map_without_a_floor_has_no_picture_of_its_graph(map_file: Path, tmp_path: Path) -> None:
+    code, said = run_here("query", map_file, "graph", "--up", "1", "0", "0", "--picture", tmp_path / "rooms.png")
+    assert code == 1 and "there is nothing to draw: no floor was found" in said
+    assert not (tmp_path / "rooms.png").exists()
+
+
 def test_graph_of_a_running_mapper_keeps_its_ids() -> None:
     with a_folder() as folder, answering(f"ipc://{folder}/query", whole_map()), MapClient(f"ipc://{folder}/query") as c:
         first, again = c.graph(), c.graph()

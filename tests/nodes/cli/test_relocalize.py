@@ -15,13 +15,23 @@ from tests.mapping.test_worlds import INTRINSICS, abroad, even_map, off, other_w
 from tests.nodes.support import run
 
 
-def test_the_frames_of_a_log_are_found_in_a_map(tmp_path: Path) -> None:
+def test_the_frames_of_a_log_are_found_in_a_map_each_world_by_itself(tmp_path: Path) -> None:
     even_map().save(tmp_path / "map.npz")
-    with LogWriter(tmp_path / "today.mcap", StreamInfo("today", {"rooms": INTRINSICS}, ROOMS, 4, 15.0)) as log:
+    log_path = tmp_path / "today.mcap"
+    with LogWriter(log_path, StreamInfo("today", {"rooms": INTRINSICS}, ROOMS, 4, 15.0)) as log:
         for frame in walk()[1:14:4]:
             log.write_frame(replace(abroad(frame, 0), label=None))
-    found = run("relocalize", tmp_path / "map.npz", tmp_path / "today.mcap", "--json")
-    assert found.returncode == 0, found.stderr
+        log.write_frame(replace(walk()[15], world=2, label=None))
+        data = log_path.stat().st_size
+        log.write_frame(replace(walk()[15], world=2, label=None))
+    whole = bytearray(log_path.read_bytes())
+    whole[data + 5000] ^= 0xFF
+    log_path.write_bytes(bytes(whole))
+    found = run("relocalize", tmp_path / "map.npz", log_path, "--json")
+    assert found.returncode == 1, found.stderr
     told = json.loads(found.stdout)
-    assert (told["frames"], told["found"], told["refused"]) == (4, 4, {})
-    assert off(np.array(told["T_map_world"]) @ other_world(), np.eye(4))[0] < 0.1
+    assert (told["frames"], told["found"], told["refused"]) == (5, 5, {})
+    assert [frame["number"] for frame in told["unreadable"]] == [5]
+    assert [(w["world"], w["agreeing"]) for w in told["worlds"]] == [(0, 4), (2, 1)]
+    assert off(np.array(told["worlds"][0]["T_map_world"]) @ other_world(), np.eye(4))[0] < 0.1
+    assert told["worlds"][1]["T_map_world"] is None and told["worlds"][1]["disagreement"] == "1 of 3 frames agree on it"

@@ -134,6 +134,23 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, port: int) -> No
     assert status["node"] == "mapper" and status["counters"]["moving"] == 7
 
 
+def test_a_camera_of_another_world_is_shown_where_the_map_has_it_and_nowhere_while_that_is_not_known(
+    robot: Robot, port: int
+) -> None:
+    robot.world, robot.T_map_world = 7, None
+    topics = {"/tf", f"/{tiny_frames()[2].camera_id}/rgb"}
+    with FoxgloveClient(f"ws://127.0.0.1:{port}", topics) as client:
+        gather(client, robot, topics - {"/tf"})
+        robot.publish(2)
+        while (message := client.receive(4 * REFRESH_S)) is not None:
+            assert message.topic != "/tf"
+        robot.T_map_world = T = np.eye(4)
+        T[:3, 3] = 5.0, -3.0, 0.7
+        found = gather(client, robot, {"/tf"})
+    at = FrameTransforms.FromString(found["/tf"].data).transforms[0].translation
+    np.testing.assert_allclose([at.x, at.y, at.z], tiny_frames()[2].T_world_camera[:3, 3] + T[:3, 3])
+
+
 def test_a_late_client_receives_the_map_that_does_not_change_and_so_after_a_restart(robot: Robot, port: int) -> None:
     url, topics = f"ws://127.0.0.1:{port}", {"/map/classes"}
     with robot.mapped() as service:
@@ -203,7 +220,7 @@ def test_a_client_that_does_not_keep_up_loses_the_oldest(port: int) -> None:
         assert not server.wants("frame", frame.camera_id)
         assert eventually(lambda: client.receive(0.05) is None and server.wants("frame", frame.camera_id), 20)
         for number in range(count):
-            server.send_frame(dataclasses.replace(frame, stamp_ns=number))  # 4 MB each, and nobody reads them
+            server.send_frame(dataclasses.replace(frame, stamp_ns=number), None)  # 4 MB each, and nobody reads them
         came: list[int] = []
         while (message := client.receive(2.0)) is not None:
             came.append(message.log_time_ns)

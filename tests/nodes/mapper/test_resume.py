@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import CAMVID11, ROOMS
 from semantic_mapper.localization.features import Features
@@ -18,7 +18,15 @@ from semantic_mapper.localization.places import make_place
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.node import Playback
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.mapper.resume import forbid, go_on, keep_earlier, note_worlds, noted_worlds, take_up
+from semantic_mapper.nodes.mapper.resume import (
+    forbid,
+    go_on,
+    keep_earlier,
+    note_worlds,
+    noted_worlds,
+    stored_settings,
+    take_up,
+)
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -74,6 +82,21 @@ def test_map_of_an_earlier_run_is_no_map_of_this_one(tmp_path: Path) -> None:
     assert fresh.frames == 0 and path.read_bytes() == before
     some_map(4).save(path)  # by the first restarted one
     assert "after 4 frames" in take_up(context(folder, 2), path, fresh)
+
+
+def test_a_run_that_goes_on_keeps_its_settings_but_for_what_the_stored_data_means(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    some_map(2).save(path)
+    user = VoxelMapConfig(memory_mb=400, unknown_below=0.3)
+    settings = stored_settings(MapperConfig(voxel_map=user), {"memory_mb", "unknown_below"}, path).voxel_map
+    assert (settings.voxel_size_m, settings.memory_mb, settings.unknown_below) == (0.05, 400, 0.3)
+    loaded, fresh = VoxelMap.load(path, config=settings), VoxelMap(settings, ROOMS)
+    assert loaded.config == settings
+    fresh.take_over(loaded)
+    assert_same(fresh, some_map(2))
+    other = stored_settings(MapperConfig(), {"voxel_size_m"}, path).voxel_map
+    with pytest.raises(ConfigError, match=r"map.npz: was made with voxel_map.voxel_size_m = 0.05 .* 0.02: leave"):
+        VoxelMap.load(path, config=other)
 
 
 def test_a_saved_map_is_gone_on_in_where_it_can_be_found_again(tmp_path: Path) -> None:

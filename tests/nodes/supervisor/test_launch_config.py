@@ -182,6 +182,10 @@ def test_a_bridge_is_one_more_listener_and_asks_the_mapper(tmp_path: Path, kind:
     given = ["kind=v4l2", "camera=webcam.toml", "poses=poses.toml"]
     launch = load_launch(path, given, Path("somewhere"))
     assert launch.inputs(kind) == ("camera", "mapper") and launch.listeners("camera") == 2
+    again = load_launch(path, [*given, "map=runs/yesterday", "history=7"], Path("somewhere")).options
+    camera, mapper = again["camera"], again["mapper"]
+    assert isinstance(mapper, MapperOptions) and (mapper.map, mapper.history_frames) == ("runs/yesterday", 7)
+    assert isinstance(camera, CameraOptions) and camera.corrections == mapper.query
     text = path.read_text(encoding="utf-8")
     bridge = f'kind = "{kind}"\nrestart = "on-failure"\n[node.options]\n'
     for change, says in (
@@ -195,6 +199,16 @@ def test_a_bridge_is_one_more_listener_and_asks_the_mapper(tmp_path: Path, kind:
         other = text.replace(bridge, bridge + change).replace('refresh_s = "{refresh}"\n', "")
         with pytest.raises(ConfigError, match=re.escape(says)):
             load_launch(_file(tmp_path, other), given)
+
+
+def test_addresses_of_zenoh_are_checked_before_anything_starts() -> None:
+    given = ["kind=v4l2", "camera=webcam.toml", "poses=poses.toml"]
+    for listen, says in (
+        ("tcp/0.0.0.0:7447", "node 'zenoh': .* certificates"),
+        ("tcp/127.0.0.1:99999", "ports end at"),
+    ):
+        with pytest.raises((ConfigError, TransportError), match=says):
+            load_launch(REPLAY_LAUNCH.with_name("zenoh.toml"), [*given, f"listen={listen}"])
 
 
 def test_launch_files_for_cameras_are_as_the_docs_say() -> None:

@@ -76,7 +76,7 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, address: str) ->
     frame, heard = tiny_frames()[2], Heard()
     camera = f"lab/robot/{frame.camera_id}"
     keys = {f"{camera}/{kind}" for kind in ("rgb", "depth", "semantics", "moving", "pose")}
-    keys |= {"lab/robot/map/points", "lab/robot/graph", "lab/robot/status/mapper"}
+    keys |= {"lab/robot/map/points", "lab/robot/graph", "lab/robot/status/mapper", "lab/robot/status/zenoh"}
     with robot.mapped(), session(address) as client:
         client.declare_subscriber("lab/robot/**", heard)
 
@@ -89,7 +89,7 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, address: str) ->
     assert set(found) == keys
 
     pose = json.loads(found[f"{camera}/pose"].payload.to_bytes())
-    assert pose["T_world_camera"] == frame.T_world_camera.tolist() and pose["intrinsics"]["fx"] == 66.0
+    assert pose["T_map_camera"] == frame.T_world_camera.tolist() and pose["intrinsics"]["fx"] == 66.0
     image = found[f"{camera}/rgb"]
     assert image.encoding == zenoh.Encoding.IMAGE_JPEG and attached(image) == pose
     shown = cv2.imdecode(np.frombuffer(image.payload.to_bytes(), np.uint8), cv2.IMREAD_COLOR)
@@ -136,11 +136,11 @@ def test_a_client_that_stands_still_loses_images(address: str) -> None:
         client.declare_subscriber("semantic_mapper/*/depth", direct)
         assert eventually(lambda: bridge.wants("frame", frame.camera_id), 20)
         for number in range(count):
-            bridge.send_frame(dataclasses.replace(frame, seq=number))  # 4 MB each
+            bridge.send_frame(dataclasses.replace(frame, seq=number), None)  # 4 MB each
         go_on.set()
 
         def receives_again() -> bool:
-            bridge.send_frame(dataclasses.replace(frame, seq=count))
+            bridge.send_frame(dataclasses.replace(frame, seq=count), None)
             return came[-1] == count
 
         assert eventually(receives_again, 20)
@@ -154,7 +154,7 @@ def test_it_joins_the_network_of_a_router_that_comes_later(address: str) -> None
             heard = Heard()
             client.declare_subscriber("semantic_mapper/rooms/pose", heard)
             assert eventually(lambda: bridge.wants("frame", "rooms"), 20)
-            bridge.send_frame(tiny_frames()[0])
+            bridge.send_frame(tiny_frames()[0], np.eye(4))
             assert eventually(lambda: bool(heard.samples), 20)
 
 

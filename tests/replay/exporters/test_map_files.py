@@ -11,13 +11,13 @@ import rerun.chunk
 
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.geometry import look_at
-from semantic_mapper.labels import make_label_set
+from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.oriented_box import OrientedBox
-from semantic_mapper.replay.exporters.map_files import AXES, ExportRequest, export_map, format_of, parse_up
+from semantic_mapper.replay.exporters.map_files import AXES, ExportRequest, export_map, format_of, parse_up, read_costs
 from semantic_mapper.replay.exporters.rerun_layout import COMPUTED_COLOR, MEASURED_COLOR
 from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
 from tests.mapping.files.test_formats import read_glb
@@ -139,12 +139,21 @@ def test_costs_are_read_by_class(corner: VoxelMap, tmp_path: Path) -> None:
         ("floor = 101", "a cost is a whole number from 0"),
         ("floor = true", "a cost is a whole number from 0"),
         ("floor", "costs.toml"),
+        ("# floor = 1", "costs.toml: has no costs"),
     ):
         (tmp_path / "costs.toml").write_text(text)
         with pytest.raises(ConfigError, match=message):
             export_map(corner, tmp_path / "plan.yaml", request)
     with pytest.raises(ConfigError, match="--costs means nothing for format obj"):
         export_map(corner, tmp_path / "a.obj", ExportRequest("obj", costs=tmp_path / "costs.toml"))
+
+
+def test_the_costs_that_the_howto_shows_are_those_of_a_map_of_rooms(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "howto.md").read_text(encoding="utf-8")
+    shown = text.split("`costs.toml` has lines")[1].split("```toml\n")[1].split("```")[0]
+    (tmp_path / "costs.toml").write_text(shown)
+    costs = read_costs(tmp_path / "costs.toml", ROOMS)
+    assert costs[ROOMS.ids[ROOMS.names.index("chair")]] == 80 and (costs >= 0).sum() == 3
 
 
 def test_files_of_a_map_without_metres_say_so_and_a_plan_is_refused(corner: VoxelMap, tmp_path: Path) -> None:
