@@ -32,7 +32,6 @@ from semantic_mapper.nodes.options import (
     ZenohOptions,
     check_tracking,
 )
-from semantic_mapper.nodes.zenoh.addresses import zenoh_settings
 
 Value = str | int | float | bool
 STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
@@ -208,10 +207,7 @@ def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
     """
     for name, own in options.items():
         if isinstance(own, ZenohOptions):
-            try:
-                zenoh_settings(own)
-            except SemanticMapperError as error:
-                raise type(error)(f"{path}: node '{name}': {error}") from error
+            _check_zenoh(own, f"{path}: node '{name}'")
         if isinstance(own, BridgeOptions):
             mapper = options[own.mapper]
             if not isinstance(mapper, MapperOptions):
@@ -226,6 +222,15 @@ def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
                     f"{path}: node '{name}' has the keys '{own.keys}', but mapper '{own.mapper}' '{mapper.keys}'; give "
                     "both the same folder as `keys`"
                 )
+
+
+def _check_zenoh(options: ZenohOptions, where: str) -> None:
+    from semantic_mapper.nodes.zenoh.addresses import zenoh_settings  # loads ZeroMQ, which few commands need
+
+    try:
+        zenoh_settings(options)
+    except SemanticMapperError as error:
+        raise type(error)(f"{where}: {error}") from error
 
 
 def _convert_options(node: NodeEntry, values: Mapping[str, Value], path: Path) -> NodeOptions:

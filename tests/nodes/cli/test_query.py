@@ -108,6 +108,16 @@ def test_instances(map_file: Path) -> None:
     assert "table" in shown and str(large["cup"]["voxels"]) in shown
 
 
+def test_instances_of_a_saved_map_stand_as_its_floor_says(tmp_path: Path) -> None:
+    plain = whole_map()
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # z becomes x
+    VoxelMap(plain.config, plain.label_set).merged(plain, T).save(tmp_path / "map.npz")
+    found = ask_file(str(tmp_path), Asked(Question.INSTANCES))
+    np.testing.assert_allclose(found["up"], (1, 0, 0), atol=0.02)
+    assert {thing["class"] for thing in found["instances"] if thing["voxels"] > 200} == {"table", "cup"}
+
+
 def answers(endpoint: str) -> bool:
     try:
         ask_mapper(endpoint, Asked(Question.INFO, "", ()))

@@ -11,8 +11,15 @@ import numpy as np
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
+from tests.mapping.rendered_views import small_map
 from tests.mapping.test_worlds import INTRINSICS, abroad, even_map, off, other_world, walk
-from tests.nodes.support import run
+from tests.nodes.support import error_line, run
+
+
+def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:
+    small_map().save(tmp_path / "map.npz")
+    done = run("relocalize", tmp_path / "map.npz", tmp_path / "none.mcap")
+    assert done.returncode == 1 and "has nothing to find oneself by" in error_line(done.stderr)
 
 
 def test_the_frames_of_a_log_are_found_in_a_map_each_world_by_itself(tmp_path: Path) -> None:

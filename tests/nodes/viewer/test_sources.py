@@ -230,6 +230,7 @@ def test_several_cameras_are_shown_until_the_last_one_ends(tmp_path: Path) -> No
         assert eventually(lambda: "the stream has ended" in told, 60)
     rows = logged(tmp_path / "live.rrd")
     assert rows["/world/cameras/left/image/rgb"] == rows["/world/cameras/right/image/rgb"] == 1
+    assert not rows["/world/cameras/left"] + rows["/world/cameras/left/image"], "where in the map it was is not known"
 
 
 def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:
