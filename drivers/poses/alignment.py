@@ -23,6 +23,7 @@ from semantic_mapper.types import Float64
 _STILL_M, _STILL_RAD = 2e-5, 2e-5  # smaller steps end a level
 _DAMPING = 1e-4  # of the normal matrix's mean diagonal: directions that no point tells of stay as they are
 _LEAST_POINTS = 30
+FALSE = 0.01  # of the information about the best known direction: noise of normals gives so much about every direction
 _COARSER = 2.0  # noise at each level, by that of the next finer one
 
 
@@ -129,6 +130,17 @@ def fit(config: OdometryPoses, levels: Sequence[Level], target: Target, T_world_
         noise_m=float(np.sqrt(s.weighted_squares / max(s.weight, 1e-9))),
         normal_matrix=s.normal_matrix,
     )
+
+
+def flat_directions(normal_matrices: Sequence[Float64]) -> Float64 | None:
+    """Projection (3, 3) on the shifts of the camera, in its own axes, that the points of fits tell nothing of.
+
+    None where they tell of all: the usual case.
+    """
+    shifts = sum((m[3:, 3:] for m in normal_matrices), np.zeros((3, 3)))
+    values, axes = np.linalg.eigh(shifts)
+    flat = axes[:, values < FALSE * values[-1]]
+    return flat @ flat.T if flat.shape[1] else None
 
 
 def _step(
