@@ -48,6 +48,7 @@ _WORSE = 2.5  # times the noise of the fits before: a view that has left the las
 _LEAST_NOISE_M = 0.002
 _NOISE_GAIN = 0.1
 _GUESSED = 0.5  # of a step along what no point tells of: how far it may be wrong
+_CORNERS_M = 0.02  # such a step by the corners of two images
 _UNSURE_M = 0.15  # an image that may be further off by such steps has no pose
 _AWAY_NS = 2_000_000_000  # a camera that gave no image for so long may be anywhere
 _LOST_NS = 5_000_000_000  # lost for so long, it begins a new world ...
@@ -337,13 +338,35 @@ class OdometryPoseSource:
         fits = [fit(self._config, view.levels, t, pose) for t in targets]
         unsure_m = min(k.unsure_m for k in used)
         flat = flat_directions([f.normal_matrix for f in fits])
-        if flat is not None:  # there the points tell nothing, and the pose goes on as guessed
-            open_directions = pose[:3, :3] @ flat @ pose[:3, :3].T
-            pose[:3, 3] += open_directions @ (guess[:3, 3] - pose[:3, 3])
+        if flat is not None:
+            pose, unsure_m = self._go_on(view, pose, pose[:3, :3] @ flat @ pose[:3, :3].T, guess)
             fits = [fit(self._config, view.levels, t, pose) for t in targets]
-            step_m = float(np.linalg.norm(open_directions @ (pose[:3, 3] - self._past[-1].T[:3, 3])))
-            unsure_m = max(self._unsure_m, unsure_m) + _GUESSED * step_m
         return _Found(pose, used[0], fits, unsure_m) if self._lies_on(fits[0]) else None
+
+    def _go_on(self, view: _View, pose: Float64, flat: Float64, guess: Float64) -> tuple[Float64, float]:
+        """Where the points tell nothing: the position there as corners of the last image say, else as guessed.
+
+        Args:
+            view: The image.
+            pose: As aligned.
+            flat: Projection (3, 3) on directions of the world that no point tells of.
+            guess: What the alignment began with.
+
+        Returns:
+            The pose, and how far it may be off in these directions, metres.
+        """
+        wanted, step_m = guess, float(np.linalg.norm(flat @ (guess[:3, 3] - self._past[-1].T[:3, 3])))
+        if self._newest is not None and not self._lost:
+            before, T_world_before = self._newest
+            count = self._config.features
+            match = pose_from_features(
+                view.features(count), before.features(count), view.intrinsics, self._config.min_matches
+            )
+            if match is not None:
+                wanted, step_m = T_world_before @ match[0], _CORNERS_M
+        moved = pose.copy()
+        moved[:3, 3] += flat @ (wanted[:3, 3] - pose[:3, 3])
+        return moved, self._unsure_m + _GUESSED * step_m
 
     def _is_near(self, guess: Float64, pose: Float64) -> bool:
         moved = float(np.linalg.norm(pose[:3, 3] - guess[:3, 3]))
