@@ -183,108 +183,38 @@ class OdometryPoseSource:
 
     def _leaves_motion(self, view: _View, found: _Found) -> bool:
         """Whether a result is not where the last motion leads: another one may be right."""
-        moved_m, turned_deg = between(self._expected(view.stamp_ns), found.T_world_camera)
-        return not self._lost and (moved_m > _JUMP_M or turned_deg > _JUMP_DEG)
+        return not self._lost and not _is_close(self._expected(view.stamp_ns), found.T_world_camera)
 
     def _second_look(self, view: _View, found: _Found | None) -> _Found | None:
         """The best fit among what was found and what the image before says; None where it is a bad one.
 
         The motion has changed at once, or the view lies on nothing. Sliding along a surface shows in a fit that is
-        worse than those before.
+        worse than those before; a pattern that repeats itself, in a motion that the corners contradict.
         """
         results = [] if found is None else [found]
         if self._newest is not None and view.stamp_ns - self._past[-1].stamp_ns < _RECENT_NS:
-            results += [
-                r for g in self._guesses_of_image(view, *self._newest) if (r := self._try(view, *g)) is not None
-            ]
+            before, T_world_before = self._newest
+            corners, turn = self._corner_motion(view), find_turn(view.rgb, before.rgb, view.intrinsics)
+            for motion in (corners, turn, np.eye(4)):
+                if motion is not None:
+                    guess = T_world_before @ motion
+                    result = self._try(view, guess, self._map.near(guess, self._config.neighbours))
+                    results += [] if result is None else [result]
+            if corners is not None:
+                told = T_world_before @ corners
+                results = [r for r in results if _is_close(told, r.T_world_camera)] or results
         best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
-        if best is None or best.fits[0].noise_m > _WORSE * max(self._noise_m or self._config.noise_m, _LEAST_NOISE_M):
-            return None
-        return best
+        noise_m = max(self._noise_m or self._config.noise_m, _LEAST_NOISE_M)
+        return None if best is None or best.fits[0].noise_m > _WORSE * noise_m else best
 
-    def _guesses_of_image(self, view: _View, before: _View, T_world_before: Float64) -> list[_Guess]:
-        """From the last image that had a pose: by its corners, as turned by the shift of the picture, and unmoved."""
+    def _corner_motion(self, view: _View) -> Float64 | None:
+        """T_before_camera (4, 4) from the last image that had a pose, by the corners of both; None without enough."""
+        if self._newest is None:
+            return None
         count = self._config.features
-        match = pose_from_features(
-            view.features(count), before.features(count), view.intrinsics, self._config.min_matches
-        )
-        turn = find_turn(view.rgb, before.rgb, view.intrinsics)
-        motions = [np.eye(4), *(m for m in (turn, None if match is None else match[0]) if m is not None)]
-        poses = [T_world_before @ T for T in reversed(motions)]
-        return [(pose, self._map.near(pose, self._config.neighbours)) for pose in poses]
-
-    def correction(self, final: bool = False) -> CorrectedWorld | None:
-        """New poses of past images since loops were closed, or None; to be asked for after each ``pose``.
-
-        Args:
-            final: No more images will come: finish what is under way.
-        """
-        while final and self._closer is not None and self._closer.busy:
-            self._close_loops(None)
-        if final:
-            self._corrected = self._trail.correction(self._keyframe_poses(), final) or self._corrected
-        corrected, self._corrected = self._corrected, None
-        return corrected
-
-    def _close_loops(self, stamp_ns: int | None) -> None:
-        """Look at one candidate; where keyframes move, the last poses move along, at most once in a while."""
-        if self._closer is None:
-            return
-        due = stamp_ns is None or stamp_ns - self._closed_ns > _PAUSE_NS
-        poses = self._closer.work(optimize=due)
-        if poses is None:
-            return
-        self._closed_ns = self._closed_ns if stamp_ns is None else stamp_ns
-        self._past = [replace(past, T=self._moved(past.T, poses)) for past in self._past]
-        if self._newest is not None:
-            self._newest = self._newest[0], self._moved(self._newest[1], poses)
-        self._map.move(poses)
-        self._corrected = self._trail.correction(self._keyframe_poses(), final=False) or self._corrected
-
-    def _keyframe_poses(self) -> dict[int, Float64]:
-        return {k.number: k.target.T_world_camera for k in self._map.frames}
-
-    def _moved(self, T_world_camera: Float64, poses: Mapping[int, Float64]) -> Float64:
-        nearest = self._map.near(T_world_camera, 1)[0]
-        return poses[nearest.number] @ invert_pose(nearest.target.T_world_camera) @ T_world_camera
-
-    def _check(self, image: CameraImage) -> None:
-        camera = (image.camera_id, image.intrinsics)
-        if self._camera is None:
-            if image.depth_m is None:
-                raise CameraError(
-                    f"camera '{image.camera_id}' has no depth: from its images alone the scale of its motion cannot be "
-                    f"known, and no map be made; {WAYS_OUT}"
-                )
-            self._camera = camera
-        if camera != self._camera:
-            raise CameraError(
-                f"odometry follows camera '{self._camera[0]}' at {self._camera[1].width}x{self._camera[1].height}; an "
-                f"image of '{image.camera_id}' at {image.intrinsics.width}x{image.intrinsics.height} came: give each "
-                "camera a pose source of its own, and do not change its resolution"
-            )
-
-    def _view(self, image: CameraImage) -> _View | None:
-        """None without enough depth."""
-        stride = max(1, round(image.intrinsics.width / self._config.width))
-        if image.depth_m is None:
-            return None
-        intrinsics = thinned(image.intrinsics, stride, stride // 2)
-        depth = thin_depth(image.depth_m, stride, self._config.depth_max_m)
-        if float((depth > 0).mean()) < _LEAST_DEPTH:
-            return None
-        size = (intrinsics.width, intrinsics.height)
-        rgb = np.asarray(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        levels = make_levels(depth, intrinsics, len(self._config.iterations))
-        return _View(image.stamp_ns, rgb, depth, intrinsics, levels)
-
-    def _begin(self, view: _View) -> PoseEstimate:
-        pose = matrix(self._config.T_world_start)
-        self._add_keyframe(view, pose, 0.0, None)
-        self._past, self._newest = [StampedPose(view.stamp_ns, pose)], (view, pose)
-        self._images = 1
-        self._counts["tracked"] += 1
-        return PoseEstimate(pose, "odometry", 0.0, self._world)
+        before = self._newest[0].features(count)
+        match = pose_from_features(view.features(count), before, view.intrinsics, self._config.min_matches)
+        return None if match is None else match[0]
 
     def _guesses(self, view: _View) -> list[_Guess]:
         """The last motion gone on with, and what corners say; that first which lies better on the nearest keyframe."""
@@ -356,14 +286,9 @@ class OdometryPoseSource:
             The pose, and how far it may be off in these directions, metres.
         """
         wanted, step_m = guess, float(np.linalg.norm(flat @ (guess[:3, 3] - self._past[-1].T[:3, 3])))
-        if self._newest is not None and not self._lost:
-            before, T_world_before = self._newest
-            count = self._config.features
-            match = pose_from_features(
-                view.features(count), before.features(count), view.intrinsics, self._config.min_matches
-            )
-            if match is not None:
-                wanted, step_m = T_world_before @ match[0], _CORNERS_M
+        corners = None if self._lost else self._corner_motion(view)
+        if self._newest is not None and corners is not None:
+            wanted, step_m = self._newest[1] @ corners, _CORNERS_M
         moved = pose.copy()
         moved[:3, 3] += flat @ (wanted[:3, 3] - pose[:3, 3])
         return moved, self._unsure_m + _GUESSED * step_m
@@ -473,6 +398,11 @@ class OdometryPoseSource:
         self._world += 1
         self._counts["new_worlds"] += 1
         return self._begin(view)
+
+
+def _is_close(T_a: Float64, T_b: Float64) -> bool:
+    moved_m, turned_deg = between(T_a, T_b)
+    return moved_m < _JUMP_M and turned_deg < _JUMP_DEG
 
 
 def _sigma(fits: list[Fit], drift_m: float) -> float:
