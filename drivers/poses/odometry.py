@@ -216,6 +216,79 @@ class OdometryPoseSource:
         match = pose_from_features(view.features(count), before, view.intrinsics, self._config.min_matches)
         return None if match is None else match[0]
 
+    def correction(self, final: bool = False) -> CorrectedWorld | None:
+        """New poses of past images since loops were closed, or None; to be asked for after each ``pose``.
+
+        Args:
+            final: No more images will come: finish what is under way.
+        """
+        while final and self._closer is not None and self._closer.busy:
+            self._close_loops(None)
+        if final:
+            self._corrected = self._trail.correction(self._keyframe_poses(), final) or self._corrected
+        corrected, self._corrected = self._corrected, None
+        return corrected
+
+    def _close_loops(self, stamp_ns: int | None) -> None:
+        """Look at one candidate; where keyframes move, the last poses move along, at most once in a while."""
+        if self._closer is None:
+            return
+        due = stamp_ns is None or stamp_ns - self._closed_ns > _PAUSE_NS
+        poses = self._closer.work(optimize=due)
+        if poses is None:
+            return
+        self._closed_ns = self._closed_ns if stamp_ns is None else stamp_ns
+        self._past = [replace(past, T=self._moved(past.T, poses)) for past in self._past]
+        if self._newest is not None:
+            self._newest = self._newest[0], self._moved(self._newest[1], poses)
+        self._map.move(poses)
+        self._corrected = self._trail.correction(self._keyframe_poses(), final=False) or self._corrected
+
+    def _keyframe_poses(self) -> dict[int, Float64]:
+        return {k.number: k.target.T_world_camera for k in self._map.frames}
+
+    def _moved(self, T_world_camera: Float64, poses: Mapping[int, Float64]) -> Float64:
+        nearest = self._map.near(T_world_camera, 1)[0]
+        return poses[nearest.number] @ invert_pose(nearest.target.T_world_camera) @ T_world_camera
+
+    def _check(self, image: CameraImage) -> None:
+        camera = (image.camera_id, image.intrinsics)
+        if self._camera is None:
+            if image.depth_m is None:
+                raise CameraError(
+                    f"camera '{image.camera_id}' has no depth: from its images alone the scale of its motion cannot be "
+                    f"known, and no map be made; {WAYS_OUT}"
+                )
+            self._camera = camera
+        if camera != self._camera:
+            raise CameraError(
+                f"odometry follows camera '{self._camera[0]}' at {self._camera[1].width}x{self._camera[1].height}; an "
+                f"image of '{image.camera_id}' at {image.intrinsics.width}x{image.intrinsics.height} came: give each "
+                "camera a pose source of its own, and do not change its resolution"
+            )
+
+    def _view(self, image: CameraImage) -> _View | None:
+        """None without enough depth."""
+        stride = max(1, round(image.intrinsics.width / self._config.width))
+        if image.depth_m is None:
+            return None
+        intrinsics = thinned(image.intrinsics, stride, stride // 2)
+        depth = thin_depth(image.depth_m, stride, self._config.depth_max_m)
+        if float((depth > 0).mean()) < _LEAST_DEPTH:
+            return None
+        size = (intrinsics.width, intrinsics.height)
+        rgb = np.asarray(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        levels = make_levels(depth, intrinsics, len(self._config.iterations))
+        return _View(image.stamp_ns, rgb, depth, intrinsics, levels)
+
+    def _begin(self, view: _View) -> PoseEstimate:
+        pose = matrix(self._config.T_world_start)
+        self._add_keyframe(view, pose, 0.0, None)
+        self._past, self._newest = [StampedPose(view.stamp_ns, pose)], (view, pose)
+        self._images = 1
+        self._counts["tracked"] += 1
+        return PoseEstimate(pose, "odometry", 0.0, self._world)
+
     def _guesses(self, view: _View) -> list[_Guess]:
         """The last motion gone on with, and what corners say; that first which lies better on the nearest keyframe."""
         guess = self._expected(view.stamp_ns)
