@@ -195,10 +195,11 @@ class OdometryPoseSource:
         if self._newest is not None and view.stamp_ns - self._past[-1].stamp_ns < _RECENT_NS:
             before, T_world_before = self._newest
             corners, turn = self._corner_motion(view), find_turn(view.rgb, before.rgb, view.intrinsics)
+            last = [k for k in self._map.frames if k.number == self._nearest]
             for motion in (corners, turn, np.eye(4)):
-                if motion is not None:
-                    guess = T_world_before @ motion
-                    result = self._try(view, guess, self._map.near(guess, self._config.neighbours))
+                guess = None if motion is None else T_world_before @ motion
+                for keyframes in () if guess is None else (self._map.near(guess, self._config.neighbours), last):
+                    result = self._try(view, guess, keyframes) if keyframes else None
                     results += [] if result is None else [result]
             if corners is not None:
                 told = T_world_before @ corners
