@@ -49,6 +49,7 @@ _LEAST_NOISE_M = 0.002
 _NOISE_GAIN = 0.1
 _GUESSED = 0.5  # of a step along what no point tells of: how far it may be wrong
 _CORNERS_M = 0.02  # such a step by the corners of two images
+_LEVER_M = 0.3  # a radian of such a turn is as much as this shift
 _UNSURE_M = 0.15  # an image that may be further off by such steps has no pose
 _AWAY_NS = 2_000_000_000  # a camera that gave no image for so long may be anywhere
 _LOST_NS = 5_000_000_000  # lost for so long, it begins a new world ...
@@ -343,29 +344,35 @@ class OdometryPoseSource:
         unsure_m = min(k.unsure_m for k in used)
         flat = flat_directions([f.normal_matrix for f in fits])
         if flat is not None:
-            pose, unsure_m = self._go_on(view, pose, pose[:3, :3] @ flat @ pose[:3, :3].T, guess)
+            pose, unsure_m = self._go_on(view, pose, flat, guess)
             fits = [fit(self._config, view.levels, t, pose) for t in targets]
         return _Found(pose, used[0], fits, unsure_m) if self._lies_on(fits[0]) else None
 
-    def _go_on(self, view: _View, pose: Float64, flat: Float64, guess: Float64) -> tuple[Float64, float]:
-        """Where the points tell nothing: the position there as corners of the last image say, else as guessed.
+    def _go_on(
+        self, view: _View, pose: Float64, flat: tuple[Float64, Float64], guess: Float64
+    ) -> tuple[Float64, float]:
+        """Where the points tell nothing: turn and position there as corners of the last image say, else as guessed.
 
         Args:
             view: The image.
             pose: As aligned.
-            flat: Projection (3, 3) on directions of the world that no point tells of.
+            flat: Projections on turns and shifts of the camera, in its own axes, that no point tells of.
             guess: What the alignment began with.
 
         Returns:
             The pose, and how far it may be off in these directions, metres.
         """
-        wanted, step_m = guess, float(np.linalg.norm(flat @ (guess[:3, 3] - self._past[-1].T[:3, 3])))
         corners = None if self._lost else self._corner_motion(view)
-        if self._newest is not None and corners is not None:
-            wanted, step_m = self._newest[1] @ corners, _CORNERS_M
+        wanted = guess if self._newest is None or corners is None else self._newest[1] @ corners
+        turn = np.asarray(cv2.Rodrigues(flat[0] @ rotation_vector(invert_pose(pose) @ wanted))[0])
         moved = pose.copy()
-        moved[:3, 3] += flat @ (wanted[:3, 3] - pose[:3, 3])
-        return moved, self._unsure_m + _GUESSED * step_m
+        moved[:3, :3] = pose[:3, :3] @ turn
+        shifts = pose[:3, :3] @ flat[1] @ pose[:3, :3].T
+        moved[:3, 3] += shifts @ (wanted[:3, 3] - pose[:3, 3])
+        last = self._past[-1].T
+        step_m = float(np.linalg.norm(shifts @ (moved[:3, 3] - last[:3, 3])))
+        step_m += _LEVER_M * float(np.linalg.norm(flat[0] @ rotation_vector(invert_pose(last) @ moved)))
+        return moved, self._unsure_m + _GUESSED * (step_m if corners is None else min(step_m, _CORNERS_M))
 
     def _is_near(self, guess: Float64, pose: Float64) -> bool:
         moved = float(np.linalg.norm(pose[:3, 3] - guess[:3, 3]))
