@@ -21,9 +21,9 @@ def find_turn(rgb: UInt8, before: UInt8, intrinsics: CameraIntrinsics) -> Float6
         before: (H, W, 3) of the earlier one.
         intrinsics: Of both.
     """
-    images = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (before, rgb)]
+    earlier, now = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (before, rgb))
     window = cv2.createHanningWindow((intrinsics.width, intrinsics.height), cv2.CV_32F)
-    (right, down), response = cv2.phaseCorrelate(*images, window)
+    (right, down), response = cv2.phaseCorrelate(earlier, now, window)
     if response < _LEAST_RESPONSE:
         return None
     ahead = np.array(

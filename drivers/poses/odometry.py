@@ -48,8 +48,8 @@ _WORSE = 2.5  # times the noise of the fits before: a view that has left the las
 _LEAST_NOISE_M = 0.002
 _NOISE_GAIN = 0.1
 _GUESSED = 0.5  # of a step along what no point tells of: how far it may be wrong
-_CORNERS_M = 0.02  # such a step by the corners of two images
 _LEVER_M = 0.3  # a radian of such a turn is as much as this shift
+_STANDING_M = 0.005  # as much for a step by corners, or a camera that seems to stand: it is not lost for that
 _UNSURE_M = 0.15  # an image that may be further off by such steps has no pose
 _AWAY_NS = 2_000_000_000  # a camera that gave no image for so long may be anywhere
 _LOST_NS = 5_000_000_000  # lost for so long, it begins a new world ...
@@ -168,10 +168,11 @@ class OdometryPoseSource:
         guesses = self._guesses_while_lost(view) if self._lost else self._guesses(view)
         found = self._first_fit(view, guesses)
         if found is None or self._leaves_motion(view, found):
-            found = self._second_look(view, found)
+            found = self._second_look(view, found, [guess for guess, _ in guesses])
         if found is None:
             return self._lose_or_begin(view, "it lies on no keyframe")
         if found.unsure_m > _UNSURE_M:
+            self._unsure_m = found.unsure_m  # until it sees more
             return self._lose_or_begin(view, "it sees nothing that tells where along a surface it is")
         return self._accept(view, found)
 
@@ -186,11 +187,16 @@ class OdometryPoseSource:
         """Whether a result is not where the last motion leads: another one may be right."""
         return not self._lost and not _is_close(self._expected(view.stamp_ns), found.T_world_camera)
 
-    def _second_look(self, view: _View, found: _Found | None) -> _Found | None:
+    def _second_look(self, view: _View, found: _Found | None, told: list[Float64]) -> _Found | None:
         """The best fit among what was found and what the image before says; None where it is a bad one.
 
         The motion has changed at once, or the view lies on nothing. Sliding along a surface shows in a fit that is
-        worse than those before; a pattern that repeats itself, in a motion that the corners contradict.
+        worse than those before; a pattern that repeats itself, in a motion that neither corners nor picture tell of.
+
+        Args:
+            view: The image.
+            found: Where it was found so far.
+            told: Poses that corners and the last motion tell.
         """
         results = [] if found is None else [found]
         if self._newest is not None and view.stamp_ns - self._past[-1].stamp_ns < _RECENT_NS:
@@ -198,13 +204,20 @@ class OdometryPoseSource:
             corners, turn = self._corner_motion(view), find_turn(view.rgb, before.rgb, view.intrinsics)
             last = [k for k in self._map.frames if k.number == self._nearest]
             for motion in (corners, turn, np.eye(4)):
-                guess = None if motion is None else T_world_before @ motion
-                for keyframes in () if guess is None else (self._map.near(guess, self._config.neighbours), last):
+                if motion is None:
+                    continue
+                guess = T_world_before @ motion
+                for keyframes in (self._map.near(guess, self._config.neighbours), last):
                     result = self._try(view, guess, keyframes) if keyframes else None
                     results += [] if result is None else [result]
-            if corners is not None:
-                told = T_world_before @ corners
-                results = [r for r in results if _is_close(told, r.T_world_camera)] or results
+            told = told if corners is None else [T_world_before @ corners]
+            turned = None if turn is None else T_world_before @ turn
+            results = [
+                r
+                for r in results
+                if any(_is_close(pose, r.T_world_camera) for pose in told)
+                or (turned is not None and _is_close(turned, r.T_world_camera, 2 * _JUMP_M))
+            ]
         best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
         noise_m = max(self._noise_m or self._config.noise_m, _LEAST_NOISE_M)
         return None if best is None or best.fits[0].noise_m > _WORSE * noise_m else best
@@ -372,7 +385,9 @@ class OdometryPoseSource:
         last = self._past[-1].T
         step_m = float(np.linalg.norm(shifts @ (moved[:3, 3] - last[:3, 3])))
         step_m += _LEVER_M * float(np.linalg.norm(flat[0] @ rotation_vector(invert_pose(last) @ moved)))
-        return moved, self._unsure_m + _GUESSED * (step_m if corners is None else min(step_m, _CORNERS_M))
+        if corners is None and step_m > _STANDING_M:
+            return moved, self._unsure_m + _GUESSED * step_m
+        return moved, max(self._unsure_m, min(self._unsure_m + _STANDING_M, _UNSURE_M))
 
     def _is_near(self, guess: Float64, pose: Float64) -> bool:
         moved = float(np.linalg.norm(pose[:3, 3] - guess[:3, 3]))
@@ -481,9 +496,9 @@ class OdometryPoseSource:
         return self._begin(view)
 
 
-def _is_close(T_a: Float64, T_b: Float64) -> bool:
+def _is_close(T_a: Float64, T_b: Float64, within_m: float = _JUMP_M) -> bool:
     moved_m, turned_deg = between(T_a, T_b)
-    return moved_m < _JUMP_M and turned_deg < _JUMP_DEG
+    return moved_m < within_m and turned_deg < _JUMP_DEG
 
 
 def _sigma(fits: list[Fit], drift_m: float) -> float:
