@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from semantic_mapper.config import convert_config, read_toml, to_plain
+from semantic_mapper.config import convert_config, read_toml
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, align_rigid, relative_pose_error
+from semantic_mapper.geometry import invert_pose
 from semantic_mapper.plots import draw_paths, write_picture
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.types import Float64, PosedFrame
@@ -27,7 +28,10 @@ from semantic_mapper.types import Float64, PosedFrame
 
 @dataclass(slots=True)
 class Run:
-    """What the odometry made of a log; rows of NaN where it was lost. ``estimated``: after all corrections."""
+    """What the odometry made of a log; rows of NaN where it was lost. ``estimated``: after all corrections.
+
+    Of several worlds the one with the most poses counts, and begins at the true pose of its first frame.
+    """
 
     estimated: list[Float64] = field(default_factory=list)
     as_they_came: list[Float64] = field(default_factory=list)
@@ -40,11 +44,9 @@ class Run:
 
 
 def follow(frames: Sequence[PosedFrame], config: OdometryPoses) -> Run:
-    """Run the odometry from the log's first pose on."""
-    run, better = Run(), dict[int, Float64]()
-    rows = tuple(tuple(float(v) for v in row) for row in frames[0].T_world_camera)
-    settings = {**to_plain(config), "T_world_start": rows}
-    with OdometryPoseSource(convert_config(settings, OdometryPoses, "odometry")) as odometry:
+    """Run the odometry."""
+    run, better, worlds = Run(), dict[int, Float64](), list[int]()
+    with OdometryPoseSource(config) as odometry:
         for frame in frames:
             image = CameraImage(frame.stamp_ns, frame.seq, frame.camera_id, frame.rgb, frame.depth_m, frame.intrinsics)
             clock, processor = time.perf_counter(), time.process_time()
@@ -55,11 +57,18 @@ def follow(frames: Sequence[PosedFrame], config: OdometryPoses) -> Run:
             run.given.append(frame.T_world_camera)
             run.as_they_came.append(np.full((4, 4), np.nan) if estimate is None else estimate.T_world_camera)
             run.sigma_m.append(0.0 if estimate is None else estimate.sigma)
+            worlds.append(-1 if estimate is None else estimate.world)
             better |= {} if corrected is None else corrected.poses
             run.corrections += corrected is not None
         corrected = odometry.correction(final=True)
         better |= {} if corrected is None else corrected.poses
-    run.estimated = [better.get(f.stamp_ns, pose) for f, pose in zip(frames, run.as_they_came, strict=True)]
+    chosen = max(worlds, key=lambda world: (world >= 0, worlds.count(world)))
+    first = worlds.index(chosen)
+    T_truth_world = run.given[first] @ invert_pose(run.as_they_came[first])
+    for k, (frame, world) in enumerate(zip(frames, worlds, strict=True)):
+        came = run.as_they_came[k] if world == chosen else np.full((4, 4), np.nan)
+        run.as_they_came[k] = T_truth_world @ came
+        run.estimated.append(T_truth_world @ (better.get(frame.stamp_ns, came) if world == chosen else came))
     run.counters = dict(odometry.counters)
     return run
 

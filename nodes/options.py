@@ -76,7 +76,7 @@ class CameraOptions(Config, frozen=True):
     # How long a mapper that is waited for (lockstep, fast, a video) may take for one frame; the first one compiles.
     ack_timeout_s: Positive = 300.0
     # Where the mapper answers (its `query`), for poses that close loops (`rgbd`): it moves its map with them, if it
-    # keeps a history. Empty = nowhere, and the map stays as it is.
+    # keeps a history. Empty = nowhere, and no loops are closed: the map could not follow.
     corrections: Annotated[str, msgspec.Meta(pattern=NAME_OR_ENDPOINT)] = ""
 
     def inputs(self) -> tuple[str, ...]:

@@ -23,6 +23,8 @@ from semantic_mapper.types import Float64
 _STILL_M, _STILL_RAD = 2e-5, 2e-5  # smaller steps end a level
 _DAMPING = 1e-4  # of the normal matrix's mean diagonal: directions that no point tells of stay as they are
 _LEAST_POINTS = 30
+FALSE = 0.01  # of the information about the best known direction: noise of normals gives so much about every direction
+_FLAT_TURN = 0.015  # the same for turns
 _COARSER = 2.0  # noise at each level, by that of the next finer one
 
 
@@ -129,6 +131,23 @@ def fit(config: OdometryPoses, levels: Sequence[Level], target: Target, T_world_
         noise_m=float(np.sqrt(s.weighted_squares / max(s.weight, 1e-9))),
         normal_matrix=s.normal_matrix,
     )
+
+
+def flat_directions(normal_matrices: Sequence[Float64]) -> tuple[Float64, Float64] | None:
+    """Projections (3, 3) on the turns and on the shifts of the camera, in its own axes, that points tell nothing of.
+
+    None where they tell of all: the usual case. A wall that fills the picture leaves a turn and two shifts open.
+
+    Args:
+        normal_matrices: (6, 6) each, of ``fit``.
+    """
+    total = sum(normal_matrices, np.zeros((6, 6)))
+    flat: list[Float64] = []
+    for part, least in ((total[:3, :3], _FLAT_TURN), (total[3:, 3:], FALSE)):
+        values, axes = np.linalg.eigh(part)
+        chosen = axes[:, values < least * values[-1]]
+        flat.append(chosen @ chosen.T)
+    return (flat[0], flat[1]) if flat[0].any() or flat[1].any() else None
 
 
 def _step(

@@ -24,6 +24,7 @@ class OdometryKeyframe:
         features: For finding back.
         place: For loop closure.
         way_m: Length of the shortest chain of keyframes back to the first one: errors add up along it.
+        unsure_m: How far it may be off along what no point told of.
     """
 
     number: int
@@ -31,6 +32,7 @@ class OdometryKeyframe:
     features: Features
     place: Features
     way_m: float
+    unsure_m: float = 0.0
 
     def moved(self, T_world_camera: Float64) -> OdometryKeyframe:
         """The same at another pose."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semantic_mapper.drivers.poses.alignment import Fit, Target, align, fit
+from semantic_mapper.drivers.poses.alignment import FALSE, Fit, Target, align, fit
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.keyframe_map import OdometryKeyframe
 from semantic_mapper.drivers.poses.pose_graph import Edge, PoseGraph, between
@@ -39,7 +39,6 @@ _SLACK_M, _SLACK_DEG = 0.1, 5.0
 _BENT_M, _BENT_DEG = 0.06, 4.0  # loops that bend the chain of keyframes by more are wrong, unless it is known badly
 _FIRM_M = 0.02  # one sigma of the chain's edges that are known well
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
-_FALSE = 0.01  # of the information about the best known direction: noise of normals gives so much about every direction
 _FLOOR_M, _FLOOR_RAD = 0.004, 0.0025  # no motion is known better
 _OPEN_M, _OPEN_RAD = 0.1, 0.05  # along what no point tells of
 
@@ -282,6 +281,6 @@ def _tracked(a: int, b: int, T_a_b: Float64) -> Edge:
 def _covariance(found: Fit) -> Float64:
     """(6, 6) of a measured motion, from what the points say about each direction."""
     values, axes = np.linalg.eigh(found.normal_matrix)
-    values = np.maximum(values - _FALSE * values[-1], 0.0) / max(found.noise_m, 1e-3) ** 2 / _POINTS_A_VOTE
+    values = np.maximum(values - FALSE * values[-1], 0.0) / max(found.noise_m, 1e-3) ** 2 / _POINTS_A_VOTE
     told = (axes * values) @ axes.T + np.diag([_OPEN_RAD**-2] * 3 + [_OPEN_M**-2] * 3)
     return np.linalg.inv(told) + np.diag([_FLOOR_RAD**2] * 3 + [_FLOOR_M**2] * 3)

@@ -2,8 +2,11 @@
 
 Each view is aligned to keyframes, not to the view before, so that errors add up from keyframe to keyframe only. Where
 the camera comes back to old ones, a pose graph takes the errors back (``loop_closure``). The first guess goes on with
-the last motion; where that leads nowhere, corners that view and keyframe share give another. A view that lies on no
-keyframe is lost: no pose, until its corners are found in a keyframe again.
+the last motion; where that leads nowhere, corners that view and keyframe share give another. Where these fail too, or
+lead off the last motion, the shift of the picture since the last view gives more, and the best fit counts. Directions
+that the points tell nothing of (along a wall that fills the picture) go on with the motion and the corners, and the
+uncertainty grows. A view that lies on no keyframe is lost: no pose, until its corners are found in a keyframe again. A
+camera that stays lost begins a new world, in which no loops are closed: the map is of the first one.
 
 Same images, same poses and corrections, bit for bit.
 """
@@ -20,9 +23,10 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage, CorrectedWorld, PoseEstimate
-from semantic_mapper.drivers.poses.alignment import Fit, Target, align, fit
-from semantic_mapper.drivers.poses.config import OdometryPoses, matrix
+from semantic_mapper.drivers.poses.alignment import Fit, Target, align, fit, flat_directions
+from semantic_mapper.drivers.poses.config import OdometryPoses, can_be_found, matrix
 from semantic_mapper.drivers.poses.depth_view import Level, make_levels, thin_depth, thinned
+from semantic_mapper.drivers.poses.image_turn import find_turn
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
 from semantic_mapper.drivers.poses.loop_closure import PLACE_FEATURES, LoopCloser
 from semantic_mapper.drivers.poses.motion import StampedPose
@@ -39,6 +43,17 @@ _LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
 _JUMP_M = 0.06  # from where the last motion leads, where another keyframe is nearest than for the last image
+_JUMP_DEG = 4.0
+_WORSE = 2.5  # times the noise of the fits before: a view that has left the last motion lies on nothing then
+_LEAST_NOISE_M = 0.002
+_NOISE_GAIN = 0.1
+_GUESSED = 0.5  # of a step along what no point tells of: how far it may be wrong
+_LEVER_M = 0.3  # a radian of such a turn is as much as this shift
+_STANDING_M = 0.005  # as much for a step by corners, or a camera that seems to stand: it is not lost for that
+_UNSURE_M = 0.15  # an image that may be further off by such steps has no pose
+_AWAY_NS = 2_000_000_000  # a camera that gave no image for so long may be anywhere
+_LOST_NS = 5_000_000_000  # lost for so long, it begins a new world ...
+_YOUNG = 5  # ... and at once in a world of fewer images: the first views may have shown too little
 _PAUSE_NS = 2_000_000_000  # between two corrections: each is work for the map
 
 _log = get_logger(__name__)
@@ -61,6 +76,26 @@ class _View:
         return self.found
 
 
+_Guess = tuple[Float64, list[OdometryKeyframe]]  # T_world_camera, and keyframes near it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Where a view lies on keyframes.
+
+    Args:
+        T_world_camera: (4, 4).
+        nearest: The keyframe that it was aligned to first.
+        fits: To the keyframes that it was aligned to.
+        unsure_m: How far it may be off along what no point tells of.
+    """
+
+    T_world_camera: Float64
+    nearest: OdometryKeyframe
+    fits: list[Fit]
+    unsure_m: float
+
+
 class OdometryPoseSource:
     """Follows one RGB-D camera. Not for several threads at once, but any may read ``counters`` and ``warnings``.
 
@@ -68,8 +103,8 @@ class OdometryPoseSource:
         config: How.
 
     Attributes:
-        counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made; with
-            ``loop_closure`` "loops_closed" and "loops_refused".
+        counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made; "new_worlds"
+            after the first; with ``loop_closure`` "loops_closed" and "loops_refused".
     """
 
     def __init__(self, config: OdometryPoses) -> None:
@@ -77,14 +112,19 @@ class OdometryPoseSource:
         self._map = KeyframeMap(config.max_keyframes)
         self._camera: tuple[str, CameraIntrinsics] | None = None
         self._past: list[StampedPose] = []  # the last two poses
-        self._lost = False
+        self._lost_ns: int | None = None  # since when it is lost
         self._next_try = 0  # keyframe that is tried next while lost
         self._warnings: tuple[str, ...] = ()
         self._closer = LoopCloser(config) if config.loop_closure else None
         self._trail = PoseTrail()
+        self._world = 0
+        self._images = 0  # with a pose in this world
         self._corrected: CorrectedWorld | None = None
         self._closed_ns = -_PAUSE_NS
         self._nearest = -1  # keyframe that the last image was aligned to first
+        self._newest: tuple[_View, Float64] | None = None  # the last image with a pose
+        self._noise_m = 0.0  # mean of the last fits
+        self._unsure_m = 0.0  # how far the last pose may be off along what no point tells of
         self._counts: Counter[str] = Counter()
 
     @property
@@ -120,15 +160,76 @@ class OdometryPoseSource:
         self._close_loops(image.stamp_ns)
         view = self._view(image)
         if view is None:
-            return self._lose("it has hardly any depth")
+            return self._lose(image, "it has hardly any depth")
         if not len(self._map):
             return self._begin(view)
+        if image.stamp_ns - self._past[-1].stamp_ns > _AWAY_NS and not self._lost:
+            self._lost_ns = image.stamp_ns
         guesses = self._guesses_while_lost(view) if self._lost else self._guesses(view)
-        for guess, targets in guesses:
-            found = self._try(view, guess, targets)
-            if found is not None:
-                return self._accept(view, targets[0], *found)
-        return self._lose("it lies on no keyframe")
+        found = self._first_fit(view, guesses)
+        if found is None or self._leaves_motion(view, found):
+            found = self._second_look(view, found, [guess for guess, _ in guesses])
+        if found is None:
+            return self._lose_or_begin(view, "it lies on no keyframe")
+        if found.unsure_m > _UNSURE_M:
+            self._unsure_m = found.unsure_m  # until it sees more
+            return self._lose_or_begin(view, "it sees nothing that tells where along a surface it is")
+        return self._accept(view, found)
+
+    @property
+    def _lost(self) -> bool:
+        return self._lost_ns is not None
+
+    def _first_fit(self, view: _View, guesses: list[_Guess]) -> _Found | None:
+        return next((found for guess in guesses if (found := self._try(view, *guess)) is not None), None)
+
+    def _leaves_motion(self, view: _View, found: _Found) -> bool:
+        """Whether a result is not where the last motion leads: another one may be right."""
+        return not self._lost and not _is_close(self._expected(view.stamp_ns), found.T_world_camera)
+
+    def _second_look(self, view: _View, found: _Found | None, told: list[Float64]) -> _Found | None:
+        """The best fit among what was found and what the image before says; None where it is a bad one.
+
+        The motion has changed at once, or the view lies on nothing. Sliding along a surface shows in a fit that is
+        worse than those before; a pattern that repeats itself, in a motion that neither corners nor picture tell of.
+
+        Args:
+            view: The image.
+            found: Where it was found so far.
+            told: Poses that corners and the last motion tell.
+        """
+        results = [] if found is None else [found]
+        if self._newest is not None and view.stamp_ns - self._past[-1].stamp_ns < _RECENT_NS:
+            before, T_world_before = self._newest
+            corners, turn = self._corner_motion(view), find_turn(view.rgb, before.rgb, view.intrinsics)
+            last = [k for k in self._map.frames if k.number == self._nearest]
+            for motion in (corners, turn, np.eye(4)):
+                if motion is None:
+                    continue
+                guess = T_world_before @ motion
+                for keyframes in (self._map.near(guess, self._config.neighbours), last):
+                    result = self._try(view, guess, keyframes) if keyframes else None
+                    results += [] if result is None else [result]
+            told = told if corners is None else [T_world_before @ corners]
+            turned = None if turn is None else T_world_before @ turn
+            results = [
+                r
+                for r in results
+                if any(_is_close(pose, r.T_world_camera) for pose in told)
+                or (turned is not None and _is_close(turned, r.T_world_camera, 2 * _JUMP_M))
+            ]
+        best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
+        noise_m = max(self._noise_m or self._config.noise_m, _LEAST_NOISE_M)
+        return None if best is None or best.fits[0].noise_m > _WORSE * noise_m else best
+
+    def _corner_motion(self, view: _View) -> Float64 | None:
+        """T_before_camera (4, 4) from the last image that had a pose, by the corners of both; None without enough."""
+        if self._newest is None:
+            return None
+        count = self._config.features
+        before = self._newest[0].features(count)
+        match = pose_from_features(view.features(count), before, view.intrinsics, self._config.min_matches)
+        return None if match is None else match[0]
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
         """New poses of past images since loops were closed, or None; to be asked for after each ``pose``.
@@ -153,6 +254,8 @@ class OdometryPoseSource:
             return
         self._closed_ns = self._closed_ns if stamp_ns is None else stamp_ns
         self._past = [replace(past, T=self._moved(past.T, poses)) for past in self._past]
+        if self._newest is not None:
+            self._newest = self._newest[0], self._moved(self._newest[1], poses)
         self._map.move(poses)
         self._corrected = self._trail.correction(self._keyframe_poses(), final=False) or self._corrected
 
@@ -196,11 +299,12 @@ class OdometryPoseSource:
     def _begin(self, view: _View) -> PoseEstimate:
         pose = matrix(self._config.T_world_start)
         self._add_keyframe(view, pose, 0.0, None)
-        self._past = [StampedPose(view.stamp_ns, pose)]
+        self._past, self._newest = [StampedPose(view.stamp_ns, pose)], (view, pose)
+        self._images = 1
         self._counts["tracked"] += 1
-        return PoseEstimate(pose, "odometry", 0.0)
+        return PoseEstimate(pose, "odometry", 0.0, self._world)
 
-    def _guesses(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
+    def _guesses(self, view: _View) -> list[_Guess]:
         """The last motion gone on with, and what corners say; that first which lies better on the nearest keyframe."""
         guess = self._expected(view.stamp_ns)
         near = self._map.near(guess, self._config.neighbours)
@@ -214,11 +318,11 @@ class OdometryPoseSource:
         a, b = self._past
         return interpolate_pose(a.T, b.T, min((stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
 
-    def _guesses_while_lost(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
+    def _guesses_while_lost(self, view: _View) -> list[_Guess]:
         """What corners say of keyframes near the last pose, then of the others, this many an image in turn."""
         last = self._past[-1]
         near = self._map.near(last.T, self._config.neighbours)
-        guesses: list[tuple[Float64, list[OdometryKeyframe]]] = []
+        guesses: list[_Guess] = []
         if view.stamp_ns - last.stamp_ns < _RECENT_NS:
             guesses.append((last.T, near))
         count = min(len(self._map), self._config.relocalise_keyframes)
@@ -226,9 +330,7 @@ class OdometryPoseSource:
         self._next_try = (self._next_try + count) % len(self._map)
         return guesses + self._guesses_of_features(view, near + [k for k in turn if k not in near])
 
-    def _guesses_of_features(
-        self, view: _View, keyframes: list[OdometryKeyframe]
-    ) -> list[tuple[Float64, list[OdometryKeyframe]]]:
+    def _guesses_of_features(self, view: _View, keyframes: list[OdometryKeyframe]) -> list[_Guess]:
         """Those with the most corners in agreement first."""
         features = view.features(self._config.features)
         found: list[tuple[int, Float64, OdometryKeyframe]] = []
@@ -239,19 +341,53 @@ class OdometryPoseSource:
         found.sort(key=lambda item: -item[0])
         return [(pose, self._map.near(pose, self._config.neighbours)) for _, pose, _ in found]
 
-    def _try(self, view: _View, guess: Float64, keyframes: list[OdometryKeyframe]) -> tuple[Float64, list[Fit]] | None:
+    def _try(self, view: _View, guess: Float64, keyframes: list[OdometryKeyframe]) -> _Found | None:
         """Align a view to keyframes; None where the result cannot be believed."""
         fits = [fit(self._config, view.levels, k.target, guess) for k in keyframes]
-        targets = [
-            k.target
+        used = [
+            k
             for number, (k, f) in enumerate(zip(keyframes, fits, strict=True))
             if number == 0 or f.overlap >= self._config.min_overlap
         ]
+        targets = [k.target for k in used]
         pose = align(self._config, view.levels, targets, guess)
         if pose is None or not self._is_near(guess, pose):
             return None
         fits = [fit(self._config, view.levels, t, pose) for t in targets]
-        return (pose, fits) if self._lies_on(fits[0]) else None
+        unsure_m = min(k.unsure_m for k in used)
+        flat = flat_directions([f.normal_matrix for f in fits])
+        if flat is not None:
+            pose, unsure_m = self._go_on(view, pose, flat, guess)
+            fits = [fit(self._config, view.levels, t, pose) for t in targets]
+        return _Found(pose, used[0], fits, unsure_m) if self._lies_on(fits[0]) else None
+
+    def _go_on(
+        self, view: _View, pose: Float64, flat: tuple[Float64, Float64], guess: Float64
+    ) -> tuple[Float64, float]:
+        """Where the points tell nothing: turn and position there as corners of the last image say, else as guessed.
+
+        Args:
+            view: The image.
+            pose: As aligned.
+            flat: Projections on turns and shifts of the camera, in its own axes, that no point tells of.
+            guess: What the alignment began with.
+
+        Returns:
+            The pose, and how far it may be off in these directions, metres.
+        """
+        corners = None if self._lost else self._corner_motion(view)
+        wanted = guess if self._newest is None or corners is None else self._newest[1] @ corners
+        turn = np.asarray(cv2.Rodrigues(flat[0] @ rotation_vector(invert_pose(pose) @ wanted))[0])
+        moved = pose.copy()
+        moved[:3, :3] = pose[:3, :3] @ turn
+        shifts = pose[:3, :3] @ flat[1] @ pose[:3, :3].T
+        moved[:3, 3] += shifts @ (wanted[:3, 3] - pose[:3, 3])
+        last = self._past[-1].T
+        step_m = float(np.linalg.norm(shifts @ (moved[:3, 3] - last[:3, 3])))
+        step_m += _LEVER_M * float(np.linalg.norm(flat[0] @ rotation_vector(invert_pose(last) @ moved)))
+        if corners is None and step_m > _STANDING_M:
+            return moved, self._unsure_m + _GUESSED * step_m
+        return moved, max(self._unsure_m, min(self._unsure_m + _STANDING_M, _UNSURE_M))
 
     def _is_near(self, guess: Float64, pose: Float64) -> bool:
         moved = float(np.linalg.norm(pose[:3, 3] - guess[:3, 3]))
@@ -265,14 +401,18 @@ class OdometryPoseSource:
             and found.rmse_m <= self._config.max_rmse_m
         )
 
-    def _accept(self, view: _View, nearest: OdometryKeyframe, pose: Float64, fits: list[Fit]) -> PoseEstimate:
+    def _accept(self, view: _View, found: _Found) -> PoseEstimate:
+        pose, nearest, fits = found.T_world_camera, found.nearest, found.fits
         if self._lost:
             self._counts["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
             self._past = []
         jumped = self._jump(view, nearest, pose)
-        self._lost, self._warnings = False, ()
+        self._lost_ns, self._warnings = None, ()
+        self._images += 1
         self._counts["tracked"] += 1
+        self._newest, self._unsure_m = (view, pose), found.unsure_m
+        self._noise_m += _NOISE_GAIN * (fits[0].noise_m - self._noise_m) if self._noise_m else fits[0].noise_m
         self._past = [*self._past[-1:], StampedPose(view.stamp_ns, pose)]
         way, turn = self._map.distances(pose)
         reach = np.maximum(way / self._config.keyframe_m, np.rad2deg(turn) / self._config.keyframe_deg)
@@ -281,7 +421,8 @@ class OdometryPoseSource:
             self._add_keyframe(view, pose, way_m, nearest.number, jumped)
         else:
             self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
-        return PoseEstimate(pose, "odometry", _sigma(fits, self._config.drift * way_m))
+        sigma = _sigma(fits, float(np.hypot(self._config.drift * way_m, found.unsure_m)))
+        return PoseEstimate(pose, "odometry", sigma, self._world)
 
     def _jump(self, view: _View, nearest: OdometryKeyframe, pose: Float64) -> tuple[int, Float64] | None:
         """Where another keyframe has taken the camera off its way: the one before, and the way expected from it."""
@@ -307,7 +448,8 @@ class OdometryPoseSource:
         place = find_place_features(view.rgb, view.depth_m, places) if places else view.features(count)
         number = self._counts["keyframes"]
         self._counts["keyframes"] += 1
-        keyframe = OdometryKeyframe(number, Target(view.levels, pose), view.features(count), place, way_m)
+        target = Target(view.levels, pose)
+        keyframe = OdometryKeyframe(number, target, view.features(count), place, way_m, self._unsure_m)
         if self._closer is not None:
             self._closer.add(keyframe, parent, before)
         self._trail.add(view.stamp_ns, number, pose, pose)
@@ -317,12 +459,46 @@ class OdometryPoseSource:
             self._trail.hand_over(*gone, invert_pose(known[gone[1]]) @ known[gone[0]])
             self._closer.remove(*gone)
 
-    def _lose(self, reason: str) -> None:
-        if not self._lost:
+    def _lose(self, image: CameraImage | _View, reason: str) -> None:
+        if self._lost_ns is None:
+            self._lost_ns = image.stamp_ns
             _log.warning("odometry_lost", reason=reason)
-        self._lost = True
-        self._warnings = (f"the odometry is lost ({reason}); show the camera a place that it has seen before",)
+        ways_on = "show the camera a place that it has seen before"
+        if self._begins_worlds:
+            ways_on += f"; after {_LOST_NS // 10**9} s it begins a new world, which the mapper finds in its map"
+        self._warnings = (f"the odometry is lost ({reason}); {ways_on}",)
         self._counts["lost"] += 1
+
+    @property
+    def _begins_worlds(self) -> bool:
+        """Whether another world can be found in the map."""
+        return can_be_found(self._config)
+
+    def _lose_or_begin(self, view: _View, reason: str) -> PoseEstimate | None:
+        """No pose, or the first one of a new world."""
+        lost_ns = 0 if self._lost_ns is None else view.stamp_ns - self._lost_ns
+        if not self._begins_worlds or (self._images >= _YOUNG and lost_ns < _LOST_NS):
+            return self._lose(view, reason)
+        _log.warning("odometry_begins_new_world", reason=reason, images=self._images, keyframes=len(self._map))
+        if self._closer is not None:
+            self._counts += self._closer.counters
+        if self._images >= _YOUNG:  # the map is of the world before: it would take no corrections of this one
+            self._corrected = self._trail.correction(self._keyframe_poses(), final=True) or self._corrected
+            self._closer = None
+        elif self._closer is not None:
+            self._closer = LoopCloser(self._config)
+        self._map, self._trail = KeyframeMap(self._config.max_keyframes), PoseTrail()
+        self._lost_ns, self._warnings = None, ()
+        self._noise_m = self._unsure_m = 0.0
+        self._nearest, self._images, self._next_try = -1, 0, 0
+        self._world += 1
+        self._counts["new_worlds"] += 1
+        return self._begin(view)
+
+
+def _is_close(T_a: Float64, T_b: Float64, within_m: float = _JUMP_M) -> bool:
+    moved_m, turned_deg = between(T_a, T_b)
+    return moved_m < within_m and turned_deg < _JUMP_DEG
 
 
 def _sigma(fits: list[Fit], drift_m: float) -> float:

@@ -62,6 +62,11 @@ class PoseOutlierFilter:
         """The world of the poses to come is another one: ``motion`` (4, 4) takes the last pose there."""
         self._jumps.follow(motion)
 
+    def abandon(self) -> FilterResult:
+        """The world of the poses has ended: what is held back is left out."""
+        why = "the camera began another world before its first poses were sure"
+        return FilterResult() if self._beginning is None else self._beginning.give_up(why)
+
     def end(self) -> FilterResult:
         """No more will come: what is held back passes where no pose has contradicted it."""
         return FilterResult() if self._beginning is None else self._beginning.end()
@@ -92,15 +97,16 @@ class _Initializer:
         waiting = self._contradiction()
         if sum(len(c) for c in self._chains) < HELD * self._agree:
             return FilterResult(waiting=waiting)
-        return self._give_up(waiting)
+        return self.give_up(waiting)
 
     def end(self) -> FilterResult:
         """See ``PoseOutlierFilter``."""
         if len(self._chains) == 1:
             return FilterResult(tuple(self._chains[0]))
-        return self._give_up(self._contradiction())
+        return self.give_up(self._contradiction())
 
-    def _give_up(self, why: str) -> FilterResult:
+    def give_up(self, why: str) -> FilterResult:
+        """Leave out what is held back."""
         held, self._chains = _in_order(self._chains), []
         return FilterResult(uninitialized=tuple((f, why) for f in held), waiting=why)
 

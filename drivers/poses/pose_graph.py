@@ -15,6 +15,7 @@ from semantic_mapper.types import Float64
 _HUBER_SIGMAS = 1.5  # motions further off than this count less
 _HELD_SIGMA = 1e-4  # radians and metres, of the first keyframe, which stays
 _ITERATIONS = 20
+_MOST_EDGES = 10  # of a keyframe, once keyframes go and leave their edges to others
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +59,28 @@ class PoseGraph:
                 kept.append(replace(edge, a=heir, T_a_b=T_heir_gone @ edge.T_a_b))
             elif edge.b == number and edge.a != heir:
                 kept.append(replace(edge, b=heir, T_a_b=edge.T_a_b @ invert_pose(T_heir_gone)))
-        self.edges = kept
+        self.edges = _strongest_of_pairs(kept)
+        self._prune()
+
+    def _prune(self) -> None:
+        """Take the weakest edges from keyframes with too many, so that the graph's size has a bound.
+
+        Only edges whose ends have a neighbour in common go: the graph stays in one piece.
+        """
+        links: dict[int, dict[int, Edge]] = {number: {} for number in self.poses}
+        for edge in self.edges:
+            links[edge.a][edge.b] = links[edge.b][edge.a] = edge
+        gone: list[Edge] = []
+        for number, own in links.items():
+            spare = sorted(own.values(), key=_strength)
+            for edge in spare[: max(0, len(own) - _MOST_EDGES)]:
+                other = edge.b if edge.a == number else edge.a
+                if own.keys() & links[other].keys():
+                    del own[other], links[other][number]
+                    gone.append(edge)
+        if gone:
+            dropped = {id(edge) for edge in gone}
+            self.edges = [edge for edge in self.edges if id(edge) not in dropped]
 
     def linked(self, number: int) -> frozenset[int]:
         """Keyframes that have an edge to this one, and itself."""
@@ -80,6 +102,20 @@ class PoseGraph:
             graph.add(gtsam.BetweenFactorPose3(X(edge.a), X(edge.b), gtsam.Pose3(edge.T_a_b), robust))
         found = minimize(graph, start, _ITERATIONS)
         return {number: found.atPose3(X(number)).matrix() for number in self.poses}
+
+
+def _strength(edge: Edge) -> tuple[bool, float]:
+    return edge.chain, -float(np.trace(edge.covariance[3:, 3:]))
+
+
+def _strongest_of_pairs(edges: list[Edge]) -> list[Edge]:
+    """One edge for each two keyframes."""
+    best: dict[tuple[int, int], Edge] = {}
+    for edge in edges:
+        pair = min(edge.a, edge.b), max(edge.a, edge.b)
+        if pair not in best or _strength(edge) > _strength(best[pair]):
+            best[pair] = edge
+    return list(best.values())
 
 
 def between(T_a: Float64, T_b: Float64) -> tuple[float, float]:

@@ -175,7 +175,7 @@ class PosedCamera:
                 if self._worlds.setdefault(image.camera_id, estimate.world) != estimate.world:
                     self._worlds[image.camera_id] = estimate.world
                     if (old := self._gates.pop(image.camera_id, None)) is not None:
-                        yield from self._passed(old.end(), image.camera_id)
+                        yield from self._passed(old.abandon(), image.camera_id)
                 gate = self._gates.setdefault(
                     image.camera_id, PoseOutlierFilter(self._checks, exact=estimate.source in EXACT)
                 )
@@ -205,8 +205,7 @@ class PosedCamera:
             self._counts["no_pose"] += 1
             self._trouble = ""  # the source tells why
             return None
-        if not estimate.world:
-            estimate = replace(estimate, world=self._world)
+        estimate = replace(estimate, world=self._world + estimate.world)
         if self._T_rig_camera is not None:
             estimate = replace(estimate, T_world_camera=estimate.T_world_camera @ self._T_rig_camera)
         try:

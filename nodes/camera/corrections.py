@@ -6,9 +6,12 @@ import threading
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+import msgspec
 import structlog
 
 from semantic_mapper.errors import SemanticMapperError, TransportError
+from semantic_mapper.nodes.camera.live import table_of
+from semantic_mapper.nodes.options import LiveCamera
 
 if TYPE_CHECKING:
     from semantic_mapper.drivers.base import CorrectedWorld
@@ -18,6 +21,24 @@ LAST_S = 10.0  # how long the last correction may take to reach the mapper, once
 _SAME_FRAME_NS = 1  # poses of images that were never mapped are left out, instead of refused
 
 _log = structlog.get_logger(__name__)
+
+
+def without_loops(live: LiveCamera) -> tuple[LiveCamera, str]:
+    """A camera whose poses close no loops: the map would not follow, and later frames would not fit it.
+
+    Returns:
+        The camera, and what to tell the user; empty where its poses close none anyway.
+    """
+    poses, _ = table_of(live.poses, "camera.poses")
+    if poses.get("kind") != "rgbd" or not poses.get("loop_closure", True):
+        return live, ""
+    note = (
+        "loop closure is off: the option `corrections` of this node is empty, so the map would not follow. Set "
+        "corrections = \"query\" (the mapper's option `query`) and, in the mapper's options, history_frames = 3000; or "
+        "loop_closure = false in the poses"
+    )
+    _log.warning("no_loop_closure", reason=note)
+    return msgspec.structs.replace(live, poses={**poses, "loop_closure": False}), note
 
 
 class CorrectionSender:

@@ -81,14 +81,16 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
         DependencyError: the kind needs something that is not installed.
         TransportError: the endpoint is taken.
     """
+    from semantic_mapper.nodes.camera.corrections import without_loops
     from semantic_mapper.transport.sockets import Publisher
 
     policy = "block" if make_source(live).can_wait else "drop"  # mistakes in the config are found here, before any wait
     if context.restartable:
         check_world(context.name, live)
+    live, note = (live, "") if options.corrections else without_loops(live)
     with (
         Publisher(context.endpoint(context.name), policy=policy) as publisher,
-        _StatusReporter(context, publisher) as reporter,
+        _StatusReporter(context, publisher, note) as reporter,
     ):
         context.heartbeat.ready()  # a camera may be plugged in much later
         with ExitStack() as stack:
@@ -302,8 +304,9 @@ class _StatusReporter:
     To the launcher it tells turns of the main loop for as long as no call into the driver hangs.
     """
 
-    def __init__(self, context: NodeContext, publisher: Publisher) -> None:
+    def __init__(self, context: NodeContext, publisher: Publisher, note: str = "") -> None:
         self.published = 0
+        self._notes = (note,) if note else ()  # of the settings; told with the warnings
         self.waiting_for = ""  # why the camera could not be opened yet
         self.sender: CorrectionSender | None = None
         self._context = context
@@ -373,7 +376,7 @@ class _StatusReporter:
         if self._source is None:
             return "starting"
         sender = () if self.sender is None else self.sender.warnings
-        return "degraded" if self._source.warnings or sender else "running"
+        return "degraded" if self._source.warnings or sender or self._notes else "running"
 
     def _tell(self, state: NodeState) -> None:
         from semantic_mapper.transport.codec import encode
@@ -389,6 +392,7 @@ class _StatusReporter:
         if self.sender is not None:
             counters |= self.sender.counters
             warnings = (*warnings, *self.sender.warnings)
+        warnings = (*warnings, *self._notes)
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, warnings)
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.drivers.poses.alignment import Target, fit
+from semantic_mapper.drivers.poses.alignment import Target, fit, flat_directions
 from semantic_mapper.drivers.poses.alignment import _add_up as add_up  # pyright: ignore[reportPrivateUsage]
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.depth_view import Level
@@ -66,6 +66,23 @@ def test_sums_over_points_are_those_of_a_plain_loop() -> None:
         assert np.allclose(found.normal_matrix, H, rtol=1e-9) and np.allclose(found.gradient, g, rtol=1e-9)
         told = (found.known, found.seen, found.flat, found.near, found.squares, found.cost, found.weight)
         assert np.allclose((*told, found.weighted_squares, found.robust_weight), sums, rtol=1e-9)
+
+
+def test_a_wall_leaves_two_shifts_and_a_turn_open_and_a_corner_none() -> None:
+    v, u = np.mgrid[: LENS.height, : LENS.width]
+    rays = np.stack(((u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones(u.shape)), axis=-1)
+    wall = np.zeros((6, 6))
+    corner = np.zeros((6, 6))
+    for p in (2 * rays).reshape(-1, 3):
+        J = np.concatenate((np.cross(p, (0, 0, -1.0)), (0, 0, -1.0)))
+        wall += np.outer(J, J)
+        for n in np.array(((0.7, 0, -0.7), (-0.7, 0, -0.7), (0, -0.8, -0.6))):
+            J = np.concatenate((np.cross(p, n), n))
+            corner += np.outer(J, J)
+    flat = flat_directions([wall])
+    assert flat is not None
+    assert np.allclose(flat[0], np.diag((0, 0, 1))) and np.allclose(flat[1], np.diag((1, 1, 0)))
+    assert flat_directions([corner]) is None
 
 
 def test_a_view_without_points_fits_nothing() -> None:

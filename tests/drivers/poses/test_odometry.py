@@ -109,6 +109,72 @@ def test_a_place_that_was_never_seen_is_not_taken_for_one_that_was() -> None:
     assert source.counters["lost"] == 8
 
 
+def test_a_camera_that_stays_lost_begins_a_new_world_and_goes_on_there() -> None:
+    here = [as_image(f) for f in walk()[:8]]
+    there = [
+        replace(as_image(f), stamp_ns=8 * 10**9 + k * 10**9)
+        for k, f in enumerate(room_frames(TRAIN_SEEDS[23], 9, INTRINSICS, path=PATH))
+    ]
+    source = OdometryPoseSource(CONFIG)
+    assert all(e is not None and e.world == 0 for e in follow(here, source))
+    found = follow(there, source)
+    assert found[:5] == [None] * 5  # it may see an old place again
+    assert source.counters["new_worlds"] == 1 and source.warnings == ()
+    later = [e for e in found[5:] if e is not None]
+    assert len(later) == 4 and {e.world for e in later} == {1}
+    assert np.array_equal(later[0].T_world_camera, np.eye(4)) and source.counters["loops_closed"] == 0
+    in_place = started()  # where the world is a given one, no other can begin
+    follow(here, in_place)
+    assert follow(there, in_place) == [None] * 9 and "new world" not in in_place.warnings[0]
+
+
+def test_first_images_that_show_too_little_are_left_behind() -> None:
+    frames = [as_image(f) for f in walk()[:6]]
+    elsewhere = as_image(next(iter(room_frames(TRAIN_SEEDS[23], 1, INTRINSICS, path=PATH))))
+    source = OdometryPoseSource(CONFIG)
+    found = follow([replace(elsewhere, stamp_ns=frames[0].stamp_ns - 10**7), *frames], source)
+    assert [e.world for e in found if e is not None] == [0, *[1] * 6] and source.counters["lost"] == 0
+
+
+def test_a_camera_that_was_away_is_looked_for_among_all_keyframes() -> None:
+    """It was unplugged at the end of its way, and is plugged in again at the beginning."""
+    frames = [as_image(f) for f in walk()]
+    source = started()
+    with source:
+        for f in frames[:30]:
+            assert source.pose(f) is not None
+        back = source.pose(replace(frames[1], stamp_ns=frames[29].stamp_ns + 10**10))
+    assert back is not None and source.counters["relocalised"] == 1
+    assert np.linalg.norm(back.T_world_camera[:3, 3] - truth()[1, :3, 3]) < 0.02
+
+
+def blank_corner(x_m: float, number: int) -> CameraImage:
+    """A wall 1 m ahead without a mark, and one beside it at x = -0.5 m; vertical all along."""
+    rays = (np.arange(160) - INTRINSICS.cx) / INTRINSICS.fx
+    with np.errstate(divide="ignore"):
+        side = np.where(rays < 0, (-0.5 - x_m) / rays, np.inf)
+    depth = np.tile(np.minimum(side, 1.0).astype(np.float32), (120, 1))
+    grey = np.full((120, 160, 3), 90, np.uint8)
+    return CameraImage(10**9 + number * 66_000_000, number, "cam", grey, depth, INTRINSICS)
+
+
+def test_along_a_blank_wall_the_motion_goes_on_for_a_while_and_then_it_is_lost() -> None:
+    found = follow([blank_corner(-0.42 + 0.03 * k, k) for k in range(40)], source := started())
+    first = next(k for k, e in enumerate(found) if e is None)
+    assert 10 < first < 35 and all(e is None for e in found[first:])
+    assert "tells where along a surface" in source.warnings[0]
+    known = [e for e in found if e is not None]
+    moved = invert_pose(known[0].T_world_camera) @ known[-1].T_world_camera
+    assert moved[0, 3] == pytest.approx(0.03 * (first - 1), abs=0.05)
+    assert known[-1].sigma > 0.1 > known[1].sigma
+
+
+def test_a_camera_that_stands_before_a_blank_wall_stays_but_is_not_sure() -> None:
+    found = [e for e in follow([blank_corner(1.0, k) for k in range(40)], started()) if e is not None]
+    assert len(found) == 40 and 0.14 < found[-1].sigma < 0.16
+    assert np.allclose(found[-1].T_world_camera, found[0].T_world_camera, atol=1e-3)
+
+
 def test_a_single_dark_image_costs_itself_only() -> None:
     frames = [as_image(f) for f in walk()[:12]]
     frames[6] = replace(frames[6], depth_m=None)

@@ -67,3 +67,22 @@ def test_edges_of_a_keyframe_that_goes_are_kept_by_its_heir() -> None:
     assert set(graph.poses) == set(range(12)) - {5}
     assert graph.linked(4) == {3, 4, 6, 11}
     assert error_m(truth, graph.optimized()) < 1e-6
+
+
+def test_the_graph_does_not_grow_with_the_keyframes_that_have_gone() -> None:
+    """A camera that goes to and fro on one metre: 30 keyframes are kept of 300, each linked to the five nearest."""
+    rng, graph, sizes = np.random.default_rng(0), PoseGraph(), []
+    for number in range(300):
+        pose = rigid(shift=rng.uniform(0, 1, 3))
+        near = sorted(graph.poses, key=lambda k: between(graph.poses[k], pose)[0])[:5]
+        graph.add(number, pose, [Edge(k, number, invert_pose(graph.poses[k]) @ pose, COVARIANCE) for k in near])
+        if len(graph.poses) > 30:
+            gone = int(rng.choice([k for k in graph.poses if k]))
+            graph.remove(gone, heir=next(k for k in near if k != gone))
+        sizes.append(len(graph.edges))
+    assert max(sizes) <= 30 * 10 / 2 + 15  # as many, and those that came with the last keyframe
+    reached, left = {0}, set(graph.poses) - {0}
+    while more := {k for k in left if graph.linked(k) & reached}:
+        reached, left = reached | more, left - more
+    assert not left
+    assert max(between(graph.poses[k], pose)[0] for k, pose in graph.optimized().items()) < 1e-5

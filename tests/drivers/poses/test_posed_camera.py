@@ -199,6 +199,15 @@ def test_first_frames_wait_for_each_other_and_none_is_lost_to_poses_that_jump_be
         assert [frame.seq for frame in frames] == [2, 4, 5, 7, 8, 9, 10, 11]
 
 
+def test_of_a_world_that_ends_before_its_poses_are_sure_nothing_is_given() -> None:
+    source = Told(lambda i: np.eye(4))
+    source.pose = lambda image: PoseEstimate(np.eye(4), "told", world=int(image.seq > 2))  # pyright: ignore
+    with PosedCamera(ListCamera(images(12)), source, begins_world=True) as camera:
+        frames = list(camera)
+    assert [f.seq for f in frames] == list(range(3, 12)) and camera.counters["uninitialized"] == 3
+    assert len({f.world for f in frames}) == 1
+
+
 def test_of_two_worlds_that_take_turns_from_the_beginning_none_is_believed() -> None:
     told = Told(lambda i: rigid(shift=(5.0 * (i.seq % 2), 0, 0)))
     camera = PosedCamera(ListCamera(images(100)), told)

@@ -20,6 +20,7 @@ import pytest
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
+from semantic_mapper.drivers.mounts import Mount
 from semantic_mapper.drivers.poses.sources import read_pose_config
 from semantic_mapper.drivers.registry import load_driver
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
@@ -233,6 +234,38 @@ def test_a_video_file_that_waits_for_a_reader_can_be_stopped_and_has_a_limit(tmp
     with running(long_film(tmp_path) | {"ack_timeout_s": 0.5}, busy=busy) as node:
         assert eventually(lambda: isinstance(node.error, TransportError), PATIENCE_S)
     assert "taken no frame for 0.5 s" in str(node.error)
+
+
+@pytest.mark.parametrize(
+    ("poses", "options", "closes", "says"),
+    [
+        ({"kind": "rgbd"}, {}, False, "loop closure is off: the option `corrections` of this node is empty"),
+        ({"kind": "rgbd", "loop_closure": False}, {}, False, ""),
+        ({"kind": "rgbd"}, {"corrections": "query"}, True, ""),
+    ],
+)
+def test_loops_are_closed_only_where_the_map_is_told_of_them(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    poses: dict[str, Any],
+    options: dict[str, Any],
+    closes: bool,
+    says: str,
+) -> None:
+    opened: list[dict[str, Any]] = []
+
+    def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> Walking:
+        opened.append(config)
+        return Walking(camera)
+
+    monkeypatch.setattr(live_camera, "with_poses", with_poses)
+    camera = long_film(tmp_path)["camera"] | {"poses": poses}
+    with running({"camera": camera, **options}) as node:
+        status = node.until(lambda m: isinstance(m, Status))
+    assert opened[-1].get("loop_closure", True) == closes
+    assert isinstance(status, Status)
+    told = [w for w in status.degraded if "loop closure" in w]
+    assert told == [] if not says else len(told) == 1 and says in told[0]
 
 
 @pytest.mark.parametrize("start", [None, np.diag((-1.0, -1, 1, 1)).tolist()])
