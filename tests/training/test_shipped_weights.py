@@ -28,7 +28,7 @@ def shipped() -> Checkpoint:
 
 def scores(field: LearnedField, width: int) -> Scores:
     config = ValidationConfig(rooms=3, queries=2, rays=800, views=6)
-    pool = RoomPoolConfig(width=width, views=10, camera=CameraDraw(usual=1.0))
+    pool = RoomPoolConfig(width=width, views=10, people=0.0, camera=CameraDraw(usual=1.0))  # they know no people
     rooms = validation_rooms(config, pool, ALONE, torch.device("cpu"))
     return validate(field.eval(), rooms, config, TrainStepConfig(), ALONE)
 
