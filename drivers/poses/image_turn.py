@@ -26,9 +26,7 @@ def find_turn(rgb: UInt8, before: UInt8, intrinsics: CameraIntrinsics) -> Float6
     (right, down), response = cv2.phaseCorrelate(earlier, now, window)
     if response < _LEAST_RESPONSE:
         return None
-    ahead = np.array(
-        (-right / intrinsics.fx, -down / intrinsics.fy, 1.0)
-    )  # where the camera looks, in the earlier axes
+    ahead = np.array((-right / intrinsics.fx, -down / intrinsics.fy, 1.0))  # its view, in the earlier axes
     ahead /= np.linalg.norm(ahead)
     axis = np.cross((0.0, 0.0, 1.0), ahead)
     sine = float(np.linalg.norm(axis))
