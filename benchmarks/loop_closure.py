@@ -134,7 +134,7 @@ def _go(poses: list[Float64], points: Float64, yaw: float) -> float:
 
 
 def film(storey: Storey, noise: int = 0) -> list[PosedFrame]:
-    """The walk as frames with true poses; each ``noise`` draws the noise of the sensors anew."""
+    """The walk as frames with true poses; each ``noise`` gives the sensors other noise."""
     poses = walk(storey)
     storey = replace(storey, scene=replace(storey.scene, seed=storey.scene.seed + 1_000_000 * noise))
     frames: list[PosedFrame] = []
