@@ -1,4 +1,4 @@
-"""Where cameras are in the map, for whoever hears of frames in the cameras' own worlds."""
+"""Where cameras are in the map, for nodes that receive frames in the cameras' own worlds."""
 
 from __future__ import annotations
 

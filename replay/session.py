@@ -80,6 +80,7 @@ class MapSession:
             own_first=own_first,
             whereabouts=self.pipeline.whereabouts,
             motion=self.pipeline.corrector.motion,
+            correcting=lambda: self.pipeline.corrector.status.running,
         )
         self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
         self.published = 0

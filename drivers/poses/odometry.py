@@ -36,7 +36,7 @@ from semantic_mapper.drivers.poses.trail import PoseTrail
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
 from semantic_mapper.localization.features import Features, find_features, find_place_features, pose_from_features
-from semantic_mapper.log_events import get_logger
+from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
@@ -160,11 +160,14 @@ class OdometryPoseSource:
         self._close_loops(image.stamp_ns)
         view = self._view(image)
         if view is None:
-            return self._lose(image, "it has hardly any depth")
+            self._lose(image, "it has hardly any depth")
+            self._lost_ns = image.stamp_ns  # such images do not tell that the place is another one
+            return None
         if not len(self._map):
             return self._begin(view)
         if image.stamp_ns - self._past[-1].stamp_ns > _AWAY_NS and not self._lost:
             self._lost_ns = image.stamp_ns
+            _log.warning("odometry_lost", reason=f"no image came for more than {_AWAY_NS // 10**9} s")
         guesses = self._guesses_while_lost(view) if self._lost else self._guesses(view)
         found = self._first_fit(view, guesses)
         if found is None or self._leaves_motion(view, found):
@@ -187,7 +190,7 @@ class OdometryPoseSource:
         """Whether a result is not where the last motion leads: another one may be right."""
         return not self._lost and not _is_close(self._expected(view.stamp_ns), found.T_world_camera)
 
-    def _second_look(self, view: _View, found: _Found | None, told: list[Float64]) -> _Found | None:
+    def _second_look(self, view: _View, found: _Found | None, expected: list[Float64]) -> _Found | None:
         """The best fit among what was found and what the image before says; None where it is a bad one.
 
         The motion has changed at once, or the view lies on nothing. Sliding along a surface shows in a fit that is
@@ -196,7 +199,7 @@ class OdometryPoseSource:
         Args:
             view: The image.
             found: Where it was found so far.
-            told: Poses that corners and the last motion tell.
+            expected: Poses that corners and the last motion tell.
         """
         results = [] if found is None else [found]
         if self._newest is not None and view.stamp_ns - self._past[-1].stamp_ns < _RECENT_NS:
@@ -210,12 +213,12 @@ class OdometryPoseSource:
                 for keyframes in (self._map.near(guess, self._config.neighbours), last):
                     result = self._try(view, guess, keyframes) if keyframes else None
                     results += [] if result is None else [result]
-            told = told if corners is None else [T_world_before @ corners]
+            expected = expected if corners is None else [T_world_before @ corners]
             turned = None if turn is None else T_world_before @ turn
             results = [
                 r
                 for r in results
-                if any(_is_close(pose, r.T_world_camera) for pose in told)
+                if any(_is_close(pose, r.T_world_camera) for pose in expected)
                 or (turned is not None and _is_close(turned, r.T_world_camera, 2 * _JUMP_M))
             ]
         best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
@@ -455,9 +458,10 @@ class OdometryPoseSource:
         self._trail.add(view.stamp_ns, number, pose, pose)
         known = self._keyframe_poses()
         gone = self._map.add(keyframe)
-        if gone is not None and self._closer is not None:
+        if gone is not None:
             self._trail.hand_over(*gone, invert_pose(known[gone[1]]) @ known[gone[0]])
-            self._closer.remove(*gone)
+            if self._closer is not None:
+                self._closer.remove(*gone)
 
     def _lose(self, image: CameraImage | _View, reason: str) -> None:
         if self._lost_ns is None:
@@ -479,7 +483,9 @@ class OdometryPoseSource:
         lost_ns = 0 if self._lost_ns is None else view.stamp_ns - self._lost_ns
         if not self._begins_worlds or (self._images >= _YOUNG and lost_ns < _LOST_NS):
             return self._lose(view, reason)
-        _log.warning("odometry_begins_new_world", reason=reason, images=self._images, keyframes=len(self._map))
+        self._counts["new_worlds"] += 1
+        if is_power_of_two(self._counts["new_worlds"]):
+            _log.warning("odometry_begins_new_world", reason=reason, images=self._images, keyframes=len(self._map))
         if self._closer is not None:
             self._counts += self._closer.counters
         if self._images >= _YOUNG:  # the map is of the world before: it would take no corrections of this one
@@ -492,7 +498,6 @@ class OdometryPoseSource:
         self._noise_m = self._unsure_m = 0.0
         self._nearest, self._images, self._next_try = -1, 0, 0
         self._world += 1
-        self._counts["new_worlds"] += 1
         return self._begin(view)
 
 

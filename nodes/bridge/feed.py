@@ -243,6 +243,8 @@ class _MapFollower:
         asked = {subject: self._outlet.asked(subject) for subject in self.sent}
         if self._labels is None and not self._ended.is_set():
             self._use_labels(self._client.info().label_set)
+        if not asked["graph"]:
+            self.no_graph = ""
         if not any(asked.values()):
             return
         mirror = self._client.mirror()

@@ -145,9 +145,9 @@ class MappingPipeline:
         rebuild begins it again, with this correction upon the one under way: the outcome is that of two in a row.
 
         Args:
-            poses: stamp_ns, or (camera_id, stamp_ns), -> T_world_camera (4, 4) float64, at least one, in the world that
-                is the right one from now on. Frames between them in time move as ``pose_correction`` says, those before
-                the first one with the first. Frames that have left the history stay where they are.
+            poses: stamp_ns, or (camera_id, stamp_ns), -> T_world_camera (4, 4) float64, at least one, in the map's
+                world as it is right from now on. Frames between them in time move as ``pose_correction`` says, those
+                before the first one with the first. Frames that have left the history stay where they are.
             until_ns: By default frames later than the last given one are trusted as they come: who corrects poses
                 mostly gives the corrected world from then on. Frames up to this stamp have come in the old world and
                 move with the last given one; ``ALWAYS``: odometry goes on in the old world, and frames to come are

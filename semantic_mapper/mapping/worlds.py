@@ -76,6 +76,7 @@ class MapWorlds:
         own_first: The first world that comes is the map's own, as in a map that begins empty.
         whereabouts: Is told of every frame.
         motion: By how much frames to come of a world are moved later on, (4, 4); see ``MapCorrector.motion``.
+        correcting: Whether the map is about to move; no world is looked for meanwhile.
 
     Attributes:
         known: T_map_world (4, 4) by world.
@@ -92,11 +93,13 @@ class MapWorlds:
         own_first: bool = True,
         whereabouts: Whereabouts | None = None,
         motion: Callable[[int], Float64] = lambda world: np.eye(4),
+        correcting: Callable[[], bool] = lambda: False,
     ) -> None:
         self._map = voxel_map
         self._classify = classify
         self._own_first = own_first
         self._motion = motion
+        self._correcting = correcting
         self._held: deque[PosedFrame] = deque()
         self._sightings: dict[int, deque[Sighting]] = {}
         self.known: dict[int, Float64] = {}
@@ -172,6 +175,10 @@ class MapWorlds:
 
     def _look(self, frame: PosedFrame) -> bool:
         """Look for a frame; True where its world has become known."""
+        if self._correcting():
+            self._sightings.clear()  # of the map as it was
+            self.reason = "the map is being corrected"
+            return False
         found = self._find(frame)
         if isinstance(found, NotFound):
             self.refused[found.reason] += 1

@@ -115,6 +115,17 @@ def test_a_picture_without_measured_depth_proves_no_place() -> None:
     assert worlds.refused["no-depth"] == 2
 
 
+def test_no_world_is_found_in_a_map_that_is_about_to_move() -> None:
+    moving = [True]
+    worlds = MapWorlds(even_map(), own_first=False, correcting=lambda: moving[0])
+    for frame in walk()[1:6]:
+        assert not worlds.take(abroad(frame)).ready
+    assert worlds.reason == "the map is being corrected" and worlds.held == 5
+    moving[0] = False
+    ready = [f.seq for frame in walk()[6:12] for f in worlds.take(abroad(frame)).ready]
+    assert worlds.found == 1 and ready[:5] == [frame.seq for frame in walk()[1:6]]
+
+
 def test_a_wrong_focal_length_is_refused() -> None:
     worlds = MapWorlds(even_map(), own_first=False)
     for frame in walk()[1:6]:

@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -126,6 +127,32 @@ def test_a_camera_that_stays_lost_begins_a_new_world_and_goes_on_there() -> None
     in_place = started()  # where the world is a given one, no other can begin
     follow(here, in_place)
     assert follow(there, in_place) == [None] * 9 and "new world" not in in_place.warnings[0]
+
+
+def test_a_covered_lens_tells_of_no_other_place() -> None:
+    here = [as_image(f) for f in walk()[:8]]
+    dark = [replace(here[-1], depth_m=np.zeros((120, 160), np.float32), stamp_ns=k * 10**9) for k in range(2, 12)]
+    there = [
+        replace(as_image(f), stamp_ns=12 * 10**9 + k * 10**9)
+        for k, f in enumerate(room_frames(TRAIN_SEEDS[23], 7, INTRINSICS, path=PATH))
+    ]
+    source = OdometryPoseSource(CONFIG)
+    assert all(e is not None for e in follow(here, source))
+    found = follow([*dark, *there], source)
+    assert found[:14] == [None] * 14, "old places are looked for as long as without the dark"
+    assert [e.world for e in found[14:] if e is not None] == [1] * 3
+
+
+@pytest.mark.parametrize("loop_closure", [False, True])
+def test_keyframes_that_have_gone_are_not_asked_for_when_a_world_ends(loop_closure: bool) -> None:
+    source = OdometryPoseSource(
+        msgspec.structs.replace(CONFIG, max_keyframes=5, keyframe_m=0.05, loop_closure=loop_closure)
+    )
+    there = room_frames(TRAIN_SEEDS[23], 30, INTRINSICS, path=PATH)
+    follow([as_image(f) for f in walk()], source)
+    found = follow([replace(as_image(f), stamp_ns=8 * 10**9 + f.seq * 10**9) for f in there], source)
+    assert {e.world for e in found if e is not None} == {1} and len(source.keyframe_poses) == 5
+    source.correction(final=True)
 
 
 def test_first_images_that_show_too_little_are_left_behind() -> None:
