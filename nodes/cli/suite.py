@@ -33,7 +33,7 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.sheet import draw_sheet
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
-from semantic_mapper.fields.nesf import NesfWeights, load_nesf, smoothed_votes
+from semantic_mapper.fields.nesf import NesfWeights, find_nesf, smoothed_votes
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -84,7 +84,8 @@ def run_suite_verb(
     out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
     prepare_file(out)
     entries = load_entries(paths, kinds)
-    refiner = None if refine is None else _Refiner(suite, load_nesf(refine), smoothed_votes(ROOMS_SUITE.label_set))
+    labels = entries[0].field.label_set  # of the maps
+    refiner = None if refine is None else _Refiner(suite, find_nesf(refine, labels), smoothed_votes(labels))
     store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
     with StopRequest() as stop:
         with frame_progress("benchmark", None, unit="%") as bar:

@@ -30,7 +30,7 @@ from semantic_mapper.training.grid_fit import GridFitConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
-RECORD_VERSION = 8  # raised by a change of what a record means or how views are rendered: older ones are made again
+RECORD_VERSION = 9  # raised by a change of what a record means or how views are rendered: older ones are made again
 
 FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
 MAP_WIDTH = 320

@@ -49,10 +49,11 @@ def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
         find: Where the second lies in the first is to be found.
 
     Raises:
-        MapError: they are the same map, or what is to be found cannot be; or one cannot be read.
+        MapError: only one is in metres, they are the same map, or what is to be found cannot be; or one cannot be read.
     """
     with open_map(path) as one, open_map(other) as two:
         manifests = one.manifest, two.manifest
+    require_same_scale(*(manifest.scale_known for manifest in manifests), "merge")
     if manifests[0].chunks and manifests[0].chunks == manifests[1].chunks:
         raise MapError(f"{path} and {other} are the same map: all that it has seen would count twice")
     for manifest, which in zip(manifests, ("first", "second"), strict=True):

@@ -271,7 +271,7 @@ def test_fewer_rays_give_nearly_the_same_view_and_a_map_that_repeats():
     for fraction in (1.0, 0.4, 0.4):
         config = tiny_config(render={"encode_width": 64, "ray_fraction": fraction, "scale": 0.5})
         field = CountingField(trained, config.sampling)
-        pipeline = MappingPipeline(config, field, ROOMS)
+        pipeline = MappingPipeline(config, field, trained.label_set)
         updates.append([pipeline.step(f) for f in frames])
         rays.append(field.rays)
         pipelines.append(pipeline)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semantic_mapper.fields.checkpoint import default_checkpoint_path
+from semantic_mapper.fields.checkpoint import find_checkpoint
 from semantic_mapper.fields.nesf import SHIPPED, load_nesf, save_nesf
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -121,7 +121,7 @@ def test_weights_that_refine_maps_label_no_frames(files: Path, tmp_path: Path) -
 
 def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     frames = tiny_frames()
-    field = hashlib.sha256(default_checkpoint_path().read_bytes()).hexdigest()
+    field = hashlib.sha256(find_checkpoint(Path("rooms-people")).read_bytes()).hexdigest()
     for name, seed, rendered in (("100000", 100_000, 1), ("50000", 50_000, 1), ("50000-every-4", 50_000, 4)):
         found = training_map(make_map(), frames, ROOMS, UP)
         made_of = made_of_room(seed, field, rendered=rendered)
@@ -129,6 +129,7 @@ def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     recipe = tmp_path / "tiny.toml"
     recipe.write_text(
         f'kind = "nesf"\nrooms = 1\nvalidation_rooms = 1\nsteps = 4\nmaps = "{tmp_path / "maps"}"\n'
+        'weights = "rooms-people"\n'
         "labelled_voxels = 500\nvalidate_every = 2\n[field]\nwidth = 2\n",
         encoding="utf-8",
     )

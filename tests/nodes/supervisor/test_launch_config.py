@@ -182,7 +182,9 @@ def test_a_bridge_is_one_more_listener_and_asks_the_mapper(tmp_path: Path, kind:
     given = ["kind=v4l2", "camera=webcam.toml", "poses=poses.toml"]
     launch = load_launch(path, given, Path("somewhere"))
     assert launch.inputs(kind) == ("camera", "mapper") and launch.listeners("camera") == 2
-    again = load_launch(path, [*given, "map=runs/yesterday", "history=7"], Path("somewhere")).options
+    again = load_launch(
+        path, [*given, "map=runs/yesterday", "history=7", "corrections=query"], Path("somewhere")
+    ).options
     camera, mapper = again["camera"], again["mapper"]
     assert isinstance(mapper, MapperOptions) and (mapper.map, mapper.history_frames) == ("runs/yesterday", 7)
     assert isinstance(camera, CameraOptions) and camera.corrections == mapper.query
