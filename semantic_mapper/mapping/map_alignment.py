@@ -53,7 +53,7 @@ def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
     """
     with open_map(path) as one, open_map(other) as two:
         manifests = one.manifest, two.manifest
-    require_same_scale(*(manifest.scale_known for manifest in manifests), "merge")
+    require_same_scale(manifests[0].scale_known, manifests[1].scale_known, "merge")
     if manifests[0].chunks and manifests[0].chunks == manifests[1].chunks:
         raise MapError(f"{path} and {other} are the same map: all that it has seen would count twice")
     for manifest, which in zip(manifests, ("first", "second"), strict=True):
