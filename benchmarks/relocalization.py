@@ -55,7 +55,7 @@ SPLITS = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS, "train": TRAIN_SEE
 PLACES = 20  # looked for in each room, and from other rooms
 NOISE = NoiseConfig()
 OTHER_LIGHT = NoiseConfig(exposure_stops=0.8, white_balance=0.25)
-AHEAD_M = 3.0  # errors of a locked-in world are told so far before the camera
+AHEAD_M = 3.0  # errors of a world that was found are measured so far ahead of the camera
 WITHIN_M, WITHIN_DEG = 0.10, 3.0  # of the truth: further off, a frame that was "found" was found falsely
 
 

@@ -63,7 +63,7 @@ def is_in_use(folder: Path) -> bool:
 
 
 def sweep() -> None:
-    """Remove the folders of this user's processes that were killed; what holds no lock file is none of ours."""
+    """Remove the folders of this user's processes that were killed; what holds no lock file belongs to others."""
     for folder in own_folders():
         with suppress(OSError):  # it is another user's, or another process has just removed it
             if folder.stat().st_uid != os.getuid():

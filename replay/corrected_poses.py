@@ -48,7 +48,7 @@ def read_corrections(path: Path) -> Trajectory:
     """Read a trajectory in TUM's format, ``stamp tx ty tz qx qy qz qw``: the poses of the camera, stamps in seconds.
 
     Raises:
-        ImportSourceError: missing, empty, or with a line that is none.
+        ImportSourceError: missing, empty, or with an invalid line.
     """
     notices: list[str] = []
     stamps_ns, rows = read_trajectory(path, notices)

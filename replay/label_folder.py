@@ -137,7 +137,7 @@ def open_label_folder(path: Path, log: Log) -> LabelFolder:
     Raises:
         LabelError: nobody knows what they mean.
         LogError: there are none, or they are of another log, or of frames that it does not have.
-        ImportSourceError: a labels.json that is none.
+        ImportSourceError: an invalid labels.json.
     """
     label_set = log.info.label_set
     if (path / LABELS_FILE).exists():

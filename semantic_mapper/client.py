@@ -135,7 +135,7 @@ class MapClient:
             there is one. ``occupancy`` and ``distance_field``, which no class enters, are of the map itself.
 
     Raises:
-        TransportError: an endpoint that is none, or a mapper that is not among the peers.
+        TransportError: an invalid endpoint, or a mapper that is not among the peers.
     """
 
     def __init__(

@@ -116,7 +116,7 @@ class OdometryPoseSource:
         self._next_try = 0  # keyframe that is tried next while lost
         self._warnings: tuple[str, ...] = ()
         self._closer = LoopCloser(config) if config.loop_closure else None
-        self._trail = PoseTrail()
+        self._trail = PoseTrail()  # stays empty where no loops are closed: nothing moves then
         self._world = 0
         self._images = 0  # with a pose in this world
         self._corrected: CorrectedWorld | None = None
@@ -423,7 +423,8 @@ class OdometryPoseSource:
         if reach.min() > 1 or fits[0].overlap < self._config.keyframe_overlap or jumped is not None:
             self._add_keyframe(view, pose, way_m, nearest.number, jumped)
         else:
-            self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
+            if self._closer is not None:
+                self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
         sigma = _sigma(fits, float(np.hypot(self._config.drift * way_m, found.unsure_m)))
         return PoseEstimate(pose, "odometry", sigma, self._world)
 
@@ -455,13 +456,12 @@ class OdometryPoseSource:
         keyframe = OdometryKeyframe(number, target, view.features(count), place, way_m, self._unsure_m)
         if self._closer is not None:
             self._closer.add(keyframe, parent, before)
-        self._trail.add(view.stamp_ns, number, pose, pose)
+            self._trail.add(view.stamp_ns, number, pose, pose)
         known = self._keyframe_poses()
         gone = self._map.add(keyframe)
-        if gone is not None:
+        if gone is not None and self._closer is not None:
             self._trail.hand_over(*gone, invert_pose(known[gone[1]]) @ known[gone[0]])
-            if self._closer is not None:
-                self._closer.remove(*gone)
+            self._closer.remove(*gone)
 
     def _lose(self, image: CameraImage | _View, reason: str) -> None:
         if self._lost_ns is None:

@@ -180,7 +180,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
         tell: Called with a line of progress.
 
     Raises:
-        TransportError: an endpoint that is none.
+        TransportError: an invalid endpoint.
     """
     with MapClient(live.query, identity=live.identity, attempts=1, refined=live.refined) as client:
         stream = begin()

@@ -173,7 +173,7 @@ class MotionDetector:
 
 
 def _align(frame: PosedFrame, cells: _Cells, views: list[_View]) -> Alignment | None:
-    """Where views of its camera say that the frame was; None where there are none."""
+    """Where the frame was by the views of its camera; None without such views."""
     views = [v for v in views if v.camera_id == frame.camera_id and v.near.shape == cells.near.shape]
     if not views:
         return None

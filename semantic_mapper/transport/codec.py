@@ -452,7 +452,7 @@ def decode_request(parts: Parts) -> tuple[str, Request]:
     kind = _query_kind(parts)
     question = QUESTIONS.get(kind)
     if question is None:
-        raise CodecError(f"question {kind!r} is none of ours; there are {', '.join(QUESTIONS)}")
+        raise CodecError(f"unknown question {kind!r}; there are {', '.join(QUESTIONS)}")
     fields, specs = _open_query(parts, question.request, kind)
     _check_rows(specs, kind)
     return kind, _decode_query(fields, specs, parts, question.request, kind)

@@ -107,7 +107,7 @@ class QuerySocket:
         identity: Of a server that has keys.
 
     Raises:
-        TransportError: an endpoint that is none, or of another machine whose identity is not given, or a server that
+        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
             is not among the peers.
     """
 

@@ -351,7 +351,7 @@ class LosslessSubscriber(_Subscriber):
         hwm: Messages that wait here before the publisher is made to wait.
 
     Raises:
-        TransportError: an endpoint that is none, or of another machine whose identity is not given, or a server that
+        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
             is not among the peers.
     """
 
@@ -471,7 +471,7 @@ class NewestSubscriber(_Subscriber):
         identity: Of publishers that have keys.
 
     Raises:
-        TransportError: an endpoint that is none, or of another machine whose identity is not given, or a server that
+        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
             is not among the peers.
     """
 

@@ -93,16 +93,14 @@ def parse_topic(topic: bytes) -> tuple[Topic, str]:
         words = topic.decode("ascii", errors="replace").split("/")
         if len(words) == 3 and words[0] in TOPICS and re.match(SOURCE_PATTERN, words[1]) and not words[2]:
             return TOPICS[words[0]], words[1]
-    raise CodecError(
-        f"topic {topic[:40]!r} is none of ours; they read '<name>/<source>/' with a name of {', '.join(TOPICS)}"
-    )
+    raise CodecError(f"unknown topic {topic[:40]!r}; topics read '<name>/<source>/' with a name of {', '.join(TOPICS)}")
 
 
 def read_topic(parts: Parts) -> tuple[Topic, str]:
     """Topic and source of a message.
 
     Raises:
-        CodecError: too few or too many parts, or a topic that is none of ours.
+        CodecError: too few or too many parts, or an unknown topic.
     """
     if not 2 <= len(parts) <= MAX_PARTS:
         raise CodecError(f"a message has 2 to {MAX_PARTS} parts, got {len(parts)}")
