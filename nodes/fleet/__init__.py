@@ -1,0 +1,1 @@
+"""Operations over many logs, on one machine or a Ray cluster, with results in a store."""
