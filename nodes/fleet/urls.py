@@ -106,3 +106,8 @@ def _errors_of_stores() -> tuple[type[BaseException], ...]:
     )
     loaded = [getattr(sys.modules[module], name) for module, name in names if module in sys.modules]
     return (OSError, *loaded)
+
+
+def unstripped(fs: Any, path: str, like: str) -> str:
+    """URL of a path in a file system; ``like`` is a URL or path of the same one."""
+    return str(fs.unstrip_protocol(path)) if is_url(like) and not like.startswith("file:") else path
