@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -79,6 +80,9 @@ def run(
             help="A setting: max_frames=100, quality=fast, voxel_map.voxel_size_m=0.05, keyframes=8; may be repeated.",
         ),
     ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="TOML file with settings of the verb; --set goes before it.")
+    ] = None,
     max_parallel: Annotated[
         int, typer.Option("--max-parallel", min=0, help="Tasks at a time; 0 = what there is room for.")
     ] = 0,
@@ -122,7 +126,7 @@ def run(
     inputs = find_inputs(logs, kind.suffix)
     store = open_store(out)
     assignments = [*(("render.device=cuda",) if gpus and kind.rest == "mapper" else ()), *(settings or ())]
-    template = make_template(operation.value, store, weights, assignments, round(worker_disk * 1e9))
+    template = make_template(operation.value, store, weights, assignments, config, round(worker_disk * 1e9))
     resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9), max_parallel)
     with (
         StopRequest() as stop,

@@ -17,6 +17,7 @@ from semantic_mapper.config import (
     NotNegative,
     check_quality,
     convert_config,
+    read_toml,
     rename_settings,
     to_plain,
 )
@@ -112,18 +113,26 @@ class Operation:
     suffix: str = LOG_SUFFIX
 
 
-def read_settings(operation: str, assignments: Sequence[str]) -> Config:
+def read_settings(operation: str, assignments: Sequence[str], config: Path | None = None) -> Config:
     """Settings of an operation with what ``--set NAME=VALUE`` says; values as in TOML, bare words are text.
 
     Names are the operation's own (``max_frames``), or the mapper's (``quality``, ``voxel_map.voxel_size_m``), or for
     ``finetune`` those of its config (``seconds``).
+
+    Args:
+        operation: Of ``OPERATIONS``.
+        assignments: What ``--set`` says.
+        config: TOML file with the same names; ``--set`` goes before it.
 
     Raises:
         ConfigError: no such setting, with the nearest one; or a value that it cannot have.
     """
     kind, rest = OPERATIONS[operation].settings, OPERATIONS[operation].rest
     own = {field.encode_name for field in msgspec.structs.fields(kind)}
-    plain: dict[str, Any] = {}
+    table = {} if config is None else read_toml(config)
+    plain: dict[str, Any] = {name: value for name, value in table.items() if name in own}
+    if others := {name: value for name, value in table.items() if name not in own}:
+        plain = {**plain, rest: others} if rest else {**plain, **others}
     for text in assignments:
         name, equals, value = text.partition("=")
         if not equals or not name:

@@ -34,7 +34,12 @@ def open_store(url: str) -> Store:
 
 
 def make_template(
-    operation: str, store: Store, weights: str | None, assignments: Sequence[str], disk_bytes: int
+    operation: str,
+    store: Store,
+    weights: str | None = None,
+    assignments: Sequence[str] = (),
+    config: Path | None = None,
+    disk_bytes: int = 0,
 ) -> Task:
     """The task that all logs share. Weights from a file are put into the store, for workers elsewhere.
 
@@ -43,7 +48,7 @@ def make_template(
         WeightsError: the weights cannot.
         StoreError: they cannot be fetched or stored.
     """
-    settings = read_settings(operation, assignments)
+    settings = read_settings(operation, assignments, config)
     name, digest, stored = _find_weights(operation, store, weights)
     return Task(
         operation=operation,
