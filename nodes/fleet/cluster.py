@@ -14,6 +14,8 @@ import secrets
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
@@ -31,13 +33,14 @@ LOCAL = "local"
 _AUTO = "auto"
 _CLIENT_SCHEME = "ray://"
 _CONNECT_TIMEOUT_S = 5.0
-_JOIN_TIMEOUT_S = 20.0
+_JOIN_TIMEOUT_S = 40.0
 _END_TIMEOUT_S = 10.0
 # The fleet's tasks read and write files, and pass small values. Ray takes at least 75 MiB, and falls back to files in
 # its folder where /dev/shm is smaller, as in containers.
 _OBJECT_STORE_FRACTION = 0.1
 _OBJECT_STORE_MIN, _OBJECT_STORE_MAX = 80 << 20, 512 << 20
 _LONGEST_TEMPORARY = 30  # letters: below it Ray puts sockets, whose paths may be 107 bytes long
+_LONGEST_REASON = 400  # letters
 _CERTIFICATES = ("RAY_TLS_SERVER_CERT", "RAY_TLS_SERVER_KEY", "RAY_TLS_CA_CERT")
 _COMMON = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -49,6 +52,15 @@ _HOW_TO_SECURE = (
     "RAY_TLS_SERVER_KEY and RAY_TLS_CA_CERT in its environment, and set the same ones here (docs/fleet-cluster.md has "
     "the commands); or give --trusted-network where nobody else can reach the cluster's network"
 )
+
+# Joins as this process is going to. Where something is wrong, Ray waits for minutes, and some faults abort the process.
+_PROBE = """
+import sys
+import ray
+from ray._private import ray_constants
+ray_constants.ENABLE_RAY_CLUSTER = ray_constants.ENABLE_RAY_CLUSTER and sys.argv[2] != "loopback"
+ray.init(address=sys.argv[1], logging_level="ERROR", log_to_driver=False)
+"""
 
 _log = get_logger(__name__)
 
@@ -165,6 +177,7 @@ def _joined(ray: Any, address: str, *, trusted_network: bool, worker_logs: bool)
         end.enter_context(_environment(_COMMON))
         if is_near:
             end.enter_context(_on_loopback())
+        _probe(address, is_near=is_near)
         end.callback(ray.shutdown)
         _init(ray, f"the Ray cluster at {address}", address=address, log_to_driver=worker_logs)
         cluster = _described(ray, embedded=False)
@@ -181,19 +194,54 @@ def _init(ray: Any, what: str, **arguments: Any) -> None:
     handler = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(configure_logging=True, logging_level=logging.ERROR, **arguments)
-    except ray.exceptions.AuthenticationError as error:
-        raise FleetError(f"{what} asks for another token: set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH") from error
     except (ConnectionError, OSError, RuntimeError, TimeoutError, ValueError, ray.exceptions.RayError) as error:
-        raise FleetError(f"{what} cannot be used: {_reason(error)}") from error
+        raise FleetError(f"{what} cannot be used: {_reason(str(error)) or type(error).__name__}") from error
     finally:
         if is_main and handler not in (signal.SIG_DFL, None):
             signal.signal(signal.SIGTERM, handler)
 
 
-def _reason(error: BaseException) -> str:
+def _probe(address: str, *, is_near: bool) -> None:
+    """Join the cluster in another process, within a bounded time.
+
+    Raises:
+        FleetError: With what Ray said.
+    """
+    command = [sys.executable, "-c", _PROBE, address, "loopback" if is_near else "network"]
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", timeout=_JOIN_TIMEOUT_S
+        )
+    except subprocess.TimeoutExpired as error:
+        said = error.stderr.decode(errors="replace") if isinstance(error.stderr, bytes) else error.stderr or ""
+        is_late = True
+    else:
+        if done.returncode == 0:
+            return
+        said, is_late = done.stderr, False
+    what = f"the Ray cluster at {address}"
+    if "InvalidAuthToken" in said or "AuthenticationError" in said:
+        raise FleetError(
+            f"{what} asks for another token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN_PATH to the file of its token"
+        )
+    if "Version mismatch" in said:
+        raise FleetError(f"{what} runs another version: {_reason(said[said.index('Version mismatch') :])}")
+    if is_late:
+        raise FleetError(
+            f"{what} does not answer within {_JOIN_TIMEOUT_S:g} s: it is no Ray cluster, it has stalled, or only one "
+            f"side uses TLS (RAY_USE_TLS is '{os.environ.get('RAY_USE_TLS', '0')}' here)"
+        )
+    if "No node info found" in said or "find_node_ids" in said:
+        raise FleetError(
+            f"{what} has no node on this machine: run `ray start --address={address} --num-cpus=0` here first, with "
+            "the same token and certificates"
+        )
+    raise FleetError(f"{what} cannot be used: {_reason(said[-_LONGEST_REASON:])}")
+
+
+def _reason(text: str) -> str:
     """One line of what Ray says on a page."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(lines)[:400] or type(error).__name__
+    return " ".join(text.split())[:_LONGEST_REASON]
 
 
 def _described(ray: Any, *, embedded: bool) -> Cluster:
@@ -234,10 +282,11 @@ def _environment(variables: Mapping[str, str], *, without: tuple[str, ...] = ())
 
 def _reread_environment() -> None:
     """Ray's core reads token and mode once in a process, which may have been in another cluster before."""
-    from ray._raylet import AuthenticationTokenLoader, Config
+    from ray import _raylet
 
-    Config.initialize("")
-    AuthenticationTokenLoader.instance().reset_cache()
+    core: Any = _raylet  # compiled, without stubs
+    core.Config.initialize("")
+    core.AuthenticationTokenLoader.instance().reset_cache()
 
 
 @contextlib.contextmanager
@@ -290,8 +339,9 @@ def _refuse_open_ports(token: Path) -> None:
 def _end(ray: Any, token: Path) -> None:
     """Shut Ray down. A start that was interrupted leaves processes that Ray has forgotten: they are killed."""
     left = _own_processes(token)
+    timeout_s = _END_TIMEOUT_S if ray.is_initialized() else 0.0
     ray.shutdown()
-    _, alive = psutil.wait_procs(left, timeout=_END_TIMEOUT_S if ray.is_initialized() else 1.0)
+    _, alive = psutil.wait_procs(left, timeout=timeout_s)
     for process in alive:
         with contextlib.suppress(psutil.NoSuchProcess):
             process.kill()
@@ -311,11 +361,10 @@ def _named(address: str) -> str:
             "(ray start --address=HOST:PORT --num-cpus=0 makes this machine one) and give --ray HOST:PORT"
         )
     try:
-        parts = urlsplit(f"//{address}")
-        host, port = parts.hostname, parts.port
+        host, port = _host_and_port(address)
     except ValueError:
-        host = port = None
-    if not host or not port or parts.netloc != address or parts.username is not None:
+        host, port = "", 0
+    if not host or not port or not set(address).isdisjoint("/@?#"):
         raise FleetError(f"'{address}' is not the address of a Ray cluster; give HOST:PORT, local or auto")
     return address
 
