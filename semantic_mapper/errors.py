@@ -61,3 +61,7 @@ class CameraError(SemanticMapperError, OSError):
 
 class NodeError(SemanticMapperError, RuntimeError):
     """A node process could not start, or ended when it should not have."""
+
+
+class FleetError(SemanticMapperError, RuntimeError):
+    """A cluster, a store of results, or a run over many logs cannot be used as asked."""
