@@ -158,7 +158,7 @@ def _embedded(ray: Any, cpus: int | None, *, worker_logs: bool) -> Iterator[Clus
             include_dashboard=False,
             object_store_memory=_object_store_bytes(),
             log_to_driver=worker_logs,
-            _temp_dir=str(folder),
+            _temp_dir=str(folder / "ray"),  # Ray lets everybody write here; nobody else comes through the one above
         )
         _refuse_open_ports(token)
         cluster = _described(ray, embedded=True)
