@@ -218,18 +218,25 @@ def _overview(output: Output, store: Any, *, as_json: bool) -> None:
     found = query(
         store,
         f"""
-        WITH done AS (
-            SELECT operation, version, weights, settings, count(*) AS logs, {figures}
-                round(median(seconds), 1) AS seconds_median, max(finished) AS finished
-            FROM logs GROUP BY ALL
-        ), given_up AS (SELECT operation, version, count(*) AS failures FROM failures GROUP BY ALL)
-        SELECT * FROM done FULL JOIN given_up USING (operation, version) ORDER BY operation, finished
+        SELECT operation, version, weights, settings, count(*) AS logs, {figures}
+            round(median(seconds), 1) AS seconds_median, max(finished) AS finished
+        FROM logs GROUP BY ALL ORDER BY operation, finished
+        """,
+    )
+    given_up = query(
+        store,
+        """
+        SELECT operation, version, count(*) AS given_up, arg_max(error, finished) AS latest_error
+        FROM failures GROUP BY ALL ORDER BY operation, version
         """,
     )
     if as_json:
-        output.json({"overview": plain_rows(found), "columns": {view: dict(pairs) for view, pairs in there.items()}})
+        tables = {"overview": plain_rows(found), "failures": plain_rows(given_up)}
+        output.json({**tables, "columns": {view: dict(pairs) for view, pairs in there.items()}})
         return
     output.print(rows_table(found.column_names, plain_rows(found)))
+    if given_up.num_rows:
+        output.print(rows_table(given_up.column_names, plain_rows(given_up)))
     for view, pairs in there.items():
         output.print(f"{view}: {', '.join(name for name, _ in pairs)}")
 
@@ -303,7 +310,8 @@ def _fraction(name: str, value: str) -> float:
 def _show_comparison(output: Output, found: FleetComparison) -> None:
     from rich.table import Table
 
-    output.print(f"A {found.a}", f"B {found.b}")
+    for line in (f"A {found.a}", f"B {found.b}"):
+        output.print(line)
     table = Table(title=f"{found.operation}, {found.metric}", title_justify="left")
     table.add_column("log")
     for name in ("A", "B", "difference", "95 % interval"):

@@ -8,8 +8,8 @@ number of draws, which a fleet of thousands of logs needs.
 
 Noise of the fleet: the same over logs. The bootstrap's standard error of a mean has a closed form, which is used.
 
-Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which is all that a
-gate has to promise; where some are, it finds more of them.
+Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which is what a gate
+has to promise; where some are, it finds more of them.
 """
 
 from __future__ import annotations
@@ -210,6 +210,8 @@ def compare_fleets(store_a: Store, store_b: Store, options: GateOptions) -> Flee
             f"{counted(len(a.keys), 'log')} of {a.describe()}, B {counted(len(b.keys), 'log')} of {b.describe()}"
         )
     notes = Counter(_partial(store_a, operation, a, "A") + _partial(store_b, operation, b, "B"))
+    if store_a.url == store_b.url and a.keys == b.keys:
+        notes["A and B are the same results"] += 1
     metric = _Metric(options)
     changes: list[LogChange] = []
     costs: dict[str, list[tuple[float, float]]] = {}
@@ -319,9 +321,7 @@ class _Metric:
         method = self._method or (rows[0].method if rows else "")
         return next((row.iou for row in rows if row.method == method), None)
 
-    def _stretches(
-        self, first: TaskResult, second: TaskResult, notes: Counter[str]
-    ) -> tuple[Float64, Float64] | None:
+    def _stretches(self, first: TaskResult, second: TaskResult, notes: Counter[str]) -> tuple[Float64, Float64] | None:
         """(S, 3, L) of the S stretches that both have, by ``class_sums``, classes in the same order; None for < 2."""
         if self._name != "miou" and not self._name.startswith(CLASS_PREFIX):
             return None
@@ -459,7 +459,9 @@ def _cost_changes(costs: Mapping[str, list[tuple[float, float]]], options: GateO
         limit = options.costs.get(name)
         exceeded = limit is not None and low > 1 + limit  # never for NaN
         ratio = math.exp(estimate.difference)
-        found.append(CostChange(name, float(np.median(a)), float(np.median(b)), ratio, low, high, logs, limit, exceeded))
+        found.append(
+            CostChange(name, float(np.median(a)), float(np.median(b)), ratio, low, high, logs, limit, exceeded)
+        )
     return tuple(found)
 
 

@@ -35,7 +35,7 @@ PART_COUNTS = 8_000_000  # ... or this many counts of segments: 64 MB in memory
 MAX_SMALL_PARTS = 32  # more of them are merged
 BATCH_ROWS = 2000  # that are in memory while parts are merged
 ORPHAN_S = 86_400.0  # files of parts that were never finished are removed after this time
-_TRIES = 5  # where other processes merge the parts that are read
+_TRIES = 20  # where other processes merge the parts that are read
 
 _log = get_logger(__name__)
 _T = TypeVar("_T")
@@ -59,24 +59,19 @@ def refresh(store: Store) -> int:
 def query(store: Store, sql: str) -> pa.Table:
     """The rows that a statement of SQL selects, after a ``refresh``.
 
-    The statement sees the views ``logs``, ``classes``, ``events``, ``segments`` and ``failures``, in DuckDB's dialect. It
-    can neither read nor write anything else: DuckDB runs without access to files and network.
+    The statement sees the views ``logs``, ``classes``, ``events``, ``segments`` and ``failures``, in DuckDB's dialect.
+    It can neither read nor write anything else: DuckDB runs without access to files and network.
 
     Args:
         store: Whose results.
-        sql: One statement that returns rows.
+        sql: A statement that returns rows.
 
     Raises:
         ConfigError: DuckDB refuses the statement, in its words; or a document or part is damaged.
         StoreError: the store cannot be reached.
         DependencyError: DuckDB or pyarrow is missing.
     """
-    duckdb = _duckdb()
-    try:
-        with duckdb.connect() as database:
-            named = {name.lower() for name in database.get_table_names(sql)}
-    except duckdb.Error as error:
-        raise ConfigError(f"SQL: {error}") from error
+    named = {word.lower() for word in re.findall(r"\w+", sql)}
     return _retried(store, lambda parts: _select(store, parts, sql, named))
 
 
@@ -417,12 +412,12 @@ def _select(store: Store, parts: _Parts, sql: str, named: set[str]) -> pa.Table:
         database.register("_chosen", chosen)
         for table in TABLES:
             # Segments are most of the bytes; files of a remote store are fetched only where the statement needs them.
-            names = parts.names() if _mentions(named, table) else []
+            names = parts.names() if table in named else []
             database.register(f"_{table}", _dataset(store, parts, table, names))
             database.execute(
                 f"CREATE VIEW {table} AS SELECT * EXCLUDE (part) FROM _{table} SEMI JOIN _chosen USING (key, part)"
             )
-        failures = [_failure_row(f) for f in store.failures()] if _mentions(named, FAILURES) else []
+        failures = [_failure_row(f) for f in store.failures()] if FAILURES in named else []
         database.register(FAILURES, pa.Table.from_pylist(failures, _failure_schema()))
         database.execute("SET enable_external_access = false")
         database.execute("SET lock_configuration = true")
@@ -430,10 +425,6 @@ def _select(store: Store, parts: _Parts, sql: str, named: set[str]) -> pa.Table:
         if found is None:
             raise ConfigError(f"SQL: {sql!r} returns no rows; give one SELECT")
         return found.to_arrow_table()
-
-
-def _mentions(named: set[str], table: str) -> bool:
-    return any(name.strip('"').rsplit(".", 1)[-1].strip('"') == table for name in named)
 
 
 def _chosen_schema() -> pa.Schema:

@@ -23,7 +23,7 @@ class Variant:
     Args:
         version, weights: For people, of the latest result.
         code, weights_digest: Of contents.
-        settings: What ``--set`` said.
+        settings: What ``--set`` said; ``settings_text`` is that as the tables have it.
         finished_us: When the latest result was finished, microseconds since 1970.
         keys: Of results, by digest of the log.
         logs: URLs, by digest of the log.
@@ -34,6 +34,7 @@ class Variant:
     code: str
     weights_digest: str
     settings: Mapping[str, Any]
+    settings_text: str
     finished_us: int
     keys: Mapping[str, str] = field(repr=False)
     logs: Mapping[str, str] = field(repr=False)
@@ -42,6 +43,12 @@ class Variant:
         """For people, on one line."""
         settings = [f"{name}={value}" for name, value in sorted(self.settings.items())]
         return ", ".join([self.version, f"weights {self.weights or '-'}", *settings])
+
+    def condition(self, operation: str) -> str:
+        """Of SQL, for rows of ``logs``."""
+        wanted = {"operation": operation, "code": self.code, "weights_digest": self.weights_digest}
+        wanted["settings"] = self.settings_text
+        return "(" + " AND ".join(f"{name} = {quoted(value)}" for name, value in wanted.items()) + ")"
 
     def is_meant(self, wanted: Mapping[str, str]) -> bool:
         """Whether each name has its value: "version" and "code" begin with it, "weights" are it, settings equal it."""
@@ -57,6 +64,11 @@ class Variant:
         return name in self.settings and str(self.settings[name]) == value
 
 
+def quoted(text: str) -> str:
+    """As a text of SQL."""
+    return "'" + text.replace("'", "''") + "'"
+
+
 def operations(store: Store) -> list[str]:
     """Those with results, the one with most of them first."""
     rows = query(store, "SELECT operation FROM logs GROUP BY operation ORDER BY count(*) DESC, operation").to_pylist()
@@ -65,8 +77,9 @@ def operations(store: Store) -> list[str]:
 
 def variants(store: Store, operation: str) -> list[Variant]:
     """All variants of an operation, the latest first."""
-    text = operation.replace("'", "''")
-    found = query(store, f"SELECT {_COLUMNS} FROM logs WHERE operation = '{text}' ORDER BY finished DESC, key")
+    found = query(
+        store, f"SELECT {_COLUMNS} FROM logs WHERE operation = {quoted(operation)} ORDER BY finished DESC, key"
+    )
     groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for row in found.to_pylist():
         groups.setdefault((row["code"], row["weights_digest"], row["settings"]), []).append(row)
@@ -82,6 +95,7 @@ def _variant(rows: Sequence[dict[str, Any]]) -> Variant:
         latest["code"],
         latest["weights_digest"],
         msgspec.json.decode(latest["settings"]),
+        latest["settings"],
         latest["finished_us"],
         {row["log_digest"]: row["key"] for row in reversed(rows)},
         {row["log_digest"]: row["log"] for row in reversed(rows)},

@@ -22,8 +22,8 @@ VERSION = "0.1.0+aaaaaaa"
 def segments_of(seed: int, loss: float = 0.0, noise: float = 0.0, noise_seed: int = 0) -> tuple[SegmentRow, ...]:
     """Twelve stretches of a log, most pixels right; ``loss`` is the fraction of right pixels that become wrong.
 
-    ``seed`` gives truth and errors, the same in each version; ``noise`` is the spread of the fraction by which a stretch
-    of this version is worse or better.
+    ``seed`` gives truth and errors, the same in each version; ``noise`` is the spread of the fraction by which a
+    stretch of this version is worse or better.
     """
     rng, own = np.random.default_rng(seed), np.random.default_rng([seed, noise_seed])
     rows = []
