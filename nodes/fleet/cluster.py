@@ -22,8 +22,8 @@ def connected(address: str | None) -> Iterator[None]:
         import ray
     except ImportError as error:
         raise DependencyError(f'{error}; pip install "semantic-mapper[fleet]"') from error
-    where = {} if address in (None, "local") else {"address": address}
-    ray.init(include_dashboard=False, log_to_driver=False, logging_level="warning", **where)
+    at = None if address in (None, "local") else address
+    ray.init(address=at, include_dashboard=False, log_to_driver=False)
     try:
         yield
     finally:

@@ -52,7 +52,7 @@ from semantic_mapper.mapping.files.tiles import (
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url
-from semantic_mapper.queries.tiles import TiledMap, describe_tile
+from semantic_mapper.queries.tiles import describe_tile
 from semantic_mapper.types import Float64
 
 MERGE_VERSION = 1  # part of all digests: raise it where the same maps would give other tiles
@@ -263,38 +263,6 @@ def run_on_ray(max_parallel: int = 0) -> Run:
     return run
 
 
-def open_tiles(url: str) -> TiledMap:
-    """The tiles in a store; each is fetched to a temporary file when it is needed.
-
-    Raises:
-        ConfigError: there are no tiles.
-        MapError: their manifest is damaged.
-        StoreError: the store cannot be reached.
-    """
-    fs, root = split_url(url)
-    if "file" in fs.protocol:
-        return TiledMap.open(Path(root))
-    where = f"{shown(url)}/{TILES_NAME}"
-    try:
-        content = persistently(lambda: fs.cat_file(f"{root}/{TILES_NAME}"), where)
-    except FileNotFoundError as error:
-        raise ConfigError(
-            f"{where}: is missing; give a store that `fleet merge` has written, or a saved map"
-        ) from error
-
-    @contextmanager
-    def fetch(row: TileRow) -> Iterator[Path]:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "tile.npz"
-            try:
-                persistently(lambda: fs.get_file(f"{root}/{row.file}", str(file)), f"{shown(url)}/{row.file}")
-            except FileNotFoundError as error:
-                raise MapError(f"{shown(url)}/{row.file}: is missing; merge the maps again") from error
-            yield file
-
-    return TiledMap(parse_tiles(content, where), fetch)
-
-
 def read_poses(path: Path) -> dict[str, Float64]:
     """Where maps lie, by their names.
 
@@ -313,7 +281,7 @@ def read_poses(path: Path) -> dict[str, Float64]:
     found: dict[str, Any] = {}
     if text.lstrip().startswith("{"):
         try:
-            found = msgspec.json.decode(text, type=dict[str, list[float] | list[list[float]]])
+            found = msgspec.json.decode(text, type=dict[str, list[Any]])
         except msgspec.DecodeError as error:
             raise ConfigError(f"--poses {path}: {error}; write {{NAME: [x, y, z, yaw_deg] or 4 rows of 4}}") from error
     else:
@@ -326,7 +294,7 @@ def read_poses(path: Path) -> dict[str, Float64]:
             except ValueError as error:
                 raise ConfigError(f"--poses {path}, line {number}: write NAME x y z yaw_deg") from error
             found[name] = [x, y, z, yaw]
-    return {name: _pose_of(np.array(values, np.float64), f"--poses {path}: {name}") for name, values in found.items()}
+    return {name: _pose_of(values, f"--poses {path}: {name}") for name, values in found.items()}
 
 
 def map_names(maps: Sequence[str]) -> list[str]:
@@ -345,7 +313,11 @@ def map_names(maps: Sequence[str]) -> list[str]:
     return [name if short.count(name) == 1 and name else shown(url) for name, url in zip(short, maps, strict=True)]
 
 
-def _pose_of(values: Float64, where: str) -> Float64:
+def _pose_of(given: list[Any], where: str) -> Float64:
+    try:
+        values = np.array(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: expected numbers, got {given}") from error
     if values.shape == (4,):
         c, s = np.cos(np.deg2rad(values[3])), np.sin(np.deg2rad(values[3]))
         T = np.eye(4)
