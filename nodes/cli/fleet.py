@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from semantic_mapper.nodes.cli import fleet_results, fleet_run
+from semantic_mapper.nodes.cli import fleet_merge, fleet_results, fleet_run
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -15,6 +15,7 @@ app = typer.Typer(
 for _function in (
     fleet_run.run,
     fleet_run.top,
+    fleet_merge.merge,
     fleet_results.table,
     fleet_results.report,
     fleet_results.compare,

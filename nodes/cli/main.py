@@ -76,6 +76,7 @@ for _function in (
 app.add_typer(cli_fleet.app, name="fleet")
 app.add_typer(cli_keys.app, name="keys")
 app.add_typer(cli_launch.app, name="launch")
+app.add_typer(cli_fleet.app, name="fleet")
 
 app.command("eval", cls=JsonCommand)(cli_eval.evaluate)
 # Coordinates below 0 look like options.
