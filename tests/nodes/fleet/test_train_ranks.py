@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,12 +21,13 @@ from msgspec.structs import replace
 from structlog.testing import capture_logs
 
 from semantic_mapper.config import convert_config
-from semantic_mapper.errors import ConfigError, WeightsError
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.fleet.room_actors import ActorFeed, open_actor_feed
 from semantic_mapper.nodes.fleet.train_ranks import train_on_ray
 from semantic_mapper.training.room_feed import InlineFeed
 from semantic_mapper.training.rooms import PackedRoom, RoomPoolConfig
 from semantic_mapper.training.train import STATE_FILE, TrainProgress, train
+from tests.nodes.support import eventually
 from tests.training.small_run import POOL, contents, small_run
 from tests.training.two_ranks import two_ranks_run
 
@@ -115,11 +117,18 @@ def test_a_killed_rank_goes_on_to_the_losses_of_an_undisturbed_run(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_what_a_rank_refuses_is_said_and_not_tried_again_and_again(cluster: None, tmp_path: Path) -> None:
-    config = small_run(start=str(tmp_path / "missing.safetensors"), steps=1)
-    with capture_logs() as events, pytest.raises(WeightsError, match=r"missing\.safetensors"):
-        train_on_ray(config, tmp_path / "out")
+def test_a_rank_that_does_not_see_the_folder_says_so_and_is_not_started_for_ever(cluster: None, tmp_path: Path) -> None:
+    def hide() -> None:
+        assert eventually(lambda: any(tmp_path.glob(".ray-*/shared")))
+        next(tmp_path.glob(".ray-*/shared")).unlink()  # as on a machine that has another folder of this name
+
+    thread = threading.Thread(target=hide)
+    thread.start()
+    with capture_logs() as events, pytest.raises(ConfigError, match=r"rank 0 on .* does not see this folder"):
+        train_on_ray(small_run(steps=1), tmp_path)
+    thread.join()
     assert [event["restarts"] for event in events if event["event"] == "ranks_restarted"] in ([], [1])
+    assert not list(tmp_path.glob(".ray-*"))
 
 
 @pytest.mark.slow
