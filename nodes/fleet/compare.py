@@ -8,7 +8,7 @@ number of draws, which a fleet of thousands of logs needs.
 
 Noise of the fleet: the same over logs. The bootstrap's standard error of a mean has a closed form, which is used.
 
-Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which is what a gate
+Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which a gate
 has to promise; where some are, it finds more of them.
 """
 
