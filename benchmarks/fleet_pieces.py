@@ -1,6 +1,6 @@
 """Logs and weights to try a fleet on: pieces of a recording, rooms, and weights that are a little worse.
 
-    logs    20 pieces of a log, one after the other, and 40 rooms of the validation split; a manifest with tags
+    logs    20 pieces of a log, one after the other, and the 40 rooms of the validation and test splits; a manifest with tags
     worse   the weights that ship with the package, with noise on every matrix
 
 Example:
@@ -25,12 +25,12 @@ from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_chec
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig, room_frames
+from semantic_mapper.scenes import TEST_SEEDS, VALIDATION_SEEDS, NoiseConfig, room_frames
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(110.3, 110.3, 79.5, 59.5, 160, 120)
-PIECES, ROOMS_COUNT, ROOM_FRAMES = 20, 40, 12
+PIECES, ROOM_FRAMES = 20, 12
 
 
 def write_pieces(source: Path, out: Path) -> list[dict[str, str]]:
@@ -52,11 +52,11 @@ def write_pieces(source: Path, out: Path) -> list[dict[str, str]]:
 def write_rooms(out: Path) -> list[dict[str, str]]:
     """Walks through rooms with a noisy depth camera; rows of the manifest."""
     rows = []
-    for number in range(ROOMS_COUNT):
+    for number, seed in enumerate((*VALIDATION_SEEDS, *TEST_SEEDS)):
         name = f"room-{number:02}.mcap"
         info = StreamInfo("rooms", {"rooms": CAMERA}, ROOMS, ROOM_FRAMES)
         with LogWriter(out / name, info) as log:
-            for frame in room_frames(VALIDATION_SEEDS[number], ROOM_FRAMES, CAMERA, noise=NoiseConfig()):
+            for frame in room_frames(seed, ROOM_FRAMES, CAMERA, noise=NoiseConfig()):
                 log.write_frame(frame)
         rows.append({"log": name, "robot": f"r{number % 3}", "site": "rooms"})
     return rows
