@@ -1,6 +1,6 @@
 """Logs and weights to try a fleet on: pieces of a recording, rooms, and weights that are a little worse.
 
-    logs    20 pieces of a log, one after the other, and the 40 rooms of the validation and test splits; a manifest with tags
+    logs    20 pieces of a log, one after the other, and the 40 rooms that nothing was trained on; a manifest with tags
     worse   the weights that ship with the package, with noise on every matrix
 
 Example:
