@@ -362,6 +362,6 @@ def _fit(node: dict[str, float], resources: Resources) -> int:
 def _failure_key(task: Task) -> str:
     """Of a log, what is done with it, and the code: a new version tries it again."""
     text = "\n".join(
-        (task.operation, shown(task.url), task.weights_digest, msgspec.json.encode(task.settings).decode(), task.code)
+        (task.operation, task.url, task.weights_digest, msgspec.json.encode(task.settings).decode(), task.code)
     )
     return hashlib.sha256(text.encode()).hexdigest()[:40]

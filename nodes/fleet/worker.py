@@ -125,7 +125,7 @@ def run_task(task: Task) -> Outcome:
     store = Store(task.store)
     files = _files_of(task.url)
     identity = ";".join(f"{file.size}:{file.version}" for file in files)
-    source_name = f"sources/{_short(f'{shown(task.url)} {identity}')}.json"
+    source_name = f"sources/{_short(f'{task.url} {identity}')}.json"
     source = _read_source(store, source_name) if all(file.version for file in files) else None
     if source is not None:
         key = task_key(task, source.digest)
