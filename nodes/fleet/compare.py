@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -209,44 +209,81 @@ def compare_fleets(store_a: Store, store_b: Store, options: GateOptions) -> Flee
             f"{store_a.shown} and {store_b.shown}: no log has results of `{operation}` in both; A has "
             f"{counted(len(a.keys), 'log')} of {a.describe()}, B {counted(len(b.keys), 'log')} of {b.describe()}"
         )
-    notes = Counter(_partial(store_a, operation, a, "A") + _partial(store_b, operation, b, "B"))
+    notes = _partial(store_a, operation, a, "A") + _partial(store_b, operation, b, "B")
     if store_a.url == store_b.url and a.keys == b.keys:
-        notes["A and B are the same results"] += 1
+        notes.append("A and B are the same results")
+    return compare_results(
+        _pairs(store_a, store_b, a, b, shared),
+        options,
+        operation=operation,
+        a=f"{store_a.shown}: {a.describe()}",
+        b=f"{store_b.shown}: {b.describe()}",
+        lost=list(_lost(store_b, a, b, operation)),
+        new=sorted(b.logs[digest] for digest in b.keys.keys() - a.keys.keys()),
+        notes=notes,
+    )
+
+
+def compare_results(
+    pairs: Iterable[tuple[TaskResult, TaskResult]],
+    options: GateOptions,
+    *,
+    operation: str = "",
+    a: str = "A",
+    b: str = "B",
+    lost: Sequence[LogChange] = (),
+    new: Sequence[str] = (),
+    notes: Sequence[str] = (),
+) -> FleetComparison:
+    """Compare results that belong together.
+
+    Args:
+        pairs: Before and after, of the same log.
+        options: What is compared, and what counts as worse.
+        operation, a, b: For people.
+        lost: Logs that have a result in A only; they count as worse.
+        new: URLs of logs that have one in B only.
+        notes: What is known already.
+
+    Raises:
+        ConfigError: no result has the metric, or a cost that ``options`` limits.
+    """
+    found = Counter(notes)
     metric = _Metric(options)
     changes: list[LogChange] = []
     costs: dict[str, list[tuple[float, float]]] = {}
-    for first, second in _pairs(store_a, store_b, a, b, shared):
-        if (change := metric.change(first, second, notes)) is not None:
+    for first, second in pairs:
+        if (change := metric.change(first, second, found)) is not None:
             changes.append(change)
         for name, pair in _costs(first, second):
             costs.setdefault(name, []).append(pair)
-    if not metric.seen:
+    if not changes:
         raise ConfigError(
-            f"{store_a.shown}: no result of `{operation}` has the metric {options.metric!r}; there are: "
+            f"{a}: no result has the metric {options.metric!r}; there are: "
             f"{', '.join(sorted(metric.others)) or 'no metrics'}"
         )
-    changes = [*_judged(changes, options, metric.sign), *_lost(store_b, a, b, operation)]
+    changes = [*_judged(changes, options, metric.sign), *lost]
     overall, means = _overall(changes)
     cost_changes = _cost_changes(costs, options)
     changes.sort(key=lambda change: _rank(change, metric.sign))
     unknown = sum(c.estimate is None for c in changes if c.status in (WORSE, BETTER, SAME))
     if unknown:
-        notes[f"{counted(unknown, 'log')} without stretches in both: judged together only, not each by itself"] += 1
+        found[f"{counted(unknown, 'log')} without stretches in both: judged together only, not each by itself"] += 1
     if overall is None and means:
-        notes["one log without stretches: its noise is unknown, so nothing is called worse or better"] += 1
+        found["one log without stretches: its noise is unknown, so nothing is called worse or better"] += 1
     return FleetComparison(
         operation,
         options.metric,
-        f"{store_a.shown}: {a.describe()}",
-        f"{store_b.shown}: {b.describe()}",
+        a,
+        b,
         metric.sign < 0,
         overall,
         means[0] if means else math.nan,
         means[1] if means else math.nan,
         tuple(changes),
-        tuple(sorted(b.logs[digest] for digest in b.keys.keys() - a.keys.keys())),
+        tuple(new),
         cost_changes,
-        tuple(f"{note}" if count == 1 else f"{note} ({counted(count, 'log')})" for note, count in notes.items()),
+        tuple(note if count == 1 else f"{note} ({counted(count, 'log')})" for note, count in found.items()),
         tuple(_reasons(changes, overall, cost_changes, options, metric.sign)),
     )
 
@@ -285,7 +322,6 @@ class _Metric:
 
     Attributes:
         sign: 1 where higher is better, else -1.
-        seen: Whether any result of A had it.
         others: Names of metrics that results have.
     """
 
@@ -293,7 +329,6 @@ class _Metric:
         self._name, self._method = options.metric, options.method
         lower = lower_is_better(options.metric) if options.lower_is_better is None else options.lower_is_better
         self.sign = -1.0 if lower else 1.0
-        self.seen = False
         self.others: set[str] = set()
 
     def change(self, first: TaskResult, second: TaskResult, notes: Counter[str]) -> LogChange | None:
@@ -309,7 +344,6 @@ class _Metric:
             estimate = None if a is None or b is None else self._estimate(*sums)
         if a is None:
             return None
-        self.seen = True
         status, reason = (UNSCORED, f"has no {self._name} in B") if b is None else (SAME, "")
         return LogChange(first.log, first.log_digest, status, a, b, estimate, reason, first.key, second.key)
 

@@ -125,6 +125,7 @@ def _add(url: str, first: int, count: int) -> None:
         refresh(store)
 
 
+@pytest.mark.slow
 def test_readers_see_each_result_once_while_others_add_and_merge(tmp_path: Path) -> None:
     store = store_of(tmp_path / "store", [made_up(n) for n in range(3)])
     context = multiprocessing.get_context("spawn")
