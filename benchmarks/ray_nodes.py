@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-_START_TIMEOUT_S = 60.0
+_START_TIMEOUT_S = 150.0
 _HOST = "127.0.0.1"
 # `ray start --node-ip-address=127.0.0.1` takes this machine's outer address instead, and any other address of loopback
 # makes Ray listen everywhere. This program is `ray` without that exchange.
@@ -46,6 +46,7 @@ class RayNodes:
         token.write_text(secrets.token_hex(32), encoding="ascii")
         token.chmod(0o600)
         self.environment = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), **environment}
+        self._node_environment = {"RAY_raylet_start_wait_time_s": "120", **self.environment}  # by default 30
         self._nodes: list[subprocess.Popen[bytes]] = []
 
     def start_head(self, *, cpus: int, options: tuple[str, ...] = ()) -> None:
@@ -115,7 +116,7 @@ class RayNodes:
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **self.environment},
+                env={**os.environ, **self._node_environment},
                 start_new_session=True,
             )
         self._nodes.append(node)
@@ -140,20 +141,25 @@ class RayNodes:
 
 @contextlib.contextmanager
 def ray_nodes(
-    *, head_cpus: int, worker_cpus: tuple[int, ...] = (), environment: Mapping[str, str] | None = None
+    *,
+    head_cpus: int,
+    worker_cpus: tuple[int, ...] = (),
+    head_options: tuple[str, ...] = (),
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[RayNodes]:
     """A cluster on loopback, with free ports and a folder of its own; killed at the end.
 
     Args:
         head_cpus: Of the head; 0 = no task runs there.
         worker_cpus: Of every further node.
+        head_options: Further options of the head's ``ray start``.
         environment: Further variables of all nodes, such as those of TLS.
     """
     # Ray's sockets lie in it, and their paths may be 107 bytes long at most: pytest's folders are too deep.
     folder = Path(tempfile.mkdtemp(prefix="ray-nodes-", dir="/tmp"))
     nodes = RayNodes(folder, environment or {})
     try:
-        nodes.start_head(cpus=head_cpus)
+        nodes.start_head(cpus=head_cpus, options=head_options)
         for node in [nodes.start_worker(cpus=cpus) for cpus in worker_cpus]:
             nodes.wait(node)
         yield nodes
