@@ -30,7 +30,9 @@ class SimulatedLog:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.truth = 50_000 * FREQUENCY * rng.lognormal(0, 0.6, (STRETCHES, CLASSES))
-        self.truth *= rng.random((STRETCHES, CLASSES)) < np.sqrt(FREQUENCY / FREQUENCY.max())  # rare ones are not in all
+        self.truth *= rng.random((STRETCHES, CLASSES)) < np.sqrt(
+            FREQUENCY / FREQUENCY.max()
+        )  # rare ones are not in all
         base = rng.normal(1.2, 0.6, CLASSES) + rng.normal(0, 0.4, (STRETCHES, CLASSES))
         self.right = 1 / (1 + np.exp(-base))
         self.confused = rng.dirichlet(np.full(CLASSES, 0.6), (STRETCHES, CLASSES))  # (S, truth, prediction)

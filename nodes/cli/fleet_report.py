@@ -97,19 +97,20 @@ def _operation(store: Store, operation: str, folder: Path) -> Iterator[Section]:
     where = latest.condition(operation)
     figures = query(store, f"SELECT * FROM logs WHERE {where}")
     names = _figures(figures)
+    metric = next((name for name in names if not name.startswith("cost_") and name != "seconds"), None)
     yield Section(f"{operation}: runs", tables=[_variants_table(store, operation, found)])
+    if metric is not None:
+        yield from _trend(store, operation, found, metric)
     histograms = [Histogram(n, _unit(n), _floats(figures, n)) for n in names[:MAX_HISTOGRAMS]]
     if histograms:
         caption = f"Logs of {latest.describe()}: {counted(figures.num_rows, 'log')}"
         yield Section(f"{operation}: distributions", pictures=[picture(draw_histograms(histograms), caption)])
     yield from _classes(store, operation, where)
-    metric = next((name for name in names if not name.startswith("cost_") and name != "seconds"), None)
     if metric is not None:
-        yield from _worst(store, operation, where, metric, folder, names)
+        yield from _tags(store, operation, where, metric, figures.column_names)
     yield from _events(store, operation, where)
     if metric is not None:
-        yield from _trend(store, operation, found, metric)
-        yield from _tags(store, operation, where, metric, figures.column_names)
+        yield from _worst(store, operation, where, metric, folder, names)
 
 
 def _figures(table: Any) -> list[str]:
@@ -191,7 +192,7 @@ def _worst(
     (total,) = query(store, f"SELECT count(*) AS n FROM logs WHERE {where}")["n"].to_pylist()
     cards = [
         Card(
-            PurePosixPath(row["log"]).name,
+            "/".join(PurePosixPath(row["log"]).parts[-2:]),
             safe_link(_link(store, row, folder)),
             _thumbnail(store, row),
             [f"{name} {cell_text(row[name])}" for name in shown[:3]],

@@ -374,7 +374,7 @@ def _merge(store: Store, parts: _Parts, small: Sequence[str]) -> None:
         source = _dataset(store, parts, table, sorted(small))
         (parts.folder / table).mkdir(exist_ok=True)
         with pq.ParquetWriter(parts.folder / table / name, source.schema, compression="zstd") as writer:
-            for batch in source.to_batches(batch_size=BATCH_ROWS):
+            for batch in source.to_batches(batch_size=BATCH_ROWS, batch_readahead=1, fragment_readahead=1):
                 pairs = zip(batch["key"].to_pylist(), batch["part"].to_pylist(), strict=True)
                 kept = batch.filter(pa.array([parts.owner.get(key) == part for key, part in pairs], pa.bool_()))
                 at = kept.schema.get_field_index("part")

@@ -144,9 +144,7 @@ def test_readers_see_each_result_once_while_others_add_and_merge(tmp_path: Path)
     assert counts(store) == (19, 19)
 
 
-def test_a_store_that_can_only_be_read_is_queried_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_can_only_be_read_is_queried_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_of(tmp_path / "store", [made_up(n) for n in range(3)])
 
     def refuse(self: Store, name: str, data: bytes) -> None:
