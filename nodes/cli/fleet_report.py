@@ -222,7 +222,7 @@ def _link(store: Store, row: Mapping[str, Any], folder: Path) -> str:
 
 
 def _file_name(row: Mapping[str, Any], kind: str) -> str:
-    """Of a file below the store; empty where there is none, or where it would lead out of the store."""
+    """Of a file below the store; empty where the result has no such file, or it would lead out of the store."""
     if not row[kind]:
         return ""
     path = PurePosixPath(row["folder"]) / row[kind]

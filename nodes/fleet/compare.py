@@ -8,8 +8,8 @@ number of draws, which a fleet of thousands of logs needs.
 
 Noise of the fleet: the same over logs. The bootstrap's standard error of a mean has a closed form, which is used.
 
-Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which is what a gate
-has to promise; where some are, it finds more of them.
+Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which is what a
+gate has to promise; where some are, it finds more of them.
 """
 
 from __future__ import annotations
@@ -102,10 +102,10 @@ class LogChange:
         log: Its URL in A.
         log_digest: Of its content.
         status: "worse", "better", "same"; "failed", "missing", "unscored": has a score in A only.
-        a, b: The metric; None where there is none.
+        a, b: The metric; None = no score.
         estimate: None where its noise is unknown.
         reason: Why it failed.
-        key_a, key_b: Of the results; empty where there is none.
+        key_a, key_b: Of the results; empty = no result.
     """
 
     log: str

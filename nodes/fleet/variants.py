@@ -106,7 +106,7 @@ def choose_variant(store: Store, operation: str, wanted: Mapping[str, str]) -> V
     """The latest variant that is meant.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: the store has no such variant.
     """
     found = variants(store, operation)
     meant = [variant for variant in found if variant.is_meant(wanted)]

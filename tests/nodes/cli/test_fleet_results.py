@@ -56,9 +56,8 @@ def test_table_writes_csv_parquet_and_json(store: Store, tmp_path: Path) -> None
     with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["key"] for row in rows] == [row["key"] for row in printed]
-    assert (
-        json.loads(rows[0]["names"]) == printed[0]["names"] == pq.read_table(tmp_path / "a.parquet")["names"][0].as_py()
-    )
+    names = pq.read_table(tmp_path / "a.parquet")["names"][0].as_py()
+    assert json.loads(rows[0]["names"]) == printed[0]["names"] == names
 
 
 def test_wrong_sql_is_an_error_in_the_words_of_duckdb(store: Store) -> None:
