@@ -1,8 +1,8 @@
 """How often `fleet compare` calls a fleet worse that is not, and how often it finds one that is, on simulated logs.
 
 A log has 12 stretches of frames and 8 classes of uneven frequency. The result B of a log differs from A by a loss that
-all logs share, by one of its own, and by noise in each stretch and class. Figures come from ``compare_results``, the same
-code as the verb's.
+all logs share, by one of its own, and by noise in each stretch and class. Figures come from ``compare_results``, as
+those of the verb do.
 """
 
 from __future__ import annotations
@@ -30,15 +30,14 @@ class SimulatedLog:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.truth = 50_000 * FREQUENCY * rng.lognormal(0, 0.6, (STRETCHES, CLASSES))
-        self.truth *= rng.random((STRETCHES, CLASSES)) < np.sqrt(
-            FREQUENCY / FREQUENCY.max()
-        )  # rare ones are not in all
+        present = np.sqrt(FREQUENCY / FREQUENCY.max())  # rare classes are not in all stretches
+        self.truth *= rng.random((STRETCHES, CLASSES)) < present
         base = rng.normal(1.2, 0.6, CLASSES) + rng.normal(0, 0.4, (STRETCHES, CLASSES))
         self.right = 1 / (1 + np.exp(-base))
         self.confused = rng.dirichlet(np.full(CLASSES, 0.6), (STRETCHES, CLASSES))  # (S, truth, prediction)
 
     def counts(self, loss: float, noise: Float64) -> Float64:
-        """(S, L, L + 1); ``loss`` is the fraction of right pixels that become wrong, ``noise`` (S, L) is added to it."""
+        """(S, L, L + 1); ``loss`` is the fraction of right pixels that become wrong, to which ``noise`` (S, L) adds."""
         hits = self.truth * np.clip(self.right * (1 - loss - noise), 0, 1)
         wrong = (self.truth - hits)[:, :, None] * self.confused
         counts = np.concatenate((wrong, np.zeros((STRETCHES, CLASSES, 1))), axis=2)

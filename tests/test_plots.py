@@ -17,11 +17,15 @@ from semantic_mapper.plots import (
     UNKNOWN,
     Bar,
     Curve,
+    Histogram,
     Panel,
+    PercentileBox,
     class_colors,
     class_rows,
     cut,
     draw_bars,
+    draw_boxes,
+    draw_histograms,
     draw_panels,
     draw_paths,
     draw_picture_rows,
@@ -171,3 +175,25 @@ def test_rows_of_pictures_have_captions_and_all_classes_below() -> None:
     picture = draw_picture_rows(rows, KLEVR, 180)
     for color in KLEVR.colors[:3]:
         assert (picture == color).all(-1).sum() >= 2 * 180 * 120
+
+
+def test_histograms_count_values_and_mark_the_median() -> None:
+    shown = [
+        Histogram("miou", "", np.array([0.1, 0.2, 0.2, 0.4, np.nan])),
+        Histogram("frames", "", np.full(7, 3.0)),
+        Histogram("nothing", "", np.array([np.nan])),
+    ]
+    figure = figure_of(draw_histograms, shown)
+    heights = [sum(patch.get_height() for patch in axes.patches) for axes in figure.axes]
+    assert heights == [4, 7, 0]
+    assert figure.axes[0].lines[0].get_xdata()[0] == pytest.approx(0.2)
+    assert not misplaced_texts(figure)
+
+
+def test_boxes_reach_from_quartile_to_quartile() -> None:
+    boxes = [PercentileBox(name, (0.1, 0.2, 0.3, 0.5, 0.9), 12) for name in (*HOSTILE[:5], "room")]
+    figure = figure_of(draw_boxes, "a title", boxes, "IoU")
+    (axes,) = figure.axes
+    assert [(p.get_x(), round(p.get_width(), 6)) for p in axes.patches] == [(0.2, 0.3)] * len(boxes)
+    assert axes.get_yticklabels()[-1].get_text() == "room"
+    assert not misplaced_texts(figure)

@@ -27,7 +27,7 @@ from semantic_mapper.nodes.cli.report import (
 )
 from semantic_mapper.nodes.fleet.compare import lower_is_better
 from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.tables import query
+from semantic_mapper.nodes.fleet.tables import Tables
 from semantic_mapper.nodes.fleet.variants import Variant, operations, variants
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import Histogram, PercentileBox, draw_boxes, draw_histograms
@@ -67,20 +67,20 @@ def write_fleet_report(store: Store, out: Path | None) -> Path:
         DependencyError: DuckDB or pyarrow is missing.
     """
     folder = out or (store.local / "report" if store.local else Path("runs/fleet-report"))
-    failed = list(_failures(store))
-    sections = [section for name in operations(store) for section in _operation(store, name, folder)]
+    with Tables(store) as tables:
+        failed = list(_failures(tables))
+        sections = [section for name in operations(tables) for section in _operation(tables, name, folder)]
     if not sections and not failed:
         raise ConfigError(f"{store.shown}: has no results yet; `fleet run` makes them")
     write_page(folder / REPORT_NAME, f"Fleet {store.shown}", [*failed, *sections])
     return folder / REPORT_NAME
 
 
-def _failures(store: Store) -> Iterator[Section]:
-    (total,) = query(store, "SELECT count(*) AS n FROM failures")["n"].to_pylist()
+def _failures(tables: Tables) -> Iterator[Section]:
+    (total,) = tables.query("SELECT count(*) AS n FROM failures")["n"].to_pylist()
     if not total:
         return
-    rows = query(
-        store,
+    rows = tables.query(
         f"SELECT operation, log, version, attempts, left(error, {MAX_ERROR}) AS error FROM failures "
         f"ORDER BY finished DESC, log LIMIT {MAX_FAILURES}",
     ).to_pylist()
@@ -90,26 +90,27 @@ def _failures(store: Store) -> Iterator[Section]:
     yield Section("Logs that were given up", [f"{counted(total, 'log')} failed{first}."], tables=[table])
 
 
-def _operation(store: Store, operation: str, folder: Path) -> Iterator[Section]:
+def _operation(tables: Tables, operation: str, folder: Path) -> Iterator[Section]:
     """All sections of an operation: its latest variant, and the trend over variants."""
-    found = variants(store, operation)
+    found = variants(tables, operation)
     latest = found[0]
     where = latest.condition(operation)
-    figures = query(store, f"SELECT * FROM logs WHERE {where}")
+    figures = tables.query(f"SELECT * FROM logs WHERE {where}")
     names = _figures(figures)
-    yield Section(f"{operation}: runs", tables=[_variants_table(store, operation, found)])
+    metric = next((name for name in names if not name.startswith("cost_") and name != "seconds"), None)
+    yield Section(f"{operation}: runs", tables=[_variants_table(tables, operation, found)])
+    if metric is not None:
+        yield from _trend(tables, operation, found, metric)
     histograms = [Histogram(n, _unit(n), _floats(figures, n)) for n in names[:MAX_HISTOGRAMS]]
     if histograms:
         caption = f"Logs of {latest.describe()}: {counted(figures.num_rows, 'log')}"
         yield Section(f"{operation}: distributions", pictures=[picture(draw_histograms(histograms), caption)])
-    yield from _classes(store, operation, where)
-    metric = next((name for name in names if not name.startswith("cost_") and name != "seconds"), None)
+    yield from _classes(tables, operation, where)
     if metric is not None:
-        yield from _worst(store, operation, where, metric, folder, names)
-    yield from _events(store, operation, where)
+        yield from _tags(tables, operation, where, metric, figures.column_names)
+    yield from _events(tables, operation, where)
     if metric is not None:
-        yield from _trend(store, operation, found, metric)
-        yield from _tags(store, operation, where, metric, figures.column_names)
+        yield from _worst(tables, operation, where, metric, folder, names)
 
 
 def _figures(table: Any) -> list[str]:
@@ -139,11 +140,10 @@ def _floats(table: Any, name: str) -> Float64:
     return values[np.isfinite(values)]
 
 
-def _variants_table(store: Store, operation: str, found: Sequence[Variant]) -> Any:
+def _variants_table(tables: Tables, operation: str, found: Sequence[Variant]) -> Any:
     rows = []
     for variant in found[:MAX_VERSIONS]:
-        (row,) = query(
-            store,
+        (row,) = tables.query(
             "SELECT count(*) AS logs, count(DISTINCT node) AS nodes, sum(seconds) / 3600 AS hours, "
             f"sum(log_bytes) / 1e9 AS gb, max(finished) AS finished FROM logs WHERE {variant.condition(operation)}",
         ).to_pylist()
@@ -152,9 +152,8 @@ def _variants_table(store: Store, operation: str, found: Sequence[Variant]) -> A
     return table_of(("version, weights, settings", "logs", "hosts", "hours", "GB of logs", "finished, UTC"), rows)
 
 
-def _classes(store: Store, operation: str, where: str) -> Iterator[Section]:
-    rows = query(
-        store,
+def _classes(tables: Tables, operation: str, where: str) -> Iterator[Section]:
+    rows = tables.query(
         f"""
         SELECT method, name, quantile_cont(iou, {_PERCENTILES}) AS percentiles, count(*) AS n
         FROM classes WHERE isfinite(iou) AND key IN (SELECT key FROM logs WHERE {where})
@@ -178,22 +177,21 @@ def _boxes(boxes: Sequence[PercentileBox], x_label: str, what: str) -> Picture:
 
 
 def _worst(
-    store: Store, operation: str, where: str, metric: str, folder: Path, names: Sequence[str]
+    tables: Tables, operation: str, where: str, metric: str, folder: Path, names: Sequence[str]
 ) -> Iterator[Section]:
     order = "DESC" if lower_is_better(metric) else ""
     shown = list(dict.fromkeys((metric, *names[:5])))
     columns = ", ".join(f'"{name}"' for name in shown)
-    rows = query(
-        store,
+    rows = tables.query(
         f"SELECT key, log, folder, thumbnail, report, weights, {columns} FROM logs WHERE {where} AND "
         f'isfinite("{metric}") ORDER BY "{metric}" {order}, log LIMIT {MAX_LOGS}',
     ).to_pylist()
-    (total,) = query(store, f"SELECT count(*) AS n FROM logs WHERE {where}")["n"].to_pylist()
+    (total,) = tables.query(f"SELECT count(*) AS n FROM logs WHERE {where}")["n"].to_pylist()
     cards = [
         Card(
-            PurePosixPath(row["log"]).name,
-            safe_link(_link(store, row, folder)),
-            _thumbnail(store, row),
+            "/".join(PurePosixPath(row["log"]).parts[-2:]),
+            safe_link(_link(tables.store, row, folder)),
+            _thumbnail(tables.store, row),
             [f"{name} {cell_text(row[name])}" for name in shown[:3]],
         )
         for row in rows[:WORST]
@@ -201,7 +199,10 @@ def _worst(
     yield Section(f"{operation}: worst logs by {metric}", cards=cards)
     table = table_of(
         ("log", *shown),
-        [(linked(row["log"], _link(store, row, folder)), *(cell_text(row[name]) for name in shown)) for row in rows],
+        [
+            (linked(row["log"], _link(tables.store, row, folder)), *(cell_text(row[name]) for name in shown))
+            for row in rows
+        ],
     )
     for column in table.columns[1:]:
         column.justify = "right"
@@ -221,7 +222,7 @@ def _link(store: Store, row: Mapping[str, Any], folder: Path) -> str:
 
 
 def _file_name(row: Mapping[str, Any], kind: str) -> str:
-    """Of a file below the store; empty where there is none, or where it would lead out of the store."""
+    """Of a file below the store; empty where the result has no such file, or it would lead out of the store."""
     if not row[kind]:
         return ""
     path = PurePosixPath(row["folder"]) / row[kind]
@@ -248,9 +249,8 @@ def _thumbnail(store: Store, row: Mapping[str, Any]) -> Picture | None:
     return picture(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB), np.uint8), row["log"], photo=True)
 
 
-def _events(store: Store, operation: str, where: str) -> Iterator[Section]:
-    rows = query(
-        store,
+def _events(tables: Tables, operation: str, where: str) -> Iterator[Section]:
+    rows = tables.query(
         f"""
         SELECT kind, count(*) AS n, count(DISTINCT key) AS logs, min(text) AS example
         FROM events WHERE key IN (SELECT key FROM logs WHERE {where})
@@ -264,15 +264,14 @@ def _events(store: Store, operation: str, where: str) -> Iterator[Section]:
     yield Section(f"{operation}: events", tables=[table])
 
 
-def _trend(store: Store, operation: str, found: Sequence[Variant], metric: str) -> Iterator[Section]:
+def _trend(tables: Tables, operation: str, found: Sequence[Variant], metric: str) -> Iterator[Section]:
     """Over the logs that the latest variants share; those with less than half of the latest one's logs are left out."""
     latest = found[0].keys.keys()
     compared = [v for v in found if 2 * len(v.keys.keys() & latest) >= len(latest)][:MAX_VERSIONS]
     if len(compared) < 2:
         return
     text = " OR ".join(variant.condition(operation) for variant in compared)
-    rows = query(
-        store,
+    rows = tables.query(
         f"""
         WITH scored AS (SELECT log_digest, code, weights_digest, settings, "{metric}" AS value FROM logs
                         WHERE ({text}) AND isfinite("{metric}")),
@@ -292,14 +291,13 @@ def _trend(store: Store, operation: str, found: Sequence[Variant], metric: str) 
         yield Section(f"{operation}: trend", pictures=[_boxes(boxes, metric, what)])
 
 
-def _tags(store: Store, operation: str, where: str, metric: str, columns: Sequence[str]) -> Iterator[Section]:
+def _tags(tables: Tables, operation: str, where: str, metric: str, columns: Sequence[str]) -> Iterator[Section]:
     """Of tags with a few values."""
     pictures = []
     for column in columns:
         if not column.startswith("tag_"):
             continue
-        rows = query(
-            store,
+        rows = tables.query(
             f"""
             SELECT "{column}" AS value, quantile_cont("{metric}", {_PERCENTILES}) AS percentiles, count(*) AS n
             FROM logs WHERE {where} AND "{column}" IS NOT NULL AND isfinite("{metric}")

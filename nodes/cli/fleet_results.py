@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from semantic_mapper.nodes.fleet.compare import Estimate, FleetComparison, LogChange
+    from semantic_mapper.nodes.fleet.tables import Tables
 
 EXIT_WORSE = 1
 EXIT_TROUBLE = 2
@@ -55,11 +56,12 @@ def table(
     output = Output.guarded()
     output.quiet = json
     from semantic_mapper.nodes.fleet.store import Store
-    from semantic_mapper.nodes.fleet.tables import plain_rows, query
+    from semantic_mapper.nodes.fleet.tables import Tables, plain_rows, query
 
     opened = Store(store)
     if sql is None:
-        _overview(output, opened, as_json=json)
+        with Tables(opened) as tables:
+            _overview(output, tables, as_json=json)
         return
     found = query(opened, sql)
     for path, write in ((csv, _write_csv), (out, _write_parquet)):
@@ -209,30 +211,28 @@ def cell_text(value: Any) -> str:
     return str(value)
 
 
-def _overview(output: Output, store: Any, *, as_json: bool) -> None:
-    from semantic_mapper.nodes.fleet.tables import columns, plain_rows, query
+def _overview(output: Output, tables: Tables, *, as_json: bool) -> None:
+    from semantic_mapper.nodes.fleet.tables import plain_rows
 
-    there = columns(store)
+    there = tables.columns()
     scored = any(name == "miou" for name, _ in there["logs"])
     figures = "round(median(miou), 4) AS miou_median, round(min(miou), 4) AS miou_worst, " if scored else ""
-    found = query(
-        store,
+    found = tables.query(
         f"""
         SELECT operation, version, weights, settings, count(*) AS logs, {figures}
             round(median(seconds), 1) AS seconds_median, max(finished) AS finished
         FROM logs GROUP BY ALL ORDER BY operation, finished
         """,
     )
-    given_up = query(
-        store,
+    given_up = tables.query(
         """
         SELECT operation, version, count(*) AS given_up, arg_max(error, finished) AS latest_error
         FROM failures GROUP BY ALL ORDER BY operation, version
         """,
     )
     if as_json:
-        tables = {"overview": plain_rows(found), "failures": plain_rows(given_up)}
-        output.json({**tables, "columns": {view: dict(pairs) for view, pairs in there.items()}})
+        rows = {"overview": plain_rows(found), "failures": plain_rows(given_up)}
+        output.json({**rows, "columns": {view: dict(pairs) for view, pairs in there.items()}})
         return
     output.print(rows_table(found.column_names, plain_rows(found)))
     if given_up.num_rows:

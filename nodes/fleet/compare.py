@@ -8,8 +8,8 @@ number of draws, which a fleet of thousands of logs needs.
 
 Noise of the fleet: the same over logs. The bootstrap's standard error of a mean has a closed form, which is used.
 
-Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which a gate
-has to promise; where some are, it finds more of them.
+Many logs: Benjamini-Hochberg. Where no log is worse, it names one as rarely as Bonferroni-Holm does, which is what a
+gate has to promise; where some are, it finds more of them.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.bootstrap import class_sums, miou_of_sums
 from semantic_mapper.nodes.fleet.results import SegmentRow, TaskResult
 from semantic_mapper.nodes.fleet.store import Store, batched
+from semantic_mapper.nodes.fleet.tables import Tables
 from semantic_mapper.nodes.fleet.variants import Variant, choose_variant, operations, variants
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
@@ -102,10 +103,10 @@ class LogChange:
         log: Its URL in A.
         log_digest: Of its content.
         status: "worse", "better", "same"; "failed", "missing", "unscored": has a score in A only.
-        a, b: The metric; None where there is none.
+        a, b: The metric; None = no score.
         estimate: None where its noise is unknown.
         reason: Why it failed.
-        key_a, key_b: Of the results; empty where there is none.
+        key_a, key_b: Of the results; empty = no result.
     """
 
     log: str
@@ -201,15 +202,16 @@ def compare_fleets(store_a: Store, store_b: Store, options: GateOptions) -> Flee
         StoreError: a store cannot be reached.
         DependencyError: DuckDB or pyarrow is missing.
     """
-    operation = options.operation or _only_operation(store_a, store_b)
-    a, b = choose_variant(store_a, operation, options.a), choose_variant(store_b, operation, options.b)
+    with Tables(store_a) as tables_a, Tables(store_b) as tables_b:
+        operation = options.operation or _only_operation(tables_a, tables_b)
+        a, b = choose_variant(tables_a, operation, options.a), choose_variant(tables_b, operation, options.b)
+        notes = _partial(tables_a, operation, a, "A") + _partial(tables_b, operation, b, "B")
     shared = [digest for digest in a.keys if digest in b.keys]
     if not shared:
         raise ConfigError(
             f"{store_a.shown} and {store_b.shown}: no log has results of `{operation}` in both; A has "
             f"{counted(len(a.keys), 'log')} of {a.describe()}, B {counted(len(b.keys), 'log')} of {b.describe()}"
         )
-    notes = _partial(store_a, operation, a, "A") + _partial(store_b, operation, b, "B")
     if store_a.url == store_b.url and a.keys == b.keys:
         notes.append("A and B are the same results")
     return compare_results(
@@ -288,16 +290,19 @@ def compare_results(
     )
 
 
-def _only_operation(store_a: Store, store_b: Store) -> str:
-    both = [name for name in operations(store_a) if name in operations(store_b)]
+def _only_operation(tables_a: Tables, tables_b: Tables) -> str:
+    there = operations(tables_b)
+    both = [name for name in operations(tables_a) if name in there]
     if len(both) == 1:
         return both[0]
     found = ", ".join(both) if both else "none in both"
-    raise ConfigError(f"{store_a.shown} and {store_b.shown}: say which operation is meant (--operation): {found}")
+    raise ConfigError(
+        f"{tables_a.store.shown} and {tables_b.store.shown}: say which operation is meant (--operation): {found}"
+    )
 
 
-def _partial(store: Store, operation: str, chosen: Variant, side: str) -> list[str]:
-    most = max(len(variant.keys) for variant in variants(store, operation))
+def _partial(tables: Tables, operation: str, chosen: Variant, side: str) -> list[str]:
+    most = max(len(variant.keys) for variant in variants(tables, operation))
     if len(chosen.keys) == most:
         return []
     return [f"{side} has {counted(len(chosen.keys), 'log')} of {chosen.describe()}, and up to {most} of other variants"]

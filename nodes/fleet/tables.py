@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -53,39 +53,87 @@ def refresh(store: Store) -> int:
             ``tables_not_saved`` is logged, and readers derive the rows for themselves.
         DependencyError: DuckDB or pyarrow is missing.
     """
-    return _retried(store, lambda parts: parts.added)
+    with Tables(store) as tables:
+        return tables.refresh()
 
 
 def query(store: Store, sql: str) -> pa.Table:
-    """The rows that a statement of SQL selects, after a ``refresh``.
+    """The rows that one statement selects; see ``Tables.query``."""
+    with Tables(store) as tables:
+        return tables.query(sql)
 
-    The statement sees the views ``logs``, ``classes``, ``events``, ``segments`` and ``failures``, in DuckDB's dialect.
-    It can neither read nor write anything else: DuckDB runs without access to files and network.
+
+class Tables:
+    """Reads the tables of a store; a context manager. The first query adds results that they lack.
 
     Args:
         store: Whose results.
-        sql: A statement that returns rows.
-
-    Raises:
-        ConfigError: DuckDB refuses the statement, in its words; or a document or part is damaged.
-        StoreError: the store cannot be reached.
-        DependencyError: DuckDB or pyarrow is missing.
     """
-    named = {word.lower() for word in re.findall(r"\w+", sql)}
-    return _retried(store, lambda parts: _select(store, parts, sql, named))
 
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._folder = tempfile.TemporaryDirectory(prefix="semantic-mapper-fleet-")
+        self._listed: list[str] = []
+        self._parts: _Parts | None = None
 
-def columns(store: Store) -> dict[str, list[tuple[str, str]]]:
-    """Name and type of each column, by table.
+    def __enter__(self) -> Self:
+        return self
 
-    Raises:
-        ConfigError, StoreError, DependencyError: as ``query``.
-    """
-    views = (*TABLES, FAILURES)
-    found = {view: query(store, f"SELECT column_name, column_type FROM (DESCRIBE {view})") for view in views}
-    return {
-        view: [(row["column_name"], row["column_type"]) for row in table.to_pylist()] for view, table in found.items()
-    }
+    def __exit__(self, *_: object) -> None:
+        self._folder.cleanup()
+
+    def refresh(self) -> int:
+        """As the function ``refresh``."""
+        self._parts = None
+        return self._retried(lambda parts: parts.added)
+
+    def query(self, sql: str) -> pa.Table:
+        """The rows that a statement of SQL selects.
+
+        The statement sees the views ``logs``, ``classes``, ``events``, ``segments`` and ``failures``, in DuckDB's
+        dialect. It can neither read nor write anything else: DuckDB runs without access to files and network.
+
+        Args:
+            sql: A statement that returns rows.
+
+        Raises:
+            ConfigError: DuckDB refuses the statement, in its words; or a document or part is damaged.
+            StoreError: the store cannot be reached.
+            DependencyError: DuckDB or pyarrow is missing.
+        """
+        named = {word.lower() for word in re.findall(r"\w+", sql)}
+        return self._retried(lambda parts: _select(self.store, parts, sql, named))
+
+    def columns(self) -> dict[str, list[tuple[str, str]]]:
+        """Name and type of each column, by table.
+
+        Raises:
+            ConfigError, StoreError, DependencyError: as ``query``.
+        """
+        views = (*TABLES, FAILURES)
+        found = {view: self.query(f"SELECT column_name, column_type FROM (DESCRIBE {view})") for view in views}
+        return {
+            view: [(row["column_name"], row["column_type"]) for row in table.to_pylist()]
+            for view, table in found.items()
+        }
+
+    def _retried(self, use: Callable[[_Parts], _T]) -> _T:
+        """Do something with all parts; again where another process has merged some of them in between."""
+        duckdb = _duckdb()
+        for tries_left in reversed(range(_TRIES)):
+            try:
+                if self._parts is None:
+                    self._listed = _listed(self.store)
+                    self._parts = _up_to_date(self.store, self._listed, Path(self._folder.name))
+                return use(self._parts)
+            except (OSError, duckdb.Error) as error:  # StoreError is an OSError
+                if tries_left and not set(self._listed) <= set(self.store.names("tables/logs")):
+                    self._parts = None
+                    continue
+                if isinstance(error, duckdb.Error):
+                    raise ConfigError(f"SQL: {error}") from error
+                raise
+        raise AssertionError("unreachable")
 
 
 def column_name(name: str, prefix: str = "") -> str:
@@ -244,24 +292,6 @@ class _Parts:
         return sorted(set(self.owner.values()))
 
 
-def _retried(store: Store, use: Callable[[_Parts], _T]) -> _T:
-    """Do something with all parts; again where another process has merged some of them in between."""
-    duckdb = _duckdb()
-    for tries_left in reversed(range(_TRIES)):
-        listed: list[str] = []
-        try:
-            with tempfile.TemporaryDirectory(prefix="semantic-mapper-fleet-") as folder:
-                listed = _listed(store)
-                return use(_up_to_date(store, listed, Path(folder)))
-        except (OSError, duckdb.Error) as error:  # StoreError is an OSError
-            if tries_left and not set(listed) <= set(store.names("tables/logs")):
-                continue
-            if isinstance(error, duckdb.Error):
-                raise ConfigError(f"SQL: {error}") from error
-            raise
-    raise AssertionError("unreachable")
-
-
 def _listed(store: Store) -> list[str]:
     """Names of the parts that are whole.
 
@@ -374,7 +404,7 @@ def _merge(store: Store, parts: _Parts, small: Sequence[str]) -> None:
         source = _dataset(store, parts, table, sorted(small))
         (parts.folder / table).mkdir(exist_ok=True)
         with pq.ParquetWriter(parts.folder / table / name, source.schema, compression="zstd") as writer:
-            for batch in source.to_batches(batch_size=BATCH_ROWS):
+            for batch in source.to_batches(batch_size=BATCH_ROWS, batch_readahead=1, fragment_readahead=1):
                 pairs = zip(batch["key"].to_pylist(), batch["part"].to_pylist(), strict=True)
                 kept = batch.filter(pa.array([parts.owner.get(key) == part for key, part in pairs], pa.bool_()))
                 at = kept.schema.get_field_index("part")

@@ -9,8 +9,7 @@ from typing import Any
 import msgspec
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.tables import query
+from semantic_mapper.nodes.fleet.tables import Tables
 from semantic_mapper.plain_text import counted
 
 _COLUMNS = "key, log, log_digest, version, code, weights, weights_digest, settings, epoch_us(finished) AS finished_us"
@@ -69,16 +68,16 @@ def quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
-def operations(store: Store) -> list[str]:
+def operations(tables: Tables) -> list[str]:
     """Those with results, the one with most of them first."""
-    rows = query(store, "SELECT operation FROM logs GROUP BY operation ORDER BY count(*) DESC, operation").to_pylist()
+    rows = tables.query("SELECT operation FROM logs GROUP BY operation ORDER BY count(*) DESC, operation").to_pylist()
     return [row["operation"] for row in rows]
 
 
-def variants(store: Store, operation: str) -> list[Variant]:
+def variants(tables: Tables, operation: str) -> list[Variant]:
     """All variants of an operation, the latest first."""
-    found = query(
-        store, f"SELECT {_COLUMNS} FROM logs WHERE operation = {quoted(operation)} ORDER BY finished DESC, key"
+    found = tables.query(
+        f"SELECT {_COLUMNS} FROM logs WHERE operation = {quoted(operation)} ORDER BY finished DESC, key"
     )
     groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for row in found.to_pylist():
@@ -102,18 +101,18 @@ def _variant(rows: Sequence[dict[str, Any]]) -> Variant:
     )
 
 
-def choose_variant(store: Store, operation: str, wanted: Mapping[str, str]) -> Variant:
+def choose_variant(tables: Tables, operation: str, wanted: Mapping[str, str]) -> Variant:
     """The latest variant that is meant.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: the store has no such variant.
     """
-    found = variants(store, operation)
+    found = variants(tables, operation)
     meant = [variant for variant in found if variant.is_meant(wanted)]
     if meant:
         return meant[0]
     text = ", ".join(f"{name}={value}" for name, value in wanted.items())
     if not found:
-        raise ConfigError(f"{store.shown}: has no results of `{operation}`; `fleet run {operation}` makes them")
+        raise ConfigError(f"{tables.store.shown}: has no results of `{operation}`; `fleet run {operation}` makes them")
     there = "; ".join(f"{v.describe()} ({counted(len(v.keys), 'log')})" for v in found[:8])
-    raise ConfigError(f"{store.shown}: no results of `{operation}` have {text}; there are: {there}")
+    raise ConfigError(f"{tables.store.shown}: no results of `{operation}` have {text}; there are: {there}")

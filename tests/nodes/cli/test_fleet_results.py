@@ -56,9 +56,8 @@ def test_table_writes_csv_parquet_and_json(store: Store, tmp_path: Path) -> None
     with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["key"] for row in rows] == [row["key"] for row in printed]
-    assert (
-        json.loads(rows[0]["names"]) == printed[0]["names"] == pq.read_table(tmp_path / "a.parquet")["names"][0].as_py()
-    )
+    names = pq.read_table(tmp_path / "a.parquet")["names"][0].as_py()
+    assert json.loads(rows[0]["names"]) == printed[0]["names"] == names
 
 
 def test_wrong_sql_is_an_error_in_the_words_of_duckdb(store: Store) -> None:
@@ -162,3 +161,14 @@ def test_compare_within_a_store(store: Store) -> None:
 def test_wrong_usage_of_compare_exits_with_2(store: Store, arguments: tuple[str, ...], said: str) -> None:
     done = run("fleet", "compare", store.url, *(word.format(store=store.url) for word in arguments))
     assert done.returncode == 2 and said in done.stderr and not done.stdout
+
+
+def test_a_remote_store_is_reported_and_compared(tmp_path: Path) -> None:
+    store = Store("memory://fleet-verbs", create=True)
+    for number in range(3):
+        store.commit(with_files(store, made_up(number)))
+    done = run("fleet", "report", store.url, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = read_page(tmp_path / "report.html")  # without links: a bucket has no pages that a browser opens
+    assert len(pictures(page)) >= 3 + 2
+    assert run("fleet", "compare", store.url, store.url).returncode == 0

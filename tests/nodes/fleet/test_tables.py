@@ -10,10 +10,10 @@ import msgspec
 import pytest
 
 from semantic_mapper.errors import ConfigError, StoreError
-from semantic_mapper.nodes.fleet import tables
+from semantic_mapper.nodes.fleet import tables as module
 from semantic_mapper.nodes.fleet.results import Failure
 from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.tables import TABLES, columns, query, refresh
+from semantic_mapper.nodes.fleet.tables import TABLES, Tables, query, refresh
 from tests.nodes.fleet.made_up import FINISHED_NS, NAMES, made_up, store_of
 
 EACH = "SELECT count(*) AS n, count(DISTINCT key) AS keys FROM "
@@ -94,7 +94,7 @@ def test_results_that_two_writers_added_are_rows_once(tmp_path: Path) -> None:
 
 
 def test_small_parts_are_merged_without_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "MAX_SMALL_PARTS", 3)
+    monkeypatch.setattr(module, "MAX_SMALL_PARTS", 3)
     store = Store(str(tmp_path / "store"), create=True)
     for number in range(8):
         store.commit(made_up(number))
@@ -106,11 +106,11 @@ def test_small_parts_are_merged_without_change(tmp_path: Path, monkeypatch: pyte
 
 
 def test_old_files_of_parts_that_never_counted_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "MAX_SMALL_PARTS", 1)
+    monkeypatch.setattr(module, "MAX_SMALL_PARTS", 1)
     store = store_of(tmp_path / "store", [made_up(0)])
     refresh(store)
     store.write("tables/segments/part-00000000000000000001-abcd.parquet", b"half")
-    recent = tables._part_name()
+    recent = module._part_name()
     store.write(f"tables/segments/{recent}", b"a writer is at it")
     store.commit(made_up(1))
     refresh(store)
@@ -118,7 +118,7 @@ def test_old_files_of_parts_that_never_counted_are_removed(tmp_path: Path, monke
 
 
 def _add(url: str, first: int, count: int) -> None:
-    tables.MAX_SMALL_PARTS = 2
+    module.MAX_SMALL_PARTS = 2
     store = Store(url)
     for number in range(first, first + count):
         store.commit(made_up(number))
@@ -171,7 +171,8 @@ def test_quarantined_tasks_are_rows_of_failures(tmp_path: Path) -> None:
 def test_an_empty_store_has_empty_tables(tmp_path: Path) -> None:
     store = Store(str(tmp_path / "store"), create=True)
     assert query(store, "SELECT * FROM logs JOIN events USING (key)").num_rows == 0
-    assert ("error", "VARCHAR") in columns(store)["failures"]
+    with Tables(store) as tables:
+        assert ("error", "VARCHAR") in tables.columns()["failures"]
 
 
 @pytest.mark.parametrize(
