@@ -28,7 +28,7 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.errors import ConfigError, FleetError, MapError, SemanticMapperError
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.map_manifest import MapManifest
@@ -251,7 +251,7 @@ def run_on_ray(max_parallel: int = 0) -> Run:
                 result, error = ray.get(ready)
             except RayError as failure:
                 raise FleetError(
-                    f"{function.__name__.strip('_')} of {jobs[number][1]}: the worker was lost "
+                    f"task {number + 1} of {len(jobs)} ({function.__name__.strip('_')}) was lost with its worker "
                     f"({str(failure).splitlines()[0]}); run the merge again, what is done stays done"
                 ) from failure
             if error is not None:
@@ -319,11 +319,7 @@ def _pose_of(given: list[Any], where: str) -> Float64:
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{where}: expected numbers, got {given}") from error
     if values.shape == (4,):
-        c, s = np.cos(np.deg2rad(values[3])), np.sin(np.deg2rad(values[3]))
-        T = np.eye(4)
-        T[:2, :2] = ((c, -s), (s, c))
-        T[:3, 3] = values[:3]
-        values = T
+        values = yaw_transform(values[:3], float(values[3]))
     if values.shape != (4, 4):
         raise ConfigError(f"{where}: expected 4 rows of 4 numbers or [x, y, z, yaw_deg], got shape {values.shape}")
     check_pose(values, where)
