@@ -1,21 +1,23 @@
-"""``semantic-mapper fleet``: operations over many logs and maps."""
+"""``semantic-mapper fleet``: many logs, many machines, one store of results."""
 
 from __future__ import annotations
 
 import typer
 
-from semantic_mapper.nodes.cli.fleet_merge import merge
+from semantic_mapper.nodes.cli import fleet_merge, fleet_results, fleet_run
 
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Operations over many logs and maps, on this machine or a Ray cluster.",
+    help="Replay, score, label, finetune and merge many logs, on this machine or a Ray cluster.",
 )
 
-
-@app.callback()
-def _options() -> None:
-    """A callback keeps ``merge`` a verb of its own while it is the only one."""
-
-
-app.command("merge")(merge)
+for _function in (
+    fleet_run.run,
+    fleet_run.top,
+    fleet_merge.merge,
+    fleet_results.table,
+    fleet_results.report,
+    fleet_results.compare,
+):
+    app.command(_function.__name__)(_function)

@@ -73,6 +73,7 @@ for _function in (
 ):
     app.command(_function.__name__.rstrip("_"))(_function)
 
+app.add_typer(cli_fleet.app, name="fleet")
 app.add_typer(cli_keys.app, name="keys")
 app.add_typer(cli_launch.app, name="launch")
 app.add_typer(cli_fleet.app, name="fleet")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
@@ -156,6 +157,14 @@ class Store:
             (self.local / name).parent.mkdir(parents=True, exist_ok=True)
         self._try(name, lambda: self._fs.put_file(str(file), self.path(name)))
 
+    def take(self, file: Path, name: str) -> None:
+        """As ``upload``, for a file that is not needed any more: moved where that is cheaper."""
+        if self.local is None:
+            self.upload(file, name)
+            return
+        target = self.local / name
+        self._try(name, lambda: _move(file, target))
+
     def download(self, name: str, file: Path) -> None:
         """Copy an object to a local file.
 
@@ -254,3 +263,8 @@ class Store:
             place(draft, target)
         finally:
             draft.unlink(missing_ok=True)
+
+
+def _move(file: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.move(file, target)

@@ -1,4 +1,4 @@
-"""Paths and URLs of logs and stores: what opens them, and how they are shown without credentials."""
+"""Paths and URLs of logs and stores: what opens them, and how they are shown without what lets anybody in."""
 
 from __future__ import annotations
 
@@ -8,44 +8,42 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 from semantic_mapper.backoff import backoff_s
-from semantic_mapper.errors import ConfigError, DependencyError, StoreError
+from semantic_mapper.errors import ConfigError, DependencyError, FleetError, StoreError
 from semantic_mapper.log_events import get_logger
 
 TRIES = 6
 FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 15.0
 
+_SCHEME = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*)://(.*)", re.DOTALL)
+_CHAIN = "::"  # between the parts of fsspec's chained URLs
+_PORT = re.compile(r"[^:]*:\d+")
+_HIDDEN = "..."
+# Where what stands before the @ is a container or the name of an account, and says where something is.
+_NAMING_SCHEMES = ("abfs", "abfss", "az", "ftp", "hdfs", "scp", "sftp", "smb", "ssh", "wasb", "wasbs")
+
 _log = get_logger(__name__)
 _T = TypeVar("_T")
-
-_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://|::)")
-_SECRET = re.compile(r"signature|token|secret|password|credential|security|key|sig|auth", re.IGNORECASE)
 
 
 def is_url(text: str) -> bool:
     """Whether a URL is meant rather than a local path."""
-    return _SCHEME.match(text) is not None
+    return bool(_split(text)[0])
 
 
 def split_url(url: str) -> tuple[Any, str]:
     """The fsspec file system of a path or URL, and the path in it, without a slash at its end.
 
     Raises:
-        ConfigError: an unknown scheme, or credentials in the URL.
+        ConfigError: an unknown scheme.
+        FleetError: a password in the URL.
         DependencyError: the package for this scheme is missing.
     """
     from fsspec.core import url_to_fs
 
-    if is_url(url) and not url.startswith("file:"):
-        parts = urlsplit(url)
-        if parts.password or (parts.username and parts.scheme not in ("http", "https")):
-            raise ConfigError(
-                f"{shown(url)}: has credentials in it, which would end in logs; give them as the protocol's own "
-                "environment variables or files (s3: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or ~/.aws)"
-            )
-    else:
+    refuse_credentials(url)
+    if not is_url(url) or url.startswith("file://"):
         url = str(Path(url.removeprefix("file://")).absolute())
     try:
         fs, path = url_to_fs(url)
@@ -57,13 +55,63 @@ def split_url(url: str) -> tuple[Any, str]:
 
 
 def shown(url: str) -> str:
-    """A URL for logs and results: without user, password, and what looks like a signature or token in its query."""
-    if not is_url(url):
+    """A URL for logs, results and messages: without user information, query and fragment.
+
+    Queries hold signatures (``X-Amz-Signature``, ``X-Goog-Signature``, ``sig``) and tokens; which of them do cannot be
+    listed. Paths of files stay as they are.
+
+    Args:
+        url: Also one of fsspec's chained URLs (``simplecache::s3://...``).
+    """
+    return _CHAIN.join(_shown_part(part) for part in url.split(_CHAIN))
+
+
+def refuse_credentials(url: str) -> None:
+    """Check that a URL holds no password: it would be in the shell's history and in the process table.
+
+    Raises:
+        FleetError: It does; names the ways that are there instead.
+    """
+    for part in url.split(_CHAIN):
+        scheme, rest = _split(part)
+        if ":" in rest[: _user_length(scheme, rest)]:
+            raise FleetError(
+                f"{shown(url)}: a URL must not hold a key or password; leave it out, and give it to every node in its "
+                "environment (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, GOOGLE_APPLICATION_CREDENTIALS), in ~/.aws, or "
+                "in fsspec's configuration (~/.config/fsspec)"
+            )
+
+
+def _shown_part(url: str) -> str:
+    scheme, rest = _split(url)
+    if not scheme:
         return url
-    parts = urlsplit(url)
-    host = parts.netloc.rsplit("@", 1)[-1]
-    query = [(k, "***" if _SECRET.search(k) else v) for k, v in parse_qsl(parts.query, keep_blank_values=True)]
-    return urlunsplit((parts.scheme, host, parts.path, urlencode(query, safe="*"), ""))
+    length = _user_length(scheme, rest)
+    user, place = rest[:length], rest[length:]
+    is_name = scheme.lower() in _NAMING_SCHEMES and ":" not in user
+    path = re.split(r"[?#]", place, maxsplit=1)[0]
+    return f"{scheme}://{user if is_name else ''}{path}{'' if path == place else '?' + _HIDDEN}"
+
+
+def _split(url: str) -> tuple[str, str]:
+    """Scheme and all after ``://``; an empty scheme for paths."""
+    match = _SCHEME.fullmatch(url)
+    return (match[1], match[2]) if match else ("", url)
+
+
+def _user_length(scheme: str, rest: str) -> int:
+    """Letters up to and including the @ of user information; 0 = there is nothing of the kind.
+
+    Secret keys of AWS contain slashes, so that user information may seem to end before it does.
+    """
+    if not scheme or scheme == "file":
+        return 0
+    host = re.split(r"[/?#]", rest, maxsplit=1)[0]
+    if "@" in host:
+        return host.rindex("@") + 1
+    if ":" in host and "@" in rest and not _PORT.fullmatch(host):
+        return rest.rindex("@") + 1
+    return 0
 
 
 def persistently(call: Callable[[], _T], what: str, tries: int = TRIES) -> _T:
@@ -106,3 +154,8 @@ def _errors_of_stores() -> tuple[type[BaseException], ...]:
     )
     loaded = [getattr(sys.modules[module], name) for module, name in names if module in sys.modules]
     return (OSError, *loaded)
+
+
+def unstripped(fs: Any, path: str, like: str) -> str:
+    """URL of a path in a file system; ``like`` is a URL or path of the same one."""
+    return str(fs.unstrip_protocol(path)) if is_url(like) and not like.startswith("file:") else path

@@ -60,13 +60,18 @@ def ranks_from_environment() -> Ranks:
 _VARIABLES = {"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "0"}
 
 
+def backend_for(device_type: str) -> str:
+    """Of a process group: gloo for tensors in host memory, NCCL for those on a GPU."""
+    return "cpu:gloo,cuda:nccl" if device_type == "cuda" else "gloo"
+
+
 @contextmanager
 def joined(ranks: Ranks, device: torch.device) -> Iterator[None]:
-    """Connected with the other ranks while inside: gloo for tensors in host memory, NCCL for those on a GPU."""
-    if ranks.world == 1:
+    """Connected with the other ranks while inside; a group that a launcher (Ray Train) has made is used, and kept."""
+    if ranks.world == 1 or distributed.is_initialized():
         yield
         return
-    distributed.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
+    distributed.init_process_group(backend_for(device.type))
     try:
         yield
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
@@ -31,6 +31,10 @@ class RoomFeed(Protocol):
     def close(self) -> None:
         """End what runs for it."""
         ...
+
+
+# Opens the feed of a pool from seeds, config and number of workers, as ``open_feed`` does.
+FeedMaker = Callable[[Iterator[int], "RoomPoolConfig", int], RoomFeed]
 
 
 def open_feed(seeds: Iterator[int], config: RoomPoolConfig, workers: int) -> RoomFeed:

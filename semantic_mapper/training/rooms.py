@@ -22,7 +22,7 @@ from semantic_mapper.scenes import TRAIN_SEEDS, RoomConfig, room_frames
 from semantic_mapper.training.cameras import CameraDraw, draw_camera
 from semantic_mapper.training.computed_depth import ComputedDepth, compute_depth, draw_computed_depth
 from semantic_mapper.training.losses import IGNORE
-from semantic_mapper.training.room_feed import open_feed
+from semantic_mapper.training.room_feed import FeedMaker, open_feed
 from semantic_mapper.training.views import LabelledView, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame, UInt8
 
@@ -191,6 +191,7 @@ class RoomPool(AbstractContextManager["RoomPool"]):
         draws: Draws made before.
         workers: Processes that render ahead; 0 renders inline.
         device: Where ``RoomViews.resident`` lies.
+        feed: Makes the rooms.
     """
 
     def __init__(
@@ -202,13 +203,14 @@ class RoomPool(AbstractContextManager["RoomPool"]):
         draws: int = 0,
         workers: int = 0,
         device: torch.device = CPU,
+        feed: FeedMaker = open_feed,
     ) -> None:
         self._config = config
         self._device = device
         self._draws = draws
         self._taken = max(0, self._wanted() - config.rooms)
         self._ring: deque[RoomViews | None] = deque(maxlen=config.rooms)
-        self._feed = open_feed(_seeds(first, stride, self._taken), config, workers)
+        self._feed = feed(_seeds(first, stride, self._taken), config, workers)
 
     @property
     def rooms_rendered(self) -> int:

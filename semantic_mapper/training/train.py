@@ -31,6 +31,7 @@ from semantic_mapper.training.images import ImageBatch, draw_images, images_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
 from semantic_mapper.training.recipe import provenance, rooms_before
+from semantic_mapper.training.room_feed import FeedMaker, open_feed
 from semantic_mapper.training.rooms import RoomPool, RoomViews
 from semantic_mapper.training.schedule import budget_fraction, learning_rate
 from semantic_mapper.training.start import start_from_imagenet, take_over, take_over_encoder
@@ -73,6 +74,7 @@ def train(
     resume: bool = False,
     on_progress: Callable[[TrainProgress], None] | None = None,
     stopped: Callable[[], object] = bool,
+    feed: FeedMaker = open_feed,
 ) -> Checkpoint:
     """Train on the training rooms; returns the weights that ``config.keep`` asks for.
 
@@ -80,6 +82,7 @@ def train(
         folder: For the state, the history, the curves and the weights kept so far; None writes nothing.
         resume: Go on with the state in ``folder``. The budget may be another one, the rest of the config may not.
         stopped: Asked once a step; when it says yes, all is saved and the weights kept so far are returned.
+        feed: Makes the rooms; every feed gives the same ones.
 
     Raises:
         ConfigError: a config that cannot be used, another one than that of the run to go on with, or a folder in use
@@ -94,7 +97,7 @@ def train(
     if folder is not None and not resume:
         check_nothing_is_overwritten(folder / STATE_FILE)
     with sole_use_of(folder if ranks.first else None), joined(ranks, device):
-        run = _Run(config, folder, ranks, device)
+        run = _Run(config, folder, ranks, device, feed)
         if resume:
             run.restore()
         else:
@@ -128,9 +131,11 @@ class _StepLoss(nn.Module):
 class _Run:
     """One training run on one rank."""
 
-    def __init__(self, config: TrainConfig, folder: Path | None, ranks: Ranks, device: torch.device) -> None:
+    def __init__(
+        self, config: TrainConfig, folder: Path | None, ranks: Ranks, device: torch.device, feed: FeedMaker
+    ) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.folder, self.ranks, self.device = config, folder, ranks, device
+        self.config, self.folder, self.ranks, self.device, self.feed = config, folder, ranks, device, feed
         self.field = build_field(config.kind, config.field, ROOMS).to(device)
         check_field(self.field, config)
         trained = config.imagenet or config.start or config.encoder_from
@@ -182,6 +187,7 @@ class _Run:
             draws=progress.draws,
             workers=config.workers,
             device=self.device,
+            feed=self.feed,
         )
         log = TrainLog(self.folder if self.ranks.first else None, progress.history)
         self._announce()

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
+
+import torch
+from safetensors import safe_open
 
 from semantic_mapper.config import convert_config, to_plain
 from semantic_mapper.training.train_config import TrainConfig
 from tests.small import SMALL_MODEL
 
+TIMES = {"seconds", "waited_s"}
 POOL = {"width": 48, "views": 5, "rooms": 3, "rooms_at_start": 2, "draws_per_room": 2}
 
 
@@ -24,3 +30,14 @@ def small_run(**changes: Any) -> TrainConfig:
         "validation": {"times": 2, "rooms": 1, "queries": 1, "rays": 64, "views": 3},
     }
     return convert_config({**base, **changes}, TrainConfig, "test config")
+
+
+def contents(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, object]]:
+    """Tensors and metadata of a state, but for what a clock says."""
+    with safe_open(path, framework="pt") as stored:
+        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+        metadata = dict(stored.metadata())
+    del metadata["elapsed_s"], metadata["images_s"]
+    history = json.loads(metadata.pop("history"))
+    lines = [{k: v for k, v in line.items() if k not in TIMES} for line in history]
+    return tensors, {**metadata, "history": lines}

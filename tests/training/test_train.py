@@ -18,9 +18,7 @@ from semantic_mapper.training.train import (
     train,
 )
 from semantic_mapper.training.train_config import TrainConfig
-from tests.training.small_run import small_run
-
-TIMES = {"seconds", "waited_s"}
+from tests.training.small_run import contents, small_run
 
 
 def stop_after(steps: int):
@@ -31,17 +29,6 @@ def stop_after(steps: int):
         done.append(progress.step)
 
     return {"on_progress": on_progress, "stopped": lambda: len(done) >= steps}
-
-
-def contents(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, object]]:
-    """Tensors and metadata of a state, but for what a clock says."""
-    with safe_open(path, framework="pt") as stored:
-        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-        metadata = dict(stored.metadata())
-    del metadata["elapsed_s"], metadata["images_s"]
-    history = json.loads(metadata.pop("history"))
-    lines = [{k: v for k, v in line.items() if k not in TIMES} for line in history]
-    return tensors, {**metadata, "history": lines}
 
 
 @pytest.mark.slow

@@ -10,10 +10,18 @@ from safetensors.torch import save_file
 
 from semantic_mapper.training.rooms import RoomPool
 from semantic_mapper.training.train import train
+from semantic_mapper.training.train_config import TrainConfig
 from tests.training.small_run import small_run
 
 
-def main(folder: Path) -> None:
+def two_ranks_run(steps: int = 4) -> TrainConfig:
+    """The config of these processes."""
+    validation = {"times": 1, "rooms": 2, "queries": 1, "rays": 64, "views": 3}
+    one_attention = small_run().field | {"cross_view_attention": False}  # weights that get no gradient
+    return small_run(steps=steps, validation=validation, field=one_attention)
+
+
+def main(folder: Path, config: TrainConfig) -> None:
     seen: list[int] = []
     plain_draw = RoomPool.draw
 
@@ -23,9 +31,7 @@ def main(folder: Path) -> None:
         return room
 
     RoomPool.draw = draw
-    validation = {"times": 1, "rooms": 2, "queries": 1, "rays": 64, "views": 3}
-    one_attention = small_run().field | {"cross_view_attention": False}  # weights that get no gradient
-    checkpoint = train(small_run(steps=4, validation=validation, field=one_attention), folder)
+    checkpoint = train(config, folder)
     rank = os.environ["RANK"]
     score = checkpoint.recipe["validation_miou"]
     about = {"rooms": " ".join(map(str, seen)), "score": str(score), "ranks": str(checkpoint.recipe["ranks"])}
@@ -35,4 +41,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), two_ranks_run(*map(int, sys.argv[2:])))
