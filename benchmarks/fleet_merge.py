@@ -33,7 +33,7 @@ from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.merge import merge_maps, run_on_ray
+from semantic_mapper.nodes.fleet.merge import Run, merge_maps, run_on_ray
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.plots import CYCLE, new_figure, rendered, write_picture
 from semantic_mapper.queries.tiles import TiledMap
@@ -188,12 +188,12 @@ def map_paths(seed: int, area_m2: float, keep: Path) -> list[Path]:
     return [keep / f"{seed}-{area_m2:g}" / f"robot-{robot}.npz" for robot in range(ROBOTS)]
 
 
-def measure(seed: int, area_m2: float, keep: Path, picture: Path | None) -> Building:
+def measure(seed: int, area_m2: float, keep: Path, picture: Path | None, run: Run) -> Building:
     """Merge and score one building, whose maps are there."""
     storey, maps = make_storey(seed, area_m2), map_paths(seed, area_m2, keep)
     began = time.monotonic()
     store = maps[0].parent / "store"
-    report = merge_maps([str(p) for p in maps], Store(str(store), create=True), {}, run_on_ray(), frame_progress)
+    report = merge_maps([str(p) for p in maps], Store(str(store), create=True), {}, run, frame_progress)
     seconds = time.monotonic() - began
     off_mm, off_deg = 0.0, 0.0
     for robot, source in enumerate(report.manifest.sources):
@@ -295,12 +295,13 @@ def main() -> None:
         storey = make_storey(seed, args.area)
         for robot, path in enumerate(map_paths(seed, args.area, args.keep)):
             map_part(storey, seed, robot, path)
-    with connected("local"):
+    with connected("local") as cluster:
+        run = run_on_ray(cluster)
         for seed in seeds:
             scores = args.keep / f"{seed}-{args.area:g}" / "scores.json"
             picture = args.picture if seed == seeds[-1] else None
             if not scores.is_file() or picture is not None:
-                building = measure(seed, args.area, args.keep, picture)
+                building = measure(seed, args.area, args.keep, picture, run)
                 if not scores.is_file():
                     scores.write_bytes(msgspec.json.encode(building))
             found.append(msgspec.json.decode(scores.read_bytes(), type=Building))

@@ -50,12 +50,14 @@ from semantic_mapper.mapping.files.tiles import (
     write_piece,
 )
 from semantic_mapper.mapping.map_alignment import find_alignment
+from semantic_mapper.nodes.fleet.cluster import Cluster
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url
 from semantic_mapper.queries.tiles import describe_tile
 from semantic_mapper.types import Float64
 
 MERGE_VERSION = 1  # part of all digests: raise it where the same maps would give other tiles
+TASK_BYTES = 3_000_000_000  # of memory that a task declares: two maps of ``tiles.MEMORY_MB`` and the libraries
 MAP_NAME = "map.npz"
 _WAY_OUT = "Give it in the file of --poses"
 
@@ -225,18 +227,20 @@ def merge_maps(
     return MergeReport(manifest, notes, peak)
 
 
-def run_on_ray(max_parallel: int = 0) -> Run:
+def run_on_ray(cluster: Cluster, max_parallel: int = 0) -> Run:
     """Runs tasks on the cluster that is connected, each on one processor; tasks of killed workers run again.
 
     Args:
-        max_parallel: Tasks at a time; 0 = as many as there are processors.
+        cluster: That this process is connected with.
+        max_parallel: Tasks at a time; 0 = as many as there are processors and memory for.
     """
+    memory = min(TASK_BYTES, cluster.memory_bytes // max(1, cluster.nodes))
 
     def run(function: Callable[..., _R], jobs: Sequence[tuple[Any, ...]], done: Callable[[], None]) -> list[_R]:
         import ray
         from ray.exceptions import RayError
 
-        task = ray.remote(num_cpus=1)(_caught)
+        task = ray.remote(num_cpus=1, memory=memory)(_caught)
         waiting = list(enumerate(jobs))[::-1]
         running: dict[Any, int] = {}
         results: dict[int, _R] = {}

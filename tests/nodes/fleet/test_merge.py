@@ -323,18 +323,18 @@ def test_maps_find_where_they_lie(seen_maps: tuple[list[str], list[Float64]], tm
 @pytest.mark.slow
 def test_workers_of_ray_give_the_same_bytes(maps: list[str], tmp_path: Path) -> None:
     merged(maps, tmp_path / "one")
-    with connected("local"):
-        merged(maps, tmp_path / "other", run_on_ray())
+    with connected("local") as cluster:
+        merged(maps, tmp_path / "other", run_on_ray(cluster))
         with pytest.raises(MapError, match="b: where it lies is not known"):
-            merged(maps, tmp_path / "third", run_on_ray(1), poses={"a": np.eye(4), "c": POSES["c"]})
+            merged(maps, tmp_path / "third", run_on_ray(cluster, 1), poses={"a": np.eye(4), "c": POSES["c"]})
     assert content(tmp_path / "one") == content(tmp_path / "other")
 
 
 KILLED = """
 import sys
 from tests.nodes.fleet.test_merge import POSES, frame_progress, connected, run_on_ray, merge_maps, Store, EDGE
-with connected("local"):
-    merge_maps(sys.argv[2:], Store(sys.argv[1], create=True), POSES, run_on_ray(), frame_progress, EDGE)
+with connected("local") as cluster:
+    merge_maps(sys.argv[2:], Store(sys.argv[1], create=True), POSES, run_on_ray(cluster), frame_progress, EDGE)
 """
 
 
