@@ -23,16 +23,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.evaluation.metrics import map_confusion
-from semantic_mapper.geometry import invert_pose, rotation_vector, transform, unproject
+from semantic_mapper.geometry import invert_pose, rotation_vector, transform, unproject, yaw_transform
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.merge import merge_maps, run_on_ray
+from semantic_mapper.nodes.fleet.merge import Run, merge_maps, run_on_ray
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.plots import CYCLE, new_figure, rendered, write_picture
 from semantic_mapper.queries.tiles import TiledMap
@@ -44,6 +45,7 @@ from semantic_mapper.scenes.storey import Storey, make_storey, survey_poses, sur
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 CAMERA = CameraIntrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)
+VOXEL_M = 0.03
 ROBOTS = 3
 NEAR_M = 0.05  # farther from the map, a true surface counts as missed
 TRUTH_VOXEL_M = 0.01
@@ -73,7 +75,7 @@ class Building(msgspec.Struct, frozen=True):
         parts, merged: Scores of the robots' maps and of the merged map.
         off_mm, off_deg: Greatest error of a map's place.
         tiles, megabytes: Of the store.
-        peak_mb: Greatest memory of a worker, libraries included.
+        peak_mb: Greatest memory of a worker so far, libraries included; workers stay from building to building.
         seconds: Of the merge.
         asked, loaded: Questions ``nearest``, each with no tile in memory, and tiles that they have loaded.
     """
@@ -104,7 +106,7 @@ def robot_poses(storey: Storey, seed: int, robot: int) -> Float64:
     rng = np.random.default_rng((seed, robot))
     room = storey.room_at(poses[:, :2, 3])
     found: list[Float64] = []
-    for T in poses[room % ROBOTS != robot]:
+    for T in poses[room % ROBOTS != robot][robot % 2 :: 2]:  # every direction once, up or down
         ahead = T[:3, 2]
         yaw = np.arctan2(ahead[1], ahead[0]) + rng.uniform(-0.35, 0.35)
         pitch = np.arcsin(ahead[2]) + rng.uniform(-0.1, 0.1)
@@ -114,13 +116,11 @@ def robot_poses(storey: Storey, seed: int, robot: int) -> Float64:
 
 def robot_world(seed: int, robot: int) -> Float64:
     """T_building_robot (4, 4): the first robot's world is the building's."""
-    T = np.eye(4)
-    if robot:
-        rng = np.random.default_rng((seed, robot, 1))
-        yaw = rng.uniform(-np.pi, np.pi)
-        T[:2, :2] = ((np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw)))
-        T[:3, 3] = rng.uniform((-20, -20, -1), (20, 20, 1))
-    return T
+    if robot == 0:
+        return np.eye(4)
+    rng = np.random.default_rng((seed, robot, 1))
+    yaw_deg = rng.uniform(-180, 180)
+    return yaw_transform(rng.uniform((-20, -20, -1), (20, 20, 1)), yaw_deg)
 
 
 def frames_of(storey: Storey, seed: int, robot: int) -> Iterator[PosedFrame]:
@@ -136,7 +136,7 @@ def map_part(storey: Storey, seed: int, robot: int, path: Path) -> None:
     """Map a robot's frames with the shipped weights, where its map is missing."""
     if path.is_file():
         return
-    mapper = Mapper.load()
+    mapper = Mapper.load(config=MapperConfig(voxel_map=VoxelMapConfig(voxel_size_m=VOXEL_M)))
     for frame in frames_of(storey, seed, robot):
         try:
             mapper.step(frame)
@@ -183,17 +183,17 @@ def count_loads(store: Path) -> tuple[int, int]:
     return asked, loaded
 
 
-def measure(seed: int, area_m2: float, keep: Path, picture: Path | None) -> Building:
-    """Map, merge and score one building; what is kept is not done again."""
-    storey = make_storey(seed, area_m2)
-    folder = keep / f"{seed}-{area_m2:g}"
-    maps = [folder / f"robot-{robot}.npz" for robot in range(ROBOTS)]
-    for robot, path in enumerate(maps):
-        map_part(storey, seed, robot, path)
+def map_paths(seed: int, area_m2: float, keep: Path) -> list[Path]:
+    """Of the robots' maps."""
+    return [keep / f"{seed}-{area_m2:g}" / f"robot-{robot}.npz" for robot in range(ROBOTS)]
+
+
+def measure(seed: int, area_m2: float, keep: Path, picture: Path | None, run: Run) -> Building:
+    """Merge and score one building, whose maps are there."""
+    storey, maps = make_storey(seed, area_m2), map_paths(seed, area_m2, keep)
     began = time.monotonic()
-    store = folder / "store"
-    with connected("local"):
-        report = merge_maps([str(p) for p in maps], Store(str(store), create=True), {}, run_on_ray(), frame_progress)
+    store = maps[0].parent / "store"
+    report = merge_maps([str(p) for p in maps], Store(str(store), create=True), {}, run, frame_progress)
     seconds = time.monotonic() - began
     off_mm, off_deg = 0.0, 0.0
     for robot, source in enumerate(report.manifest.sources):
@@ -242,7 +242,7 @@ def draw(parts: Sequence[Float32], merged: MapPoints, edge_blocks: int, seed: in
     low = np.flatnonzero(merged.xyz[:, 2] < 2.0)[:: 1 + len(merged.xyz) // 150_000]
     order = low[np.argsort(merged.xyz[low, 2])]
     of_merged.scatter(*merged.xyz[order, :2].T, s=0.6, c=ROOMS.colorize(merged.label[order]) / 255, lw=0)
-    edge_m = edge_blocks * 8 * 0.02
+    edge_m = edge_blocks * 8 * VOXEL_M
     for axis, line in ((0, of_merged.axvline), (1, of_merged.axhline)):
         ends = np.floor(merged.xyz[:, axis].min() / edge_m), np.ceil(merged.xyz[:, axis].max() / edge_m)
         for n in np.arange(ends[0], ends[1] + 1):
@@ -292,13 +292,20 @@ def main() -> None:
     found: list[Building] = []
     seeds = list(TEST_SEEDS)[args.first : args.first + args.buildings]
     for seed in seeds:
-        scores = args.keep / f"{seed}-{args.area:g}" / "scores.json"
-        picture = args.picture if seed == seeds[-1] else None
-        if not scores.is_file() or picture is not None:
-            building = measure(seed, args.area, args.keep, picture)
-            if not scores.is_file():
-                scores.write_bytes(msgspec.json.encode(building))
-        found.append(msgspec.json.decode(scores.read_bytes(), type=Building))
+        storey = make_storey(seed, args.area)
+        for robot, path in enumerate(map_paths(seed, args.area, args.keep)):
+            map_part(storey, seed, robot, path)
+    with connected("local") as cluster:
+        run = run_on_ray(cluster)
+        for seed in seeds:
+            scores = args.keep / f"{seed}-{args.area:g}" / "scores.json"
+            picture = args.picture if seed == seeds[-1] else None
+            if not scores.is_file() or picture is not None:
+                building = measure(seed, args.area, args.keep, picture, run)
+                if not scores.is_file():
+                    scores.write_bytes(msgspec.json.encode(building))
+            found.append(msgspec.json.decode(scores.read_bytes(), type=Building))
+            print(msgspec.json.encode(found[-1]).decode(), flush=True)
     show(found)
 
 

@@ -81,6 +81,15 @@ def pose_matrix(position: Float64, quaternion: Float64) -> Float64:
     return T_world_camera
 
 
+def yaw_transform(position: Float64, yaw_deg: float) -> Float64:
+    """Transform (4, 4) that turns by degrees about +z, then shifts by ``position`` (3,)."""
+    c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
+    T = np.eye(4)
+    T[:2, :2] = ((c, -s), (s, c))
+    T[:3, 3] = position
+    return T
+
+
 def rotation_vector(T_a_b: Float64) -> Float64:
     """Axis times angle (3,), in radians, of the rotation of a rigid transform (4, 4)."""
     return np.asarray(cv2.Rodrigues(T_a_b[:3, :3])[0], np.float64)[:, 0]

@@ -24,6 +24,7 @@ from semantic_mapper.geometry import (
     scale_intrinsics,
     transform,
     unproject,
+    yaw_transform,
 )
 from semantic_mapper.types import CameraIntrinsics
 
@@ -273,3 +274,9 @@ def test_a_rotation_of_huge_numbers_is_refused_without_overflow(scale: float) ->
     pose[:3, :3] *= scale
     with pytest.raises(PoseError, match="not a rotation"):
         check_pose(pose, "frame 1")
+
+
+def test_a_yaw_turns_x_towards_y_before_it_shifts() -> None:
+    T = yaw_transform(np.array((1.0, 2.0, 3.0)), 90.0)
+    np.testing.assert_allclose(T @ (1, 0, 0, 1), (1, 3, 3, 1), atol=1e-12)
+    check_pose(T, "yaw")

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.nodes.cli.fleet_run import RayOption, TrustedOption
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.plain_text import counted
 
@@ -29,10 +30,11 @@ def merge(
     tile_blocks: Annotated[
         int, typer.Option(min=1, max=1000, help="Edge of a tile in blocks of 8 voxels: 25 are 4 m at 2 cm voxels.")
     ] = 25,
-    ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Ray cluster; `local` starts one here.  [default: local]")
-    ] = None,
-    max_parallel: Annotated[int, typer.Option(min=0, help="Tasks at a time; 0 = as many as processors.")] = 0,
+    ray: RayOption = None,
+    max_parallel: Annotated[
+        int, typer.Option("--max-parallel", min=0, help="Tasks at a time; 0 = what there is room for.")
+    ] = 0,
+    trusted_network: TrustedOption = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> None:
     """Merge maps of one building into tiles, which `query` reads without loading all of them.
@@ -60,8 +62,8 @@ def merge(
             map_path(Path(name))
     given = {} if poses is None else read_poses(poses)
     store = Store(out, create=True)
-    with connected(ray):
-        report = merge_maps(maps, store, given, run_on_ray(max_parallel), frame_progress, tile_blocks)
+    with connected(ray, trusted_network=trusted_network) as cluster:
+        report = merge_maps(maps, store, given, run_on_ray(cluster, max_parallel), frame_progress, tile_blocks)
     manifest = report.manifest
     if json:
         places = {source.name: [list(row) for row in source.T_world_map] for source in manifest.sources}

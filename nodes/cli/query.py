@@ -12,7 +12,6 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.saved_maps import holds_tiles
 from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 
@@ -109,6 +108,8 @@ def query(
     Example: semantic-mapper query s3://maps/house nearest chair 0 0 1
     """
     class_name, point = _read_arguments(question, arguments or [])
+    from semantic_mapper.nodes.cli.saved_maps import holds_tiles
+
     in_tiles = holds_tiles(source)
     endpoint = "" if in_tiles else map_endpoint(source)
     if refined and not endpoint:

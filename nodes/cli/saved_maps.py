@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.types import Float64
 
 MAP_NAME = "map.npz"
 MAP_SUFFIX = ".npz"
 LOG_SUFFIX = ".mcap"
 TILES_NAME = "tiles.json"
-SOCKETS = ("ipc", "tcp")  # schemes of running mappers
+SOCKETS = ("ipc", "inproc", "tcp")  # schemes of running mappers
 
 
 def map_path(path: Path) -> Path:
@@ -77,11 +77,7 @@ def parse_transform(text: str) -> Float64:
         return _read_transform(Path(text))
     if len(numbers) != 4 or not np.isfinite(numbers).all():
         raise ConfigError(f"--transform '{text}': expected four numbers, x y z in metres and yaw in degrees")
-    c, s = np.cos(np.deg2rad(numbers[3])), np.sin(np.deg2rad(numbers[3]))
-    T = np.eye(4)
-    T[:2, :2] = ((c, -s), (s, c))
-    T[:3, 3] = numbers[:3]
-    return T
+    return yaw_transform(np.array(numbers[:3]), numbers[3])
 
 
 def _read_transform(path: Path) -> Float64:

@@ -28,7 +28,7 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.errors import ConfigError, FleetError, MapError, SemanticMapperError
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.map_manifest import MapManifest
@@ -50,12 +50,14 @@ from semantic_mapper.mapping.files.tiles import (
     write_piece,
 )
 from semantic_mapper.mapping.map_alignment import find_alignment
+from semantic_mapper.nodes.fleet.cluster import Cluster
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url
 from semantic_mapper.queries.tiles import describe_tile
 from semantic_mapper.types import Float64
 
 MERGE_VERSION = 1  # part of all digests: raise it where the same maps would give other tiles
+TASK_BYTES = 3_000_000_000  # of memory that a task declares: two maps of ``tiles.MEMORY_MB`` and the libraries
 MAP_NAME = "map.npz"
 _WAY_OUT = "Give it in the file of --poses"
 
@@ -225,18 +227,20 @@ def merge_maps(
     return MergeReport(manifest, notes, peak)
 
 
-def run_on_ray(max_parallel: int = 0) -> Run:
+def run_on_ray(cluster: Cluster, max_parallel: int = 0) -> Run:
     """Runs tasks on the cluster that is connected, each on one processor; tasks of killed workers run again.
 
     Args:
-        max_parallel: Tasks at a time; 0 = as many as there are processors.
+        cluster: That this process is connected with.
+        max_parallel: Tasks at a time; 0 = as many as there are processors and memory for.
     """
+    memory = min(TASK_BYTES, cluster.memory_bytes // max(1, cluster.nodes))
 
     def run(function: Callable[..., _R], jobs: Sequence[tuple[Any, ...]], done: Callable[[], None]) -> list[_R]:
         import ray
         from ray.exceptions import RayError
 
-        task = ray.remote(num_cpus=1)(_caught)
+        task = ray.remote(num_cpus=1, memory=memory)(_caught)
         waiting = list(enumerate(jobs))[::-1]
         running: dict[Any, int] = {}
         results: dict[int, _R] = {}
@@ -251,7 +255,7 @@ def run_on_ray(max_parallel: int = 0) -> Run:
                 result, error = ray.get(ready)
             except RayError as failure:
                 raise FleetError(
-                    f"{function.__name__.strip('_')} of {jobs[number][1]}: the worker was lost "
+                    f"task {number + 1} of {len(jobs)} ({function.__name__.strip('_')}) was lost with its worker "
                     f"({str(failure).splitlines()[0]}); run the merge again, what is done stays done"
                 ) from failure
             if error is not None:
@@ -319,11 +323,7 @@ def _pose_of(given: list[Any], where: str) -> Float64:
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{where}: expected numbers, got {given}") from error
     if values.shape == (4,):
-        c, s = np.cos(np.deg2rad(values[3])), np.sin(np.deg2rad(values[3]))
-        T = np.eye(4)
-        T[:2, :2] = ((c, -s), (s, c))
-        T[:3, 3] = values[:3]
-        values = T
+        values = yaw_transform(values[:3], float(values[3]))
     if values.shape != (4, 4):
         raise ConfigError(f"{where}: expected 4 rows of 4 numbers or [x, y, z, yaw_deg], got shape {values.shape}")
     check_pose(values, where)

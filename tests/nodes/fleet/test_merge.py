@@ -26,7 +26,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.fleet import merge as merge_module
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.merge import MergeReport, map_names, merge_maps, read_poses, run_on_ray
+from semantic_mapper.nodes.fleet.merge import Alignment, MergeReport, map_names, merge_maps, read_poses, run_on_ray
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.tile_reading import open_tiles
 from semantic_mapper.types import Float64
@@ -222,6 +222,32 @@ def test_a_map_that_fits_nowhere_is_refused_by_name(maps: list[str], tmp_path: P
     assert not (tmp_path / "store" / "tiles").exists()
 
 
+def test_a_map_joins_whichever_placed_map_it_agrees_with_most(maps: list[str], tmp_path: Path) -> None:
+    a, b, c = (str(Path(url, "map.npz")) for url in maps)
+    T_b_c = turned((0, 0, 0), (1.0, 0.0, 0.0))
+    found = {
+        (a, b): Alignment(_rows(POSES["b"]), 5, 9),
+        (b, c): Alignment(_rows(T_b_c), 4, 9),
+    }
+    asked: list[tuple[str, str]] = []
+
+    def answered(function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], done: Any) -> list[Any]:
+        if function is not merge_module._align:
+            return here(function, jobs, done)
+        asked.extend((job[1], job[2]) for job in jobs)
+        return [found.get((job[1], job[2]), Alignment(None, refusal="too few")) for job in jobs]
+
+    report = merged(maps, tmp_path, answered, poses={})
+    assert asked == [(a, b), (a, c), (b, c)], "no pair twice, and none of maps whose places are unknown"
+    np.testing.assert_allclose(report.manifest.sources[2].T_world_map, POSES["b"] @ T_b_c)
+    assert [source.placed for source in report.manifest.sources] == ["first", "found", "found"]
+    assert report.notes[2] == "c: 4 of 9 places found in b"
+
+
+def _rows(T: Float64) -> Any:
+    return tuple(tuple(row) for row in T.tolist())
+
+
 def test_poses_are_read_from_text_and_json(tmp_path: Path) -> None:
     path = tmp_path / "poses"
     path.write_text("# name x y z yaw\na 0 0 0 0\n\nb 1 2 3 90  # the east wing\n")
@@ -297,18 +323,18 @@ def test_maps_find_where_they_lie(seen_maps: tuple[list[str], list[Float64]], tm
 @pytest.mark.slow
 def test_workers_of_ray_give_the_same_bytes(maps: list[str], tmp_path: Path) -> None:
     merged(maps, tmp_path / "one")
-    with connected("local"):
-        merged(maps, tmp_path / "other", run_on_ray())
+    with connected("local") as cluster:
+        merged(maps, tmp_path / "other", run_on_ray(cluster))
         with pytest.raises(MapError, match="b: where it lies is not known"):
-            merged(maps, tmp_path / "third", run_on_ray(1), poses={"a": np.eye(4), "c": POSES["c"]})
+            merged(maps, tmp_path / "third", run_on_ray(cluster, 1), poses={"a": np.eye(4), "c": POSES["c"]})
     assert content(tmp_path / "one") == content(tmp_path / "other")
 
 
 KILLED = """
 import sys
 from tests.nodes.fleet.test_merge import POSES, frame_progress, connected, run_on_ray, merge_maps, Store, EDGE
-with connected("local"):
-    merge_maps(sys.argv[2:], Store(sys.argv[1], create=True), POSES, run_on_ray(), frame_progress, EDGE)
+with connected("local") as cluster:
+    merge_maps(sys.argv[2:], Store(sys.argv[1], create=True), POSES, run_on_ray(cluster), frame_progress, EDGE)
 """
 
 
