@@ -91,6 +91,10 @@ def run(
         float,
         typer.Option(metavar="GB", min=0.0, help="Disk that tasks of a machine may take together; 0 = what is free."),
     ] = 0.0,
+    timeout: Annotated[
+        float,
+        typer.Option(metavar="HOURS", min=0.0, help="A log that takes longer has failed; 0 = none.  [default: 0]"),
+    ] = 0.0,
     retry_quarantined: Annotated[
         bool, typer.Option("--retry-quarantined", help="Also try logs that failed in an earlier run.")
     ] = False,
@@ -120,7 +124,7 @@ def run(
     store = open_store(out)
     assignments = [*(("render.device=cuda",) if gpus and kind.rest == "mapper" else ()), *(settings or ())]
     template = make_template(operation.value, store, weights, assignments, config, round(worker_disk * 1e9))
-    resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9), max_parallel)
+    resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9), max_parallel, timeout * 3600)
     with (
         StopRequest() as stop,
         connected(ray, trusted_network=trusted_network) as cluster,

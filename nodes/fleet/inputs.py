@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -63,10 +64,13 @@ def _expand(argument: str, suffix: str) -> Iterator[LogInput]:
         yield from _read_manifest(argument)
         return
     fs, path = split_url(argument)
-    if not any(letter in path for letter in "*?["):
-        if not is_url(argument) and not persistently(lambda: fs.exists(path), argument):
+    if not is_url(argument) and os.path.exists(path):  # letters of globs may stand in names
+        yield LogInput(path)
+        return
+    if not any(letter in path for letter in "*?[") or argument.startswith(("http://", "https://")):
+        if not is_url(argument):
             raise ConfigError(f"{argument}: no such log; give a path, a URL, a glob or a manifest")
-        yield LogInput(_absolute(argument))
+        yield LogInput(argument)
         return
     folders = argument.endswith("/")
     matches: dict[str, dict[str, Any]] = persistently(lambda: fs.glob(path, detail=True), shown(argument))

@@ -85,12 +85,15 @@ class Resources:
         cpus, gpus: Also fractions.
         memory_bytes: Of its node.
         max_parallel: Tasks at a time; 0 = what the cluster has room for.
+        timeout_s: A task that is not done after so long, with its wait in the cluster's queue, is ended and counts as
+            failed; 0 = none.
     """
 
     cpus: float = 1.0
     gpus: float = 0.0
     memory_bytes: int = 2 << 30
     max_parallel: int = 0
+    timeout_s: float = 0.0
 
 
 @dataclass(slots=True)
@@ -102,6 +105,8 @@ class _Try:
     failures: int = 0
     crashes: int = 0
     lost: int = 0
+    since: float = 0.0  # handed to Ray
+    too_long: bool = False
 
 
 class FleetRun:
@@ -193,6 +198,7 @@ class FleetRun:
                     ended = "done"
                     break
                 self._collect()
+                self._end_slow()
                 on_progress(self._updated())
                 if time.monotonic() - reported > REPORT_S:
                     self._report()
@@ -231,6 +237,7 @@ class FleetRun:
     def _submit(self, remote: Any) -> None:
         room = self._room()
         while len(self._running) < room and (attempt := self._next()) is not None:
+            attempt.since, attempt.too_long = time.monotonic(), False
             self._running[remote.remote(attempt.task)] = attempt
 
     def _next(self) -> _Try | None:
@@ -258,6 +265,16 @@ class FleetRun:
             for reference in more:
                 self._take(reference, self._running.pop(reference))
 
+    def _end_slow(self) -> None:
+        """End what takes longer than allowed; it comes back as a process that died."""
+        import ray
+
+        timeout_s = self._resources.timeout_s
+        for reference, attempt in self._running.items() if timeout_s else ():
+            if not attempt.too_long and time.monotonic() - attempt.since > timeout_s:
+                attempt.too_long = True
+                ray.cancel(reference, force=True)
+
     def _take(self, reference: Any, attempt: _Try) -> None:
         import ray
         from ray import exceptions
@@ -266,12 +283,18 @@ class FleetRun:
             outcome: Outcome = ray.get(reference)
         except exceptions.RayTaskError as error:
             self._failed(attempt, error.cause, str(error.cause))
-        except exceptions.NodeDiedError as error:
-            self._lost(attempt, str(error))
-        except (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError) as error:
-            attempt.crashes += 1
-            self._again(attempt, f"the process died: {error}", attempt.crashes >= CRASHES)
-        except exceptions.RayError as error:  # the answer is lost, or the cluster in trouble: not the log's fault
+        except (exceptions.WorkerCrashedError, exceptions.TaskCancelledError) as error:
+            if attempt.too_long:
+                attempt.failures += 1
+                error_s = f"took longer than {self._resources.timeout_s:g} s"
+                self._again(attempt, error_s, attempt.failures >= FAILURES)
+            else:
+                self._died(attempt, error)
+        except exceptions.OutOfMemoryError as error:
+            self._died(attempt, error)
+        except (
+            exceptions.RayError
+        ) as error:  # a node died, the answer is lost, or the cluster in trouble: not the log's fault
             self._lost(attempt, f"{type(error).__name__}: {error}")
         else:
             self._store_failures = 0
@@ -290,6 +313,10 @@ class FleetRun:
             return
         attempt.failures += 1
         self._again(attempt, f"{type(cause).__name__}: {text}", attempt.failures >= FAILURES)
+
+    def _died(self, attempt: _Try, error: BaseException) -> None:
+        attempt.crashes += 1
+        self._again(attempt, f"the process died: {error}", attempt.crashes >= CRASHES)
 
     def _lost(self, attempt: _Try, text: str) -> None:
         attempt.lost += 1

@@ -227,6 +227,9 @@ class Store:
     def commit(self, result: TaskResult) -> bool:
         """Make a result count; False where another attempt has been quicker, and this one's files are removed."""
         if self.create(f"results/{result.key}/{RESULT_FILE}", encode_document(result)):
+            for name in self.names(f"results/{result.key}"):
+                if name != RESULT_FILE and f"results/{result.key}/{name}" != result.folder:
+                    self.remove(f"results/{result.key}/{name}", folder=True)  # of attempts that were killed
             return True
         winner = self.result(result.key)
         if winner is not None and winner.folder == result.folder:

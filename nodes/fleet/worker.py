@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 import msgspec
 import structlog
@@ -244,7 +245,8 @@ def _fetch(url: str, files: list[_File], folder: Path, *, local: bool) -> tuple[
         return path, _joined(digests)
     target = folder / "log"
     target.mkdir()
-    fetched = [(target / Path(file.url).name, _download(file, target / Path(file.url).name)) for file in files]
+    paths = [target / Path(urlsplit(file.url).path).name for file in files]  # without what signs it
+    fetched = [(path, _download(file, path)) for file, path in zip(files, paths, strict=True)]
     path = target if len(fetched) > 1 else fetched[0][0]
     return path, _joined([digest for _, digest in fetched])
 

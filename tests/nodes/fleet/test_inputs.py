@@ -26,6 +26,16 @@ def test_a_glob_with_a_slash_takes_folders(logs: Path) -> None:
     assert [Path(i.url).name for i in find_inputs([f"{logs}/*/"], ".mcap")] == ["run", "run2"]
 
 
+def test_a_name_with_letters_of_globs_is_a_name(logs: Path) -> None:
+    (logs / "a[1].mcap").write_bytes(b"log")
+    assert [Path(i.url).name for i in find_inputs([f"{logs}/a[1].mcap"], ".mcap")] == ["a[1].mcap"]
+
+
+def test_a_signed_url_is_no_glob() -> None:
+    (found,) = find_inputs(["https://host/a.mcap?X-Amz-Signature=1"], ".mcap")
+    assert found.url == "https://host/a.mcap?X-Amz-Signature=1"
+
+
 def test_a_log_that_is_named_twice_is_taken_once(logs: Path) -> None:
     assert len(find_inputs([f"{logs}/a.mcap", f"{logs}/*.mcap"], ".mcap")) == 2
 

@@ -121,6 +121,15 @@ def test_a_stop_ends_tasks_at_once_and_says_so(store: Store, cluster: Cluster, t
     assert again.done == 1 and time.monotonic() - began < 250  # far less than a task that still slept
 
 
+def test_a_log_that_takes_too_long_is_quarantined(store: Store, cluster: Cluster, tmp_path: Path) -> None:
+    resources = Resources(cpus=1.0, memory_bytes=1 << 20, timeout_s=3.0)
+    status = run_fleet(store, cluster, tasks.sleep_long, ["slow"], tmp_path / "traces", resources=resources)
+    assert (status.done, status.failed) == (0, 1)
+    assert names(tmp_path / "traces") == ["slow.1", "slow.2"]
+    (failure,) = store.failures()
+    assert failure.errors == ("took longer than 3 s",) * 2
+
+
 @pytest.mark.parametrize("max_parallel", [0, 1])
 def test_no_more_run_at_a_time_than_allowed(store: Store, cluster: Cluster, tmp_path: Path, max_parallel: int) -> None:
     resources = Resources(cpus=0.25, memory_bytes=1 << 20, max_parallel=max_parallel)

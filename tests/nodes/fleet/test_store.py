@@ -52,6 +52,13 @@ def test_a_commit_whose_answer_was_lost_counts(store: Store) -> None:
     assert store.exists("results/k/one/map.npz")
 
 
+def test_what_killed_attempts_have_left_goes_with_the_next_result(store: Store) -> None:
+    store.write("results/k/killed/map.npz", b"half")
+    store.write("results/k/one/map.npz", b"one")
+    assert store.commit(made_result("k", "one"))
+    assert store.names("results/k") == ["one", "result.json"]
+
+
 def test_of_many_writers_at_once_one_commits(store: Store) -> None:
     barrier = threading.Barrier(16)
     made: list[bool] = []
