@@ -34,6 +34,7 @@ _AUTO = "auto"
 _CLIENT_SCHEME = "ray://"
 _CONNECT_TIMEOUT_S = 5.0
 _JOIN_TIMEOUT_S = 40.0
+_EMBEDDED_TRIES = 4
 _END_TIMEOUT_S = 10.0
 # The fleet's tasks read and write files, and pass small values. Ray takes at least 75 MiB, and falls back to files in
 # its folder where /dev/shm is smaller, as in containers.
@@ -153,6 +154,7 @@ def _embedded(ray: Any, cpus: int | None, *, worker_logs: bool) -> Iterator[Clus
         _init(
             ray,
             "the embedded Ray cluster",
+            tries=_EMBEDDED_TRIES,
             address=LOCAL,
             num_cpus=cpus if cpus is not None else len(os.sched_getaffinity(0)),
             include_dashboard=False,
@@ -188,17 +190,40 @@ def _joined(ray: Any, address: str, *, trusted_network: bool, worker_logs: bool)
         yield replace(cluster, trusted_network=is_trusted)
 
 
-def _init(ray: Any, what: str, **arguments: Any) -> None:
-    """``ray.init``, with its many errors as one, and without its handler of SIGTERM where the program has its own."""
+def _init(ray: Any, what: str, tries: int = 1, **arguments: Any) -> None:
+    """``ray.init``, with its many errors as one, and without its handler of SIGTERM where the program has its own.
+
+    Ray gives a node 30 s to start, which are too few where much else runs: it is started up to ``tries`` times.
+    """
     is_main = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        ray.init(configure_logging=True, logging_level=logging.ERROR, **arguments)
+        while not _started(ray, arguments, is_last=tries <= 1):
+            tries -= 1
     except (ConnectionError, OSError, RuntimeError, TimeoutError, ValueError, ray.exceptions.RayError) as error:
         raise FleetError(f"{what} cannot be used: {_reason(str(error)) or type(error).__name__}") from error
     finally:
         if is_main and handler not in (signal.SIG_DFL, None):
             signal.signal(signal.SIGTERM, handler)
+
+
+def _started(ray: Any, arguments: Mapping[str, Any], *, is_last: bool) -> bool:
+    """Whether Ray has started in time.
+
+    Raises:
+        RuntimeError: It has not, and this was the last try.
+    """
+    try:
+        ray.init(configure_logging=True, logging_level=logging.ERROR, **arguments)
+    except Exception as error:  # Ray raises this very class for a node that is late
+        if "timed out during startup" not in str(error):
+            raise
+        ray.shutdown()
+        if is_last:
+            raise RuntimeError("it did not start in time; the machine may have too much else to do") from error
+        _log.warning("ray_slow_to_start")
+        return False
+    return True
 
 
 def _probe(address: str, *, is_near: bool) -> None:
