@@ -61,3 +61,11 @@ class CameraError(SemanticMapperError, OSError):
 
 class NodeError(SemanticMapperError, RuntimeError):
     """A node process could not start, or ended when it should not have."""
+
+
+class StoreError(SemanticMapperError, OSError):
+    """A store of results, or an object in it, cannot be reached, read or written."""
+
+
+class FleetError(SemanticMapperError, RuntimeError):
+    """A cluster cannot be started or joined, or does not run what it was given."""

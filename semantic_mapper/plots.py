@@ -289,6 +289,80 @@ def _value(value: float) -> str:
     return f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
+@dataclass(frozen=True, slots=True)
+class Histogram:
+    """How often which values occur.
+
+    Args:
+        title: Above it.
+        x_label: Of the axis, with the unit.
+        values: (N,), N > 0.
+    """
+
+    title: str
+    x_label: str
+    values: Float64
+
+
+@rendered
+def draw_histograms(histograms: Sequence[Histogram], columns: int = 3, size: tuple[int, int] = (400, 280)) -> Figure:
+    """Histograms beside and below each other, each with its median as a line."""
+    from matplotlib.ticker import MaxNLocator
+
+    columns = min(columns, len(histograms))
+    rows = -(-len(histograms) // columns)
+    figure = new_figure(columns * size[0], rows * size[1], 1.25, layout="constrained")
+    for number, histogram in enumerate(histograms, 1):
+        axes = figure.add_subplot(rows, columns, number)
+        values = histogram.values[np.isfinite(histogram.values)]
+        low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+        if high - low < 1e-9 * max(abs(high), 1e-300):  # all the same: one bar
+            low, high = low - 0.5 * (abs(low) or 1.0), high + 0.5 * (abs(high) or 1.0)
+        bins = min(max(round(2 * np.sqrt(len(values))), 5), 40)
+        axes.hist(values, bins=bins, range=(low, high), color=_hex(GOOD))
+        if len(values):
+            middle = float(np.median(values))
+            axes.axvline(middle, color=_hex(WARN), linewidth=1.5, label=f"median {middle:.4g}")
+            axes.legend(loc="best")
+        axes.set(title=cut(histogram.title, size[0] - 60, TEXT_PT), xlabel=histogram.x_label, ylabel="logs")
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
+
+
+@dataclass(frozen=True, slots=True)
+class PercentileBox:
+    """Five percentiles of some values: 5, 25, 50, 75 and 95; ``count`` says how many values there were."""
+
+    name: str
+    percentiles: tuple[float, float, float, float, float]
+    count: int
+
+
+@rendered
+def draw_boxes(title: str, boxes: Sequence[PercentileBox], x_label: str) -> Figure:
+    """Boxes below each other: quartiles and median, whiskers from the 5th to the 95th percentile."""
+    figure = new_figure(1000, 30 * len(boxes) + (130 if title else 84), 1.25, layout="constrained")
+    if title:
+        figure.suptitle(cut(title, 970, TITLE_PT, "bold"), x=0.012, ha="left")
+    axes = figure.add_subplot()
+    places = np.arange(len(boxes))
+    low, first, middle, third, high = np.array([box.percentiles for box in boxes], np.float64).T
+    axes.hlines(places, low, high, color=_hex(DIM_TEXT), linewidth=1.5, zorder=1.5)
+    axes.barh(places, third - first, 0.6, first, color=_hex(GOOD), zorder=2)
+    axes.vlines(middle, places - 0.3, places + 0.3, color=_hex(BACKGROUND), linewidth=2.5, zorder=3)
+    reach = max(float(high.max() - low.min()), 1e-9)
+    for place, box in enumerate(boxes):
+        end = float(high.max()) + 0.02 * reach
+        text = f"{box.percentiles[2]:.4g}  n = {box.count}"
+        axes.text(end, place, text, va="center", fontsize=SMALL_PT, color=_hex(DIM_TEXT))
+    axes.set_yticks(places, [cut(box.name, 260, TEXT_PT) for box in boxes], fontsize=TEXT_PT, color=_hex(TEXT))
+    axes.set(xlabel=x_label, ylim=(len(boxes) - 0.4, -0.6))
+    axes.set_xlim(float(low.min()) - 0.03 * reach, float(high.max()) + 0.2 * reach)
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", length=0)
+    return figure
+
+
 @rendered
 def draw_paths(title: str, paths: Mapping[str, Float64], up: Float64) -> Figure:
     """Paths from above, at one scale both ways; a dot marks where each begins.

@@ -14,6 +14,8 @@ from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb, 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from semantic_mapper.config import MapperConfig
+
 BASELINE_SECONDS = 300.0
 
 TargetsArgument = Annotated[
@@ -106,7 +108,10 @@ def evaluate(
     if baselines and seconds == 0:
         raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
     baseline_s = BASELINE_SECONDS if seconds is None else seconds
-    options = _single(weights), baselines, baseline_s, max_frames, config, seed or 0, instances
+    from semantic_mapper.nodes.cli.run_replay import mapper_config
+
+    mapper = mapper_config(config, None, seed or 0)
+    options = _single(weights), baselines, baseline_s, max_frames, mapper, seed or 0, instances
     return _evaluate_targets(targets or [], options, mesh, out, print_json=print_json)
 
 
@@ -118,7 +123,7 @@ def _single(weights: list[Path] | None) -> Path | None:
 
 def _evaluate_targets(
     targets: list[Path],
-    options: tuple[Path | None, bool, float, int, Path | None, int, Path | None],
+    options: tuple[Path | None, bool, float, int, MapperConfig, int, Path | None],
     mesh: Path | None,
     json_file: Path | None,
     *,

@@ -20,6 +20,7 @@ from semantic_mapper.nodes.cli import doctor as cli_doctor
 from semantic_mapper.nodes.cli import eval as cli_eval
 from semantic_mapper.nodes.cli import export as cli_export
 from semantic_mapper.nodes.cli import finetune as cli_finetune
+from semantic_mapper.nodes.cli import fleet as cli_fleet
 from semantic_mapper.nodes.cli import keys as cli_keys
 from semantic_mapper.nodes.cli import label as cli_label
 from semantic_mapper.nodes.cli import launch as cli_launch
@@ -72,8 +73,10 @@ for _function in (
 ):
     app.command(_function.__name__.rstrip("_"))(_function)
 
+app.add_typer(cli_fleet.app, name="fleet")
 app.add_typer(cli_keys.app, name="keys")
 app.add_typer(cli_launch.app, name="launch")
+app.add_typer(cli_fleet.app, name="fleet")
 
 app.command("eval", cls=JsonCommand)(cli_eval.evaluate)
 # Coordinates below 0 look like options.

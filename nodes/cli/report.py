@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from rich.style import Style
 from rich.table import Table
+from rich.text import Text
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.overview import ELEVATION, LabelledPoints, draw_strip
@@ -50,6 +53,23 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
+class Card:
+    """One of several things beside each other.
+
+    Args:
+        title: Its name.
+        link: Where it leads; empty = nowhere. See ``linked`` for what may be a link.
+        picture: None = no picture.
+        lines: Short texts below.
+    """
+
+    title: str
+    link: str = ""
+    picture: Picture | None = None
+    lines: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Section:
     """A part of a page; what it has stands in this order.
 
@@ -57,7 +77,8 @@ class Section:
         heading: None of its own where empty.
         notes: Paragraphs that the reader must not miss.
         view: What ``point_view`` returns; at most once a page.
-        pictures, tables: The tables are those that the console shows.
+        pictures, tables: The tables are those that the console shows; cells may be ``linked`` texts.
+        cards: Beside each other.
         lines: Paragraphs.
         folded: Texts that a click unfolds, by their heads.
     """
@@ -66,6 +87,7 @@ class Section:
     notes: Sequence[str] = ()
     view: Mapping[str, Any] | None = None
     pictures: Sequence[Picture] = ()
+    cards: Sequence[Card] = ()
     tables: Sequence[Table] = ()
     lines: Sequence[str] = ()
     folded: Mapping[str, str] = field(default_factory=dict)
@@ -109,12 +131,33 @@ def _plain(section: Section) -> dict[str, Any]:
             "title": str(table.title or ""),
             "heads": [str(column.header) for column in table.columns],
             "right": [column.justify == "right" for column in table.columns],
-            "rows": list(zip(*(column.cells for column in table.columns), strict=True)),
+            "rows": [[_cell(cell) for cell in row] for row in zip(*(c.cells for c in table.columns), strict=True)],
             "sections": [number for number, row in enumerate(table.rows, 1) if row.end_section],
         }
         for table in section.tables
     ]
     return {**{name: getattr(section, name) for name in Section.__slots__}, "tables": tables}
+
+
+def _cell(cell: Any) -> dict[str, str]:
+    style = cell.style if isinstance(cell, Text) else ""
+    return {"text": str(cell), "link": style.link or "" if isinstance(style, Style) else ""}
+
+
+def linked(text: str, link: str) -> Text:
+    """A cell of a table that leads somewhere; the page itself fetches nothing.
+
+    Args:
+        text: What is shown.
+        link: A relative path, or a URL of http or https; anything else is left out. Empty = nowhere.
+    """
+    return Text(text, style=Style(link=safe_link(link) or None))
+
+
+def safe_link(link: str) -> str:
+    """The link, or nothing where it would run a program or open something other than a page."""
+    scheme = re.match(r"[^/?#]*:", link)
+    return link if scheme is None or scheme.group().lower() in ("http:", "https:") else ""
 
 
 def picture(pixels: UInt8, caption: str, *, photo: bool = False) -> Picture:
@@ -183,7 +226,7 @@ def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
 
 
-def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+def table_of(heads: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> Table:
     """A plain table."""
     table = Table(*heads)
     for row in rows:

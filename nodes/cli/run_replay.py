@@ -84,6 +84,13 @@ def replay_log(
         LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
         ImportSourceError: the corrections cannot be read.
     """
+    return replay_session(request, stop, on_start, on_frame)[0]
+
+
+def replay_session(
+    request: ReplayRequest, stop: StopRequest, on_start: Callable[[int], None], on_frame: Callable[[int], None]
+) -> tuple[dict[str, Any], MapSession]:
+    """``replay_log``, and the session that its summary is of."""
     trajectory = read_corrections(request.corrections) if request.corrections else None
     exclude = load_checkpoint(request.exclude).train_stamps_ns if request.exclude else frozenset[int]()
     with hold_folder(request.out), open_log((request.log, *request.further_parts)) as log:
@@ -118,7 +125,7 @@ def replay_log(
         reason = summary["map"]["nearly_empty"] or "no frame has depth or finds a source view"
         reason = session.refusals.first[0].reason if session.refusals else reason
         raise LogError(f"{request.log}: none of {counted(done, 'frame')} could be mapped; the first: {reason}")
-    return summary
+    return summary, session
 
 
 def _map_frames(session: MapSession, log: Log, total: int, stop: StopRequest, on_frame: Callable[[int], None]) -> int:

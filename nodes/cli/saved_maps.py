@@ -13,6 +13,8 @@ from semantic_mapper.types import Float64
 MAP_NAME = "map.npz"
 MAP_SUFFIX = ".npz"
 LOG_SUFFIX = ".mcap"
+TILES_NAME = "tiles.json"
+SOCKETS = ("ipc", "tcp")  # schemes of running mappers
 
 
 def map_path(path: Path) -> Path:
@@ -32,6 +34,8 @@ def map_path(path: Path) -> Path:
 
 def _instead_of_map(folder: Path) -> str:
     """What to do about a folder without a map, from what is in it."""
+    if holds_tiles(str(folder)):
+        return "it holds a map in tiles, which `query` and `export` read"
     maps = sorted(file.name for file in folder.glob(f"*{MAP_SUFFIX}"))
     if maps:
         return f"name the map itself, such as {folder / maps[0]}"
@@ -41,6 +45,12 @@ def _instead_of_map(folder: Path) -> str:
     if is_log(folder):
         return f"its logs hold frames: `semantic-mapper replay {folder} --out FOLDER` makes a map of them"
     return "give a saved map or a folder that `replay` has written"
+
+
+def holds_tiles(source: str) -> bool:
+    """Whether a map in tiles is meant, as `fleet merge` writes it: a folder with their manifest, or a URL of files."""
+    scheme, found, _ = source.partition("://")
+    return scheme not in SOCKETS if found else (Path(source) / TILES_NAME).is_file()
 
 
 def refuse_overwriting(out: Path, *sources: Path) -> None:

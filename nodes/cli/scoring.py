@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,11 @@ from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.nodes.cli.console import frame_progress
-from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.cli.summary_table import percent
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.evaluate.methods import (
+    Evaluation,
     baseline_predictors,
     evaluate_frames,
     field_predictors,
@@ -41,7 +41,7 @@ class ScoreRequest:
     baselines: bool
     seconds: float
     max_frames: int
-    config: Path | None
+    config: MapperConfig
     seed: int
     instances: Path | None = None
 
@@ -56,12 +56,21 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
     Raises:
         LogError, LabelError, WeightsError: nothing can be scored.
     """
+    return evaluate_log(request)[0]
+
+
+def evaluate_log(request: ScoreRequest) -> tuple[dict[str, Any], Evaluation]:
+    """``score_log``, and what it was made of.
+
+    Raises:
+        LogError, LabelError, WeightsError: nothing can be scored.
+    """
     with open_log(request.log) as log:
         stream_labels = log.info.label_set
         if stream_labels is None:
             raise LabelError(f"{request.log}: has no label images to score against")
         check_scorable(log)
-        bundle = Mapper.load(request.weights, _frame_by_frame(mapper_config(request.config, None, request.seed)))
+        bundle = Mapper.load(request.weights, _frame_by_frame(request.config))
         if not bundle.checkpoint.model.knows_classes:
             raise WeightsError(
                 f"{bundle.weights_path}: a field of kind '{bundle.checkpoint.model.kind}' knows no classes, so that "
@@ -100,11 +109,11 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         model, recipe = bundle.checkpoint.model, bundle.checkpoint.recipe
         shortfall = explain_shortfall(model.kind, found.methods, recipe)
         return {
-            **asdict(found),
+            **found.plain(),
             "damaged": len(log.errors),
             "weights": bundle.weights_path.name,
             "notes": list(shortfall),
-        }
+        }, found
 
 
 def check_scorable(log: Log) -> None:

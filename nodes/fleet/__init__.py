@@ -1,1 +1,1 @@
-"""Work on many machines, through Ray."""
+"""Operations over many logs, on one machine or a Ray cluster, with results in a store."""

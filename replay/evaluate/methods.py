@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -14,8 +14,9 @@ from torch.nn import functional
 
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import FrameError, LabelError
-from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix
+from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, confusion_of
 from semantic_mapper.evaluation.panoptic import PanopticImage
+from semantic_mapper.evaluation.segments import Segments
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
@@ -68,6 +69,12 @@ class Evaluation:
     excluded: int
     refused: int
     pseudo_labelled: int = 0
+    segments: Mapping[str, Segments] = field(default_factory=dict[str, Segments])  # by method, but for that of the map
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data, without ``segments``."""
+        names = ("methods", "scored", "excluded", "refused", "pseudo_labelled")
+        return {name: getattr(self, name) for name in names}
 
 
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
@@ -155,6 +162,7 @@ def evaluate_frames(
     truth_mapper = TruthMapper(stream_labels, label_set)
     confusions = {name: ConfusionMatrix(label_set) for name in predictors}
     confidences = {name: ConfidenceScores() for name in predictors}
+    segments = {name: Segments(label_set) for name in predictors}
     scored = excluded = refused = pseudo = 0
     for index, frame in enumerate(frames):
         where = f"frame seq={frame.seq}"
@@ -175,7 +183,9 @@ def evaluate_frames(
                 labelled = frame.label != stream_labels.ignore_id
                 strange = labelled & (truth == label_set.ignore_id)
                 for name, opinion in predicted.items():
-                    confusions[name].update(truth, opinion.label, where)
+                    image = confusion_of(truth, opinion.label, label_set, where)
+                    confusions[name] += image
+                    segments[name].add(image)
                     if opinion.confidence is not None:
                         correct = opinion.label[labelled] == truth[labelled]
                         confidences[name].update(opinion.confidence[labelled], correct, strange[labelled])
@@ -206,7 +216,7 @@ def evaluate_frames(
         methods[SEEN] = {**panoptic.score(voxel_map)}
         for name, figures in panoptic.score_methods().items():
             methods[name] |= figures
-    return Evaluation(methods, scored, excluded, refused, pseudo)
+    return Evaluation(methods, scored, excluded, refused, pseudo, segments)
 
 
 def _panoptic(tell: ThingTeller, frame: PosedFrame, opinion: Opinion) -> PanopticImage:

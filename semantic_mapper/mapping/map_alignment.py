@@ -61,15 +61,19 @@ def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
             raise MapError(_nothing_to_find(which))
 
 
-def _nothing_to_find(which: str) -> str:
+def _nothing_to_find(which: str, way_out: str = _WAY_OUT) -> str:
     return (
         f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without depth, by an "
-        f"older release, or with keyframes.save_places = false). {_WAY_OUT}"
+        f"older release, or with keyframes.save_places = false). {way_out}"
     )
 
 
-def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
+def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT) -> MapAlignment:
     """Where another map lies in this one.
+
+    Args:
+        voxel_map, other: Are read.
+        way_out: What errors advise where it cannot be found.
 
     Raises:
         MapError: the maps do not fit each other, nothing can be told, or not for sure; says why.
@@ -78,7 +82,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
         if not len(one.places):
-            raise MapError(_nothing_to_find(which))
+            raise MapError(_nothing_to_find(which, way_out))
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
     seen = []
@@ -94,7 +98,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
         told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         raise MapError(
             f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
-            f"first ({told or 'none was refused'}), and {consensus.refusal}. {_WAY_OUT}"
+            f"first ({told or 'none was refused'}), and {consensus.refusal}. {way_out}"
         )
     return MapAlignment(agreed(consensus.agreeing), len(consensus.agreeing), len(chosen))
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
@@ -24,7 +24,7 @@ from semantic_mapper.queries.components import Components, components_of, find_c
 from semantic_mapper.queries.oriented_box import OrientedBox, upright_box
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
-from semantic_mapper.types import Float64, Int32, Int64
+from semantic_mapper.types import Bool, Float64, Int32, Int64
 
 MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
 SURE_VOXELS = 200  # smaller things are wrong more often
@@ -162,7 +162,18 @@ class InstanceTracker:
             row = np.repeat(np.arange(len(surface.packed)), np.diff(surface.start))
             parts = np.split(found.order, found.ends[:-1]) if len(ids) else []
             things = tuple(
-                last.things[kept] if last and kept >= 0 else self._describe(snapshot, surface, row, part, int(number))
+                last.things[kept]
+                if last and kept >= 0
+                else describe_thing(
+                    int(number),
+                    snapshot.label_set,
+                    snapshot.voxel_size_m,
+                    self._up,
+                    surface,
+                    row,
+                    part,
+                    snapshot.measured(snapshot.slots[row[part]].astype(np.int64), surface.voxel[part].astype(np.int64)),
+                )
                 for part, number, kept in zip(parts, ids, same, strict=True)
             )
             self._last = _Found(surface, found, ids, sizes, things)
@@ -227,30 +238,43 @@ class InstanceTracker:
             most = size if known is None or 2 * size < known.most_voxels else max(size, known.most_voxels)
             self._whole[thing.id] = self._going.get(thing.id) or _Whole(thing, snapshot.version, most)
 
-    def _describe(
-        self,
-        snapshot: MapSnapshot,
-        surface: ClassSurface,
-        row: NDArray[np.int64],
-        part: NDArray[np.int64],
-        number: int,
-    ) -> Instance:
-        """The thing with the voxels ``part``; ``row`` (N,) of the block of each of all voxels."""
-        voxel, class_id = surface.voxel[part], int(surface.label[part[0]])
-        xyz = surface.point[part] * snapshot.voxel_size_m
-        confidence = surface.confidence[part].mean(dtype=np.float64) / CONFIDENCE_STEPS
-        within = np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
-        labels = snapshot.label_set
-        return Instance(
-            number,
-            class_id,
-            labels.names[labels.ids.index(class_id)],
-            float(confidence),
-            xyz.mean(axis=0),
-            upright_box(xyz, self._up),
-            unpack_keys(surface.packed[row[part]]) * 8 + within,
-            float(snapshot.measured(snapshot.slots[row[part]].astype(np.int64), voxel.astype(np.int64)).mean()),
-        )
+
+def describe_thing(
+    number: int,
+    labels: LabelSet,
+    voxel_size_m: float,
+    up: Float64,
+    surface: ClassSurface,
+    row: NDArray[np.int64],
+    part: NDArray[np.int64],
+    measured: Bool,
+) -> Instance:
+    """One thing, of some of N surface voxels.
+
+    Args:
+        number: Its id.
+        labels: Of the map.
+        voxel_size_m: Edge of a voxel.
+        up: (3,) unit vector along which its box stands.
+        surface: The N voxels.
+        row: (N,) of the block of each.
+        part: (M,) which of them are the thing.
+        measured: (M,) whether a sensor measured these.
+    """
+    voxel, class_id = surface.voxel[part], int(surface.label[part[0]])
+    xyz = surface.point[part] * voxel_size_m
+    confidence = surface.confidence[part].mean(dtype=np.float64) / CONFIDENCE_STEPS
+    within = np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
+    return Instance(
+        number,
+        class_id,
+        labels.names[labels.ids.index(class_id)],
+        float(confidence),
+        xyz.mean(axis=0),
+        upright_box(xyz, up),
+        unpack_keys(surface.packed[row[part]]) * 8 + within,
+        float(measured.mean()),
+    )
 
 
 def _find_things(snapshot: MapSnapshot, surface: ClassSurface, min_voxels: int) -> Components:

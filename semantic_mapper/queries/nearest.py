@@ -50,10 +50,34 @@ def nearest(
     """
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
+    found = np.array((0.0, 0.0, 0.0, np.inf))
+    return nearer_surface(snapshot, p, class_id, confidence_steps(min_confidence), found)
+
+
+def confidence_steps(min_confidence: float) -> int:
+    """The least stored confidence that is at least ``min_confidence``.
+
+    Raises:
+        MapError: no such confidence.
+    """
     if not 0 <= min_confidence <= 1:
         raise MapError(f"min_confidence must be 0..1, got {min_confidence}")
-    least = int(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
-    found, place = _search(snapshot, p, class_id, least)
+    return int(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
+
+
+def nearer_surface(
+    snapshot: MapSnapshot, p: Float64, class_id: int, least: int, found: Float64
+) -> NearestSurface | None:
+    """A surface point of a class that is nearer than one that is known; ``None`` where there is no such.
+
+    Args:
+        snapshot: The map, or a part of it: its ``packed`` are looked at, its ``index`` knows their neighbours.
+        p: (3,) in units of voxels.
+        class_id: The class.
+        least: Places of less confidence, times 255, do not count.
+        found: (4,) the nearest surface point so far and the square of its distance, in units of voxels; updated.
+    """
+    place = _search(snapshot, p, class_id, least, found)
     if place < 0:
         return None
     confidence = float(snapshot.voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS
@@ -62,25 +86,23 @@ def nearest(
     return NearestSurface(found[:3] * snapshot.voxel_size_m, distance * snapshot.voxel_size_m, confidence, measured)
 
 
-def _search(snapshot: MapSnapshot, p: Float64, class_id: int, least: int) -> tuple[Float64, int]:
-    """The nearest surface point of a class and the square of its distance, (4,) in units of voxels; and slot * 512 +
-    voxel of it, -1 = none.
+def _search(snapshot: MapSnapshot, p: Float64, class_id: int, least: int, found: Float64) -> int:
+    """Slot * 512 + voxel of the nearest surface point of a class, -1 = none is nearer than ``found``, which is updated.
 
     Blocks are gone through in the order of the least distance that their surface may have, until that is more than
     what was found. The first alone leaves few of the others to be put in order.
     """
     rows, bounds = np.empty(snapshot.block_count, np.int64), np.empty(snapshot.block_count)
     count = bound_blocks(p, class_id, snapshot.packed, snapshot.slots, snapshot.voxels.classes, rows, bounds)
-    found = np.array((0.0, 0.0, 0.0, np.inf))
     if count == 0:
-        return found, -1
+        return -1
     rows, bounds = rows[:count], bounds[:count]
     first = np.array([bounds.argmin()])
     place = _search_rows(snapshot, p, class_id, least, rows[first], bounds[first], found)
     left = np.flatnonzero(bounds <= found[3])
     left = left[np.argsort(bounds[left], kind="stable")]
     nearer = _search_rows(snapshot, p, class_id, least, rows[left], bounds[left], found)
-    return found, nearer if nearer >= 0 else place
+    return nearer if nearer >= 0 else place
 
 
 def _search_rows(

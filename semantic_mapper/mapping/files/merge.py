@@ -84,7 +84,24 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
     Raises:
         MapError: the target has no room.
     """
-    pairs = _overlaps(pack_keys(source.all_keys()), T_target_source)
+    pairs = overlaps(pack_keys(source.all_keys()), T_target_source)
+    for packed, added in moved_blocks(source, T_target_source, pairs):
+        add_values(target, packed, added, cap, version)
+
+
+def moved_blocks(
+    source: BlockGrid, T_target_source: VoxelTransform, pairs: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.int64], BlockValues]]:
+    """Blocks of a target with what a source says of them; those without a measurement are left out.
+
+    Args:
+        source: Is read.
+        T_target_source: Where the source lies.
+        pairs: (P, 2) of ``overlaps``: all, or all pairs of some target blocks.
+
+    Yields:
+        Packed keys (B,), sorted, and their values, evidence as float32 sums; at most ``MERGED_AT_ONCE`` at a time.
+    """
     R_source_target = np.ascontiguousarray(T_target_source.R.T)
     for wanted, needed in _parts(pairs):
         grid = source.holding(needed)
@@ -94,10 +111,18 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
         )
         holds = (moved.weight > 0).any(axis=1)  # votes come with weight
         if holds.any():
-            blocks = target.activate(wanted[holds])
-            added = BlockValues(*(part[holds] for part in moved))
-            _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
-            target.mark_changed(blocks, version)
+            yield wanted[holds], BlockValues(*(part[holds] for part in moved))
+
+
+def add_values(target: BlockGrid, packed: NDArray[np.int64], added: BlockValues, cap: float, version: int) -> None:
+    """Add blocks (B,) of ``moved_blocks`` to a grid; see ``add_blocks``.
+
+    Raises:
+        MapError: the target has no room.
+    """
+    blocks = target.activate(packed)
+    _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
+    target.mark_changed(blocks, version)
 
 
 def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
@@ -126,7 +151,7 @@ def count_empty(source: BlockGrid) -> int:
     return empty
 
 
-def _overlaps(sources: NDArray[np.int64], T_target_source: VoxelTransform) -> NDArray[np.int64]:
+def overlaps(sources: NDArray[np.int64], T_target_source: VoxelTransform) -> NDArray[np.int64]:
     """Pairs (P, 2) of packed keys, sorted: a block of the target and a source block that may say something of it."""
     corners = np.array([[x, y, z] for x in (-1, BLOCK_SIDE) for y in (-1, BLOCK_SIDE) for z in (-1, BLOCK_SIDE)])
     ends = (unpack_keys(sources)[:, None] * BLOCK_SIDE + corners) @ T_target_source.R.T + T_target_source.t

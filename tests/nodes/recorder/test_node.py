@@ -291,5 +291,7 @@ def test_parts_are_replayed_as_one_log(weights: Path, config: Path, tmp_path: Pa
     summary = replay_log(request, StopRequest(), lambda count: None, lambda done: None)
     assert summary["frames"]["fused"] == 6 == VoxelMap.load(tmp_path / "out" / "map.npz").frames
     assert is_log(tmp_path) and not is_log(tmp_path / "out")
-    scored = score_log(ScoreRequest(tmp_path, weights, baselines=False, seconds=0, max_frames=5, config=config, seed=0))
+    scored = score_log(
+        ScoreRequest(tmp_path, weights, baselines=False, seconds=0, max_frames=5, config=settings, seed=0)
+    )
     assert scored["scored"] + scored["excluded"] + scored["refused"] == 5  # more than one part holds

@@ -1,0 +1,211 @@
+"""What a fleet costs beside a serial run, and how far one driver goes.
+
+    overhead     tiny logs, one after the other, in one process and by a fleet with one worker: milliseconds a log
+    many         10,000 tiny files through scheduler and store with an operation that only counts bytes: rate, memory
+    workers      replay by one process, by two processes that know nothing of each other, and by a fleet of two workers
+
+Example: python -m benchmarks.fleet_scaling overhead many workers --out runs/fleet-scaling
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import psutil
+
+from benchmarks.fleet_faults import write_logs
+from semantic_mapper.config import Config
+from semantic_mapper.nodes.fleet import operations
+from semantic_mapper.nodes.fleet.cluster import connected
+from semantic_mapper.nodes.fleet.inputs import LogInput, find_inputs
+from semantic_mapper.nodes.fleet.operations import Job, Operation
+from semantic_mapper.nodes.fleet.results import Findings
+from semantic_mapper.nodes.fleet.runner import DriverStatus, FleetRun, Resources
+from semantic_mapper.nodes.fleet.start import make_template
+from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.worker import Outcome, Task, run_task
+
+TINY_LOGS, TINY_FRAMES = 60, 2
+WORKER_LOGS, WORKER_FRAMES = 24, 40
+MANY = 10_000
+REPEATS = 3
+SETTINGS = ("quality=fast", "voxel_map.voxel_size_m=0.05")
+SMALL = Resources(cpus=1.0, memory_bytes=500_000_000)
+
+
+def count_bytes(task: Task) -> Outcome:
+    """``run_task`` with an operation that takes no time; everything else is as always."""
+
+    def run(job: Job) -> Findings:
+        return Findings(metrics={"bytes": float(job.log.stat().st_size)})
+
+    counting = {"replay": Operation(Config, "", run, 0.1)}
+    with patch.object(operations, "OPERATIONS", counting):
+        return run_task(task)
+
+
+def overhead(out: Path) -> dict[str, object]:
+    """Milliseconds that a fleet adds to each log."""
+    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, replay_log
+    from semantic_mapper.nodes.process import StopRequest
+
+    logs = write_logs(out / "tiny", TINY_LOGS, TINY_FRAMES)
+    settings = operations.read_settings("replay", SETTINGS)
+    seconds: dict[str, list[float]] = {"serial": [], "fleet": []}
+    with connected(None, cpus=1) as cluster:
+        for repeat in range(-1, REPEATS):  # the first one loads packages and is not counted
+            shutil.rmtree(out / "serial", ignore_errors=True)
+            began = time.monotonic()
+            for log in logs:
+                request = ReplayRequest(log, out / "serial" / log.stem, None, settings.mapper)  # pyright: ignore[reportAttributeAccessIssue]
+                replay_log(request, StopRequest(), lambda count: None, lambda count: None)
+            serial_s = time.monotonic() - began
+            shutil.rmtree(out / "fleet", ignore_errors=True)
+            store = Store(str(out / "fleet"), create=True)
+            template = make_template("replay", store, None, SETTINGS)
+            inputs = find_inputs([str(log) for log in logs], ".mcap")
+            began = time.monotonic()
+            status = FleetRun(store, template, inputs, SMALL, cluster).run(lambda: False, lambda now: None)
+            fleet_s = time.monotonic() - began
+            assert status.done == len(logs)
+            if repeat >= 0:
+                seconds["serial"].append(serial_s)
+                seconds["fleet"].append(fleet_s)
+    added = [1e3 * (f - s) / len(logs) for s, f in zip(seconds["serial"], seconds["fleet"], strict=True)]
+    return {
+        "logs": len(logs),
+        "serial_ms_a_log": [round(1e3 * s / len(logs), 1) for s in seconds["serial"]],
+        "fleet_ms_a_log": [round(1e3 * s / len(logs), 1) for s in seconds["fleet"]],
+        "added_ms_a_log": round(statistics.median(added), 1),
+    }
+
+
+def many(out: Path) -> dict[str, object]:
+    """10,000 files: rate and memory of the driver."""
+    folder = out / "many"
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(MANY):
+        (folder / f"{number:05}.mcap").write_bytes(f"log {number}".encode())
+    shutil.rmtree(out / "many-store", ignore_errors=True)
+    store = Store(str(out / "many-store"), create=True)
+    template = replace(make_template("replay", store), settings={})
+    driver = psutil.Process()
+    samples: list[tuple[int, float]] = []
+
+    def watch(status: DriverStatus) -> None:
+        over = status.done + status.existing + status.failed
+        if not samples or over >= samples[-1][0] + MANY // 20:
+            samples.append((over, driver.memory_info().rss / 1e6))
+
+    inputs = [LogInput(item.url) for item in find_inputs([f"{folder}/*.mcap"], ".mcap")]
+    with connected(None, cpus=2) as cluster:
+        began = time.monotonic()
+        status = FleetRun(store, template, inputs, SMALL, cluster, function=count_bytes).run(lambda: False, watch)
+        seconds = time.monotonic() - began
+        began = time.monotonic()
+        again = FleetRun(store, template, inputs, SMALL, cluster, function=count_bytes).run(lambda: False, watch)
+        again_s = time.monotonic() - began
+    assert (status.done, again.existing) == (MANY, MANY)
+    first = next(mb for over, mb in samples if over >= MANY // 10)
+    return {
+        "files": MANY,
+        "logs_a_second": round(MANY / seconds, 1),
+        "logs_a_second_when_done": round(MANY / again_s, 1),
+        "driver_mb_after_a_tenth": round(first, 1),
+        "driver_mb_most": round(max(mb for _, mb in samples), 1),
+        "driver_mb": [(over, round(mb, 1)) for over, mb in samples],
+    }
+
+
+def workers(out: Path) -> dict[str, object]:
+    """Rate of two workers as a multiple of that of one process."""
+    logs = write_logs(out / "rooms", WORKER_LOGS, WORKER_FRAMES)
+    rates: dict[str, list[float]] = {"one process": [], "two processes": [], "fleet, two workers": []}
+    with connected(None, cpus=2) as cluster:
+        for repeat in range(-1, REPEATS):
+            found = {
+                "one process": len(logs) / _processes(out, [logs]),
+                "two processes": len(logs) / _processes(out, [logs[::2], logs[1::2]]),
+            }
+            shutil.rmtree(out / "fleet", ignore_errors=True)
+            store = Store(str(out / "fleet"), create=True)
+            template = make_template("replay", store, None, SETTINGS)
+            inputs = find_inputs([str(log) for log in logs], ".mcap")
+            began = time.monotonic()
+            FleetRun(store, template, inputs, SMALL, cluster).run(lambda: False, lambda now: None)
+            found["fleet, two workers"] = len(logs) / (time.monotonic() - began)
+            if repeat >= 0:
+                for name, rate in found.items():
+                    rates[name].append(round(rate, 3))
+    one = statistics.median(rates["one process"])
+    ratios = {f"{name}, of two times one": round(statistics.median(r) / (2 * one), 3) for name, r in rates.items()}
+    return {"logs": len(logs), "logs_a_second": rates, **ratios}
+
+
+def _processes(out: Path, parts: list[list[Path]]) -> float:
+    """Seconds that processes of one thread take, one for each part, once all of them have loaded their packages."""
+    program = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from semantic_mapper.nodes.cli.run_replay import ReplayRequest, replay_log\n"
+        "from semantic_mapper.nodes.fleet.operations import read_settings\n"
+        "from semantic_mapper.nodes.process import StopRequest\n"
+        "settings = read_settings('replay', sys.argv[2].split())\n"
+        "def work(paths):\n"
+        "    for path in map(Path, paths):\n"
+        "        request = ReplayRequest(path, Path(sys.argv[1]) / path.stem, None, settings.mapper)\n"
+        "        replay_log(request, StopRequest(), lambda count: None, lambda count: None)\n"
+        "work(sys.argv[3:4])\n"
+        "print('ready', flush=True)\n"
+        "input()\n"
+        "work(sys.argv[3:])\n"
+    )
+    shutil.rmtree(out / "serial", ignore_errors=True)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", program, str(out / "serial"), " ".join(SETTINGS), *map(str, part)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=environment,
+        )
+        for part in parts
+    ]
+    for process in started:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    began = time.monotonic()
+    for process in started:
+        process.communicate("\n")
+        assert process.returncode == 0
+    return time.monotonic() - began
+
+
+def main() -> None:
+    """Measure the parts that are named."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = {"overhead": overhead, "many": many, "workers": workers}
+    parser.add_argument("parts", nargs="+", choices=parts)
+    parser.add_argument("--out", type=Path, default=Path("runs/fleet-scaling"))
+    arguments = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"
+    for name in arguments.parts:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        found = parts[name](arguments.out)
+        (arguments.out / f"{name}.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        print(name, json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,313 @@
+"""The page of ``fleet report``; its size is bounded, however many logs there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import quote
+
+import cv2
+import numpy as np
+
+from semantic_mapper.errors import ConfigError, StoreError
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.nodes.cli.fleet_results import cell_text
+from semantic_mapper.nodes.cli.report import (
+    REPORT_NAME,
+    Card,
+    Picture,
+    Section,
+    linked,
+    picture,
+    safe_link,
+    table_of,
+    write_page,
+)
+from semantic_mapper.nodes.fleet.compare import lower_is_better
+from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.tables import query
+from semantic_mapper.nodes.fleet.variants import Variant, operations, variants
+from semantic_mapper.plain_text import counted
+from semantic_mapper.plots import Histogram, PercentileBox, draw_boxes, draw_histograms
+from semantic_mapper.types import Float64
+
+WORST = 12  # logs with their pictures
+MAX_LOGS = 200  # rows of the table of logs
+MAX_FAILURES = 50
+MAX_CLASSES = 40
+MAX_VERSIONS = 8
+MAX_KINDS = 20
+MAX_TAG_VALUES = 15
+MAX_HISTOGRAMS = 9
+MAX_ERROR = 2000  # letters
+THUMBNAIL_WIDTH = 360
+MAX_THUMBNAIL_BYTES = 16 * 2**20
+_FIRST = ("miou", "map_miou", "cost_step_ms_p50", "seconds")  # these metrics and costs come first
+_NO_FIGURES = ("log_bytes", "attempts")
+_PERCENTILES = "[0.05, 0.25, 0.5, 0.75, 0.95]"
+
+_log = get_logger(__name__)
+
+
+def write_fleet_report(store: Store, out: Path | None) -> Path:
+    """Write ``report.html`` of all operations of a store.
+
+    Args:
+        store: Whose results.
+        out: Folder for it; None = "report" in a local store, else ``runs/fleet-report``.
+
+    Returns:
+        The page.
+
+    Raises:
+        ConfigError: the store has neither results nor failures, or the page cannot be written.
+        StoreError: the store cannot be reached.
+        DependencyError: DuckDB or pyarrow is missing.
+    """
+    folder = out or (store.local / "report" if store.local else Path("runs/fleet-report"))
+    failed = list(_failures(store))
+    sections = [section for name in operations(store) for section in _operation(store, name, folder)]
+    if not sections and not failed:
+        raise ConfigError(f"{store.shown}: has no results yet; `fleet run` makes them")
+    write_page(folder / REPORT_NAME, f"Fleet {store.shown}", [*failed, *sections])
+    return folder / REPORT_NAME
+
+
+def _failures(store: Store) -> Iterator[Section]:
+    (total,) = query(store, "SELECT count(*) AS n FROM failures")["n"].to_pylist()
+    if not total:
+        return
+    rows = query(
+        store,
+        f"SELECT operation, log, version, attempts, left(error, {MAX_ERROR}) AS error FROM failures "
+        f"ORDER BY finished DESC, log LIMIT {MAX_FAILURES}",
+    ).to_pylist()
+    first = "" if total <= MAX_FAILURES else f", the latest {MAX_FAILURES}"
+    cells = [(r["log"], r["operation"], r["version"], str(r["attempts"]), r["error"].split("\n")[-1]) for r in rows]
+    table = table_of(("log", "operation", "version", "attempts", "error"), cells)
+    yield Section("Logs that were given up", [f"{counted(total, 'log')} failed{first}."], tables=[table])
+
+
+def _operation(store: Store, operation: str, folder: Path) -> Iterator[Section]:
+    """All sections of an operation: its latest variant, and the trend over variants."""
+    found = variants(store, operation)
+    latest = found[0]
+    where = latest.condition(operation)
+    figures = query(store, f"SELECT * FROM logs WHERE {where}")
+    names = _figures(figures)
+    yield Section(f"{operation}: runs", tables=[_variants_table(store, operation, found)])
+    histograms = [Histogram(n, _unit(n), _floats(figures, n)) for n in names[:MAX_HISTOGRAMS]]
+    if histograms:
+        caption = f"Logs of {latest.describe()}: {counted(figures.num_rows, 'log')}"
+        yield Section(f"{operation}: distributions", pictures=[picture(draw_histograms(histograms), caption)])
+    yield from _classes(store, operation, where)
+    metric = next((name for name in names if not name.startswith("cost_") and name != "seconds"), None)
+    if metric is not None:
+        yield from _worst(store, operation, where, metric, folder, names)
+    yield from _events(store, operation, where)
+    if metric is not None:
+        yield from _trend(store, operation, found, metric)
+        yield from _tags(store, operation, where, metric, figures.column_names)
+
+
+def _figures(table: Any) -> list[str]:
+    """Columns of metrics and costs with a value, the most telling first."""
+    import pyarrow as pa
+
+    names = [
+        field.name
+        for field in table.schema
+        if pa.types.is_float64(field.type)
+        and field.name not in _NO_FIGURES
+        and table[field.name].null_count < table.num_rows
+    ]
+    return sorted(names, key=lambda n: (_FIRST.index(n) if n in _FIRST else len(_FIRST), n.startswith("cost_"), n))
+
+
+def _unit(name: str) -> str:
+    """For the axis; figures in 0..1 and counts have none."""
+    for word, unit in (("ms", "milliseconds"), ("mb", "MB"), ("bytes", "bytes"), ("seconds", "seconds")):
+        if word in name.split("_"):
+            return unit
+    return "metres" if name.endswith("_m") else ""
+
+
+def _floats(table: Any, name: str) -> Float64:
+    values = np.asarray(table[name].to_numpy(), np.float64)
+    return values[np.isfinite(values)]
+
+
+def _variants_table(store: Store, operation: str, found: Sequence[Variant]) -> Any:
+    rows = []
+    for variant in found[:MAX_VERSIONS]:
+        (row,) = query(
+            store,
+            "SELECT count(*) AS logs, count(DISTINCT node) AS nodes, sum(seconds) / 3600 AS hours, "
+            f"sum(log_bytes) / 1e9 AS gb, max(finished) AS finished FROM logs WHERE {variant.condition(operation)}",
+        ).to_pylist()
+        times = f"{row['hours']:.2f}", f"{row['gb']:.2f}", str(row["finished"])[:16]
+        rows.append((variant.describe(), str(row["logs"]), str(row["nodes"]), *times))
+    return table_of(("version, weights, settings", "logs", "hosts", "hours", "GB of logs", "finished, UTC"), rows)
+
+
+def _classes(store: Store, operation: str, where: str) -> Iterator[Section]:
+    rows = query(
+        store,
+        f"""
+        SELECT method, name, quantile_cont(iou, {_PERCENTILES}) AS percentiles, count(*) AS n
+        FROM classes WHERE isfinite(iou) AND key IN (SELECT key FROM logs WHERE {where})
+        GROUP BY method, name ORDER BY method, n DESC, name LIMIT {MAX_CLASSES}
+        """,
+    ).to_pylist()
+    methods = {row["method"] for row in rows}
+    boxes = [
+        PercentileBox(
+            row["name"] if len(methods) == 1 else f"{row['name']}: {row['method']}", row["percentiles"], row["n"]
+        )
+        for row in rows
+    ]
+    if boxes:
+        yield Section(f"{operation}: classes", pictures=[_boxes(boxes, "IoU of a class in a log", "IoU of classes")])
+
+
+def _boxes(boxes: Sequence[PercentileBox], x_label: str, what: str) -> Picture:
+    caption = f"{what}: quartiles and median over logs, whiskers from the 5th to the 95th percentile"
+    return picture(draw_boxes("", boxes, x_label), caption)
+
+
+def _worst(
+    store: Store, operation: str, where: str, metric: str, folder: Path, names: Sequence[str]
+) -> Iterator[Section]:
+    order = "DESC" if lower_is_better(metric) else ""
+    shown = list(dict.fromkeys((metric, *names[:5])))
+    columns = ", ".join(f'"{name}"' for name in shown)
+    rows = query(
+        store,
+        f"SELECT key, log, folder, thumbnail, report, weights, {columns} FROM logs WHERE {where} AND "
+        f'isfinite("{metric}") ORDER BY "{metric}" {order}, log LIMIT {MAX_LOGS}',
+    ).to_pylist()
+    (total,) = query(store, f"SELECT count(*) AS n FROM logs WHERE {where}")["n"].to_pylist()
+    cards = [
+        Card(
+            PurePosixPath(row["log"]).name,
+            safe_link(_link(store, row, folder)),
+            _thumbnail(store, row),
+            [f"{name} {cell_text(row[name])}" for name in shown[:3]],
+        )
+        for row in rows[:WORST]
+    ]
+    yield Section(f"{operation}: worst logs by {metric}", cards=cards)
+    table = table_of(
+        ("log", *shown),
+        [(linked(row["log"], _link(store, row, folder)), *(cell_text(row[name]) for name in shown)) for row in rows],
+    )
+    for column in table.columns[1:]:
+        column.justify = "right"
+    lines = [] if total <= len(rows) else [f"{len(rows)} of {counted(total, 'log')}, the worst first."]
+    yield Section(f"{operation}: logs", tables=[table], lines=lines)
+
+
+def _link(store: Store, row: Mapping[str, Any], folder: Path) -> str:
+    """To the page of a log: a relative path for a local store, a URL for one on the web, else nothing."""
+    name = _file_name(row, "report")
+    if not name:
+        return ""
+    if store.local is not None:
+        # "./" keeps a name with a colon from being read as a scheme
+        return "./" + quote(os.path.relpath(store.local.resolve() / name, folder.resolve()))
+    return f"{store.url.rstrip('/')}/{quote(name)}" if store.url.startswith(("http://", "https://")) else ""
+
+
+def _file_name(row: Mapping[str, Any], kind: str) -> str:
+    """Of a file below the store; empty where there is none, or where it would lead out of the store."""
+    if not row[kind]:
+        return ""
+    path = PurePosixPath(row["folder"]) / row[kind]
+    return "" if path.is_absolute() or ".." in path.parts else str(path)
+
+
+def _thumbnail(store: Store, row: Mapping[str, Any]) -> Picture | None:
+    name = _file_name(row, "thumbnail")
+    if not name:
+        return None
+    try:
+        data = store.read(name)
+    except StoreError as error:
+        _log.warning("thumbnail_missing", log=row["log"], error=str(error))
+        return None
+    pixels = None
+    if 0 < len(data) <= MAX_THUMBNAIL_BYTES:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None:
+        _log.warning("thumbnail_damaged", log=row["log"], file=name)
+        return None
+    scale = min(THUMBNAIL_WIDTH / pixels.shape[1], 1.0)
+    small = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return picture(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB), np.uint8), row["log"], photo=True)
+
+
+def _events(store: Store, operation: str, where: str) -> Iterator[Section]:
+    rows = query(
+        store,
+        f"""
+        SELECT kind, count(*) AS n, count(DISTINCT key) AS logs, min(text) AS example
+        FROM events WHERE key IN (SELECT key FROM logs WHERE {where})
+        GROUP BY kind ORDER BY n DESC, kind LIMIT {MAX_KINDS}
+        """,
+    ).to_pylist()
+    if not rows:
+        return
+    cells = [(row["kind"], str(row["n"]), str(row["logs"]), row["example"][:MAX_ERROR]) for row in rows]
+    table = table_of(("kind", "events", "logs", "example"), cells)
+    yield Section(f"{operation}: events", tables=[table])
+
+
+def _trend(store: Store, operation: str, found: Sequence[Variant], metric: str) -> Iterator[Section]:
+    """Over the logs that the latest variants share; those with less than half of the latest one's logs are left out."""
+    latest = found[0].keys.keys()
+    compared = [v for v in found if 2 * len(v.keys.keys() & latest) >= len(latest)][:MAX_VERSIONS]
+    if len(compared) < 2:
+        return
+    text = " OR ".join(variant.condition(operation) for variant in compared)
+    rows = query(
+        store,
+        f"""
+        WITH scored AS (SELECT log_digest, code, weights_digest, settings, "{metric}" AS value FROM logs
+                        WHERE ({text}) AND isfinite("{metric}")),
+             shared AS (SELECT log_digest FROM scored GROUP BY log_digest HAVING count(*) = {len(compared)})
+        SELECT code, weights_digest, settings, quantile_cont(value, {_PERCENTILES}) AS percentiles, count(*) AS n
+        FROM scored SEMI JOIN shared USING (log_digest) GROUP BY code, weights_digest, settings
+        """,
+    ).to_pylist()
+    by_kind = {(row["code"], row["weights_digest"], row["settings"]): row for row in rows}
+    boxes = [
+        PercentileBox(variant.describe(), row["percentiles"], row["n"])
+        for variant in reversed(compared)
+        if (row := by_kind.get((variant.code, variant.weights_digest, variant.settings_text)))
+    ]
+    if boxes:
+        what = f"{metric} by version, the latest below, over the {counted(boxes[0].count, 'log')} that all have"
+        yield Section(f"{operation}: trend", pictures=[_boxes(boxes, metric, what)])
+
+
+def _tags(store: Store, operation: str, where: str, metric: str, columns: Sequence[str]) -> Iterator[Section]:
+    """Of tags with a few values."""
+    pictures = []
+    for column in columns:
+        if not column.startswith("tag_"):
+            continue
+        rows = query(
+            store,
+            f"""
+            SELECT "{column}" AS value, quantile_cont("{metric}", {_PERCENTILES}) AS percentiles, count(*) AS n
+            FROM logs WHERE {where} AND "{column}" IS NOT NULL AND isfinite("{metric}")
+            GROUP BY value ORDER BY n DESC, value LIMIT {MAX_TAG_VALUES + 1}
+            """,
+        ).to_pylist()
+        if 2 <= len(rows) <= MAX_TAG_VALUES:
+            boxes = [PercentileBox(row["value"] or "(empty)", row["percentiles"], row["n"]) for row in rows]
+            pictures.append(_boxes(boxes, metric, f"{metric} by {column.removeprefix('tag_')}"))
+    if pictures:
+        yield Section(f"{operation}: by tag", pictures=pictures)

@@ -1,0 +1,161 @@
+"""Paths and URLs of logs and stores: what opens them, and how they are shown without what lets anybody in."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from semantic_mapper.backoff import backoff_s
+from semantic_mapper.errors import ConfigError, DependencyError, FleetError, StoreError
+from semantic_mapper.log_events import get_logger
+
+TRIES = 6
+FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 15.0
+
+_SCHEME = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*)://(.*)", re.DOTALL)
+_CHAIN = "::"  # between the parts of fsspec's chained URLs
+_PORT = re.compile(r"[^:]*:\d+")
+_HIDDEN = "..."
+# Where what stands before the @ is a container or the name of an account, and says where something is.
+_NAMING_SCHEMES = ("abfs", "abfss", "az", "ftp", "hdfs", "scp", "sftp", "smb", "ssh", "wasb", "wasbs")
+
+_log = get_logger(__name__)
+_T = TypeVar("_T")
+
+
+def is_url(text: str) -> bool:
+    """Whether a URL is meant rather than a local path."""
+    return bool(_split(text)[0])
+
+
+def split_url(url: str) -> tuple[Any, str]:
+    """The fsspec file system of a path or URL, and the path in it, without a slash at its end.
+
+    Raises:
+        ConfigError: an unknown scheme.
+        FleetError: a password in the URL.
+        DependencyError: the package for this scheme is missing.
+    """
+    from fsspec.core import url_to_fs
+
+    refuse_credentials(url)
+    if not is_url(url) or url.startswith("file://"):
+        url = str(Path(url.removeprefix("file://")).absolute())
+    try:
+        fs, path = url_to_fs(url)
+    except ImportError as error:
+        raise DependencyError(f"{shown(url)}: {error}") from error
+    except ValueError as error:
+        raise ConfigError(f"{shown(url)}: cannot be opened ({error})") from error
+    return fs, str(path).rstrip("/")
+
+
+def shown(url: str) -> str:
+    """A URL for logs, results and messages: without user information, query and fragment.
+
+    Queries hold signatures (``X-Amz-Signature``, ``X-Goog-Signature``, ``sig``) and tokens; which of them do cannot be
+    listed. Paths of files stay as they are.
+
+    Args:
+        url: Also one of fsspec's chained URLs (``simplecache::s3://...``).
+    """
+    return _CHAIN.join(_shown_part(part) for part in url.split(_CHAIN))
+
+
+def refuse_credentials(url: str) -> None:
+    """Check that a URL holds no password: it would be in the shell's history and in the process table.
+
+    Raises:
+        FleetError: It does; names the ways that are there instead.
+    """
+    for part in url.split(_CHAIN):
+        scheme, rest = _split(part)
+        if ":" in rest[: _user_length(scheme, rest)]:
+            raise FleetError(
+                f"{shown(url)}: a URL must not hold a key or password; leave it out, and give it to every node in its "
+                "environment (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, GOOGLE_APPLICATION_CREDENTIALS), in ~/.aws, or "
+                "in fsspec's configuration (~/.config/fsspec)"
+            )
+
+
+def _shown_part(url: str) -> str:
+    scheme, rest = _split(url)
+    if not scheme:
+        return url
+    length = _user_length(scheme, rest)
+    user, place = rest[:length], rest[length:]
+    is_name = scheme.lower() in _NAMING_SCHEMES and ":" not in user
+    path = re.split(r"[?#]", place, maxsplit=1)[0]
+    return f"{scheme}://{user if is_name else ''}{path}{'' if path == place else '?' + _HIDDEN}"
+
+
+def _split(url: str) -> tuple[str, str]:
+    """Scheme and all after ``://``; an empty scheme for paths."""
+    match = _SCHEME.fullmatch(url)
+    return (match[1], match[2]) if match else ("", url)
+
+
+def _user_length(scheme: str, rest: str) -> int:
+    """Letters up to and including the @ of user information; 0 = there is nothing of the kind.
+
+    Secret keys of AWS contain slashes, so that user information may seem to end before it does.
+    """
+    if not scheme or scheme == "file":
+        return 0
+    host = re.split(r"[/?#]", rest, maxsplit=1)[0]
+    if "@" in host:
+        return host.rindex("@") + 1
+    if ":" in host and "@" in rest and not _PORT.fullmatch(host):
+        return rest.rindex("@") + 1
+    return 0
+
+
+def persistently(call: Callable[[], _T], what: str, tries: int = TRIES) -> _T:
+    """Do what needs a store; again after pauses where it cannot be reached or answers with an error of its own.
+
+    Args:
+        call: May be done twice without harm.
+        what: Named in errors, without credentials.
+        tries: At most.
+
+    Raises:
+        StoreError: it still cannot be done, or is refused.
+        FileNotFoundError, FileExistsError: as they say.
+    """
+    for failures in range(1, tries + 1):
+        try:
+            return call()
+        except (FileNotFoundError, FileExistsError):
+            raise
+        except (PermissionError, NotADirectoryError, IsADirectoryError) as error:
+            raise StoreError(f"{what}: is refused ({error}); check the credentials and the path") from error
+        except _errors_of_stores() as error:
+            if failures == tries:
+                raise StoreError(f"{what}: cannot be reached or written ({type(error).__name__}: {error})") from error
+            pause_s = backoff_s(failures, FIRST_PAUSE_S, MAX_PAUSE_S)
+            _log.warning("store_retry", what=what, failures=failures, pause_s=pause_s, error=str(error))
+            time.sleep(pause_s)
+    raise AssertionError("unreachable")
+
+
+def _errors_of_stores() -> tuple[type[BaseException], ...]:
+    """What the packages in use raise for failed requests; not all of it is an ``OSError``."""
+    names = (
+        ("botocore.exceptions", "BotoCoreError"),
+        ("botocore.exceptions", "ClientError"),
+        ("aiohttp", "ClientError"),
+        ("gcsfs.retry", "HttpError"),
+        ("google.auth.exceptions", "GoogleAuthError"),
+        ("fsspec.exceptions", "FSTimeoutError"),
+    )
+    loaded = [getattr(sys.modules[module], name) for module, name in names if module in sys.modules]
+    return (OSError, *loaded)
+
+
+def unstripped(fs: Any, path: str, like: str) -> str:
+    """URL of a path in a file system; ``like`` is a URL or path of the same one."""
+    return str(fs.unstrip_protocol(path)) if is_url(like) and not like.startswith("file:") else path

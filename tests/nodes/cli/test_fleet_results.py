@@ -1,0 +1,164 @@
+"""``fleet table``, ``report`` and ``compare``: what they print and write, and their exit codes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from semantic_mapper.nodes.cli.report import linked, safe_link
+from semantic_mapper.nodes.fleet.results import Failure
+from semantic_mapper.nodes.fleet.store import Store
+from tests.nodes.cli.test_report import pictures, read_page
+from tests.nodes.fleet.made_up import FINISHED_NS, made_up, store_of, with_files
+from tests.nodes.support import error_line, run
+
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "fleet-results.md"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """Two versions of 8 logs; the later one with files and a log that failed."""
+    store = store_of(tmp_path / "store", [made_up(n) for n in range(8)])
+    for number in range(8):
+        later = made_up(
+            number, loss=0.02, version="0.2.0", code="d" * 64, finished_ns=FINISHED_NS + (number + 1) * 10**12
+        )
+        store.commit(with_files(store, later))
+    failed = Failure("f", "replay", "/logs/bad <b>.mcap", {}, "0.2.0", ("LogError: is cut off",), FINISHED_NS)
+    store.quarantine(failed)
+    return store
+
+
+def test_table_prints_the_rows_of_a_query(store: Store) -> None:
+    done = run("fleet", "table", store.url, "SELECT log, miou FROM logs WHERE version = '0.2.0' ORDER BY miou LIMIT 2")
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.strip().splitlines()) == 3 and "/logs/000" in done.stdout
+
+
+def test_table_without_sql_shows_an_overview_and_the_columns(store: Store) -> None:
+    done = run("fleet", "table", store.url)
+    assert done.returncode == 0, done.stderr
+    assert "miou_median" in done.stdout and "LogError: is cut off" in done.stdout and "tag_robot" in done.stdout
+    found = json.loads(run("fleet", "table", store.url, "--json").stdout)
+    assert [row["logs"] for row in found["overview"]] == [8, 8] and found["columns"]["classes"]["iou"] == "DOUBLE"
+
+
+def test_table_writes_csv_parquet_and_json(store: Store, tmp_path: Path) -> None:
+    sql = "SELECT key, first, names, finished FROM segments JOIN logs USING (key) ORDER BY key, first LIMIT 3"
+    done = run("fleet", "table", store.url, sql, "--csv", tmp_path / "a.csv", "--out", tmp_path / "a.parquet", "--json")
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["key"] for row in rows] == [row["key"] for row in printed]
+    assert (
+        json.loads(rows[0]["names"]) == printed[0]["names"] == pq.read_table(tmp_path / "a.parquet")["names"][0].as_py()
+    )
+
+
+def test_wrong_sql_is_an_error_in_the_words_of_duckdb(store: Store) -> None:
+    done = run("fleet", "table", store.url, "SELECT moiu FROM logs")
+    assert done.returncode == 1 and "moiu" in error_line(done.stderr) and not done.stdout
+
+
+def test_what_is_no_store_says_so(tmp_path: Path) -> None:
+    for verb in (("table",), ("report",)):
+        done = run("fleet", *verb, tmp_path)
+        assert done.returncode == 1 and "is no fleet store" in error_line(done.stderr)
+    assert run("fleet", "compare", tmp_path, tmp_path).returncode == 2
+
+
+@pytest.mark.parametrize("sql", re.findall(r"```sql\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL))
+def test_queries_of_the_documentation_run(store: Store, sql: str) -> None:
+    done = run("fleet", "table", store.url, sql, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)
+
+
+def test_report_has_pictures_links_failures_and_trend(store: Store) -> None:
+    done = run("fleet", "report", store.url)
+    assert done.returncode == 0, done.stderr
+    assert store.local is not None
+    path = store.local / "report" / "report.html"
+    assert str(path) in done.stdout
+    page = read_page(path, links=True)
+    links = [element.get("href") or "" for element in page.iter("a")]
+    assert len(links) == 16 and all((path.parent / link).resolve().name == "report.html" for link in links)
+    assert all((path.parent / link).is_file() for link in links)
+    heads = [element.text for element in page.iter("h2")]
+    assert heads[:1] == ["Logs that were given up"] and {"replay: trend", "replay: by tag"} <= set(heads)
+    assert len(pictures(page)) >= 8 + 4
+    assert "bad &lt;b&gt;.mcap" in path.read_text(encoding="utf-8")
+
+
+def test_report_of_one_log_without_files_or_score(tmp_path: Path) -> None:
+    import msgspec
+
+    plain = made_up(0)
+    findings = msgspec.structs.replace(plain.findings, metrics={"miou": None}, classes=(), segments=(), costs={})
+    store = store_of(tmp_path / "one", [msgspec.structs.replace(plain, findings=findings)])
+    done = run("fleet", "report", store.url, "--out", tmp_path / "page")
+    assert done.returncode == 0, done.stderr
+    assert read_page(tmp_path / "page" / "report.html") is not None
+
+
+def test_report_of_an_empty_store_says_that_nothing_is_there(tmp_path: Path) -> None:
+    store = Store(str(tmp_path / "empty"), create=True)
+    done = run("fleet", "report", store.url)
+    assert done.returncode == 1 and "has no results yet" in error_line(done.stderr)
+
+
+@pytest.mark.parametrize("link", ["javascript:alert(1)", "data:text/html,x", " javascript:x", "file:///etc/passwd"])
+def test_links_lead_to_pages_only(link: str) -> None:
+    assert safe_link(link) == "" and not str(getattr(linked("x", link).style, "link", None) or "")
+
+
+def test_files_outside_the_store_are_no_links(tmp_path: Path) -> None:
+    import msgspec
+
+    result = made_up(0)
+    findings = msgspec.structs.replace(result.findings, report="../../../outside.html", thumbnail="/etc/passwd")
+    store = store_of(tmp_path / "store", [msgspec.structs.replace(result, findings=findings)])
+    assert run("fleet", "report", store.url, "--out", tmp_path / "page").returncode == 0
+    text = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    assert "outside.html" not in text and "<a href" not in text
+
+
+def test_compare_finds_a_worse_version_and_not_a_rerun(tmp_path: Path) -> None:
+    results = [made_up(n) for n in range(6)]
+    a, same = store_of(tmp_path / "a", results), store_of(tmp_path / "same", results)
+    worse = store_of(tmp_path / "worse", [made_up(n, loss=0.15) for n in range(6)])
+    done = run("fleet", "compare", a.url, same.url)
+    assert done.returncode == 0 and done.stdout.rstrip().endswith("not worse"), done.stderr
+    done = run("fleet", "compare", a.url, worse.url, "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode == 1 and found["worse"] and len(found["logs"]) == 6
+    assert found["overall"]["high"] < 0
+    done = run("fleet", "compare", a.url, worse.url)
+    assert done.returncode == 1 and "6 logs lost more than 0.02" in done.stdout
+
+
+def test_compare_within_a_store(store: Store) -> None:
+    done = run("fleet", "compare", store.url, "--a", "version=0.1.0", "--b", "version=0.2.0")
+    assert done.returncode == 1 and "the mean of miou over logs is worse" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "STORE_B"),
+        (("{store}", "--a", "version"), "--a version: write NAME=VALUE"),
+        (("{store}", "--metric", "moiu"), "moiu"),
+        (("{store}", "--cost", "seconds=much"), "write a fraction"),
+        (("{store}", "--threshold", "-1"), "--threshold"),
+        (("{store}/none",), "is no fleet store"),
+    ],
+)
+def test_wrong_usage_of_compare_exits_with_2(store: Store, arguments: tuple[str, ...], said: str) -> None:
+    done = run("fleet", "compare", store.url, *(word.format(store=store.url) for word in arguments))
+    assert done.returncode == 2 and said in done.stderr and not done.stdout

@@ -1,0 +1,214 @@
+"""The release gate: what it calls worse, what it does not, and how sure it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.nodes.fleet.compare import (
+    Estimate,
+    GateOptions,
+    compare_fleets,
+    compare_results,
+    lower_is_better,
+)
+from semantic_mapper.nodes.fleet.results import Failure, Findings, SegmentRow, TaskResult
+from semantic_mapper.nodes.fleet.store import Store
+from tests.nodes.fleet.made_up import FINISHED_NS, VERSION, made_up, store_of
+
+OTHER: dict[str, Any] = {"version": "0.2.0+bbbbbbb", "code": "d" * 64}
+
+
+def pairs(count: int, **changes: Any) -> list[tuple[TaskResult, TaskResult]]:
+    return [(made_up(n), made_up(n, **changes)) for n in range(count)]
+
+
+def with_findings(result: TaskResult, **changes: Any) -> TaskResult:
+    return msgspec.structs.replace(result, findings=msgspec.structs.replace(result.findings, **changes))
+
+
+def test_a_rerun_with_the_same_results_is_not_worse(tmp_path: Path) -> None:
+    results = [made_up(n) for n in range(6)]
+    a, b = store_of(tmp_path / "a", results), store_of(tmp_path / "b", results)
+    found = compare_fleets(a, b, GateOptions(threshold=0.0, log_threshold=0.0))
+    assert not found.worse and found.count("same") == 6
+    assert found.overall is not None and (found.overall.low, found.overall.high) == (0, 0)
+
+
+def test_reruns_with_noise_are_rarely_worse_and_real_losses_are_found() -> None:
+    assert sum(compare_results(pairs(12, noise=0.02, noise_seed=s), GateOptions()).worse for s in range(1, 9)) <= 2
+    found = compare_results(pairs(12, noise=0.02, noise_seed=1, loss=0.02), GateOptions())
+    assert found.worse and "the mean of miou over logs is worse" in found.reasons
+    assert found.count("worse") == 0  # one point and a half: less than a single log may lose
+
+
+def test_one_log_that_lost_much_is_found_among_many() -> None:
+    both = [(made_up(n), made_up(n, loss=0.15 if n == 17 else 0.0, noise=0.02, noise_seed=2)) for n in range(40)]
+    found = compare_results(both, GateOptions())
+    assert found.worse and [log.log for log in found.logs if log.status == "worse"] == ["/logs/0017.mcap"]
+    assert found.logs[0].log == "/logs/0017.mcap"
+    assert found.reasons == ("1 log lost more than 0.02",)
+
+
+def test_logs_that_got_better_are_no_alarm() -> None:
+    found = compare_results(pairs(10, loss=-0.08), GateOptions())
+    assert not found.worse and found.count("better") == 10
+
+
+def test_a_threshold_allows_a_small_loss() -> None:
+    both = pairs(10, loss=0.02, noise=0.01, noise_seed=3)
+    assert compare_results(both, GateOptions()).worse
+    assert not compare_results(both, GateOptions(threshold=0.03)).worse
+
+
+def test_logs_that_failed_or_are_missing_are_worse_and_say_why(tmp_path: Path) -> None:
+    results = [made_up(n) for n in range(4)]
+    a, b = store_of(tmp_path / "a", results), store_of(tmp_path / "b", results[:2])
+    failed = results[2]
+    b.quarantine(Failure(failed.key, "replay", failed.log, {}, VERSION, ("LogError: cut off",), FINISHED_NS))
+    found = compare_fleets(a, b, GateOptions())
+    assert [(log.status, log.reason) for log in found.logs[:2]] == [("failed", "LogError: cut off"), ("missing", "")]
+    assert found.reasons == ("1 log failed in B", "1 log missing in B")
+    reverse = compare_fleets(b, a, GateOptions())
+    assert not reverse.worse and reverse.new == tuple(result.log for result in results[2:])
+
+
+def test_a_log_without_a_score_in_b_is_worse() -> None:
+    a, b = made_up(1), made_up(1)
+    both = [*pairs(3), (with_findings(a, segments=()), with_findings(b, segments=(), metrics={"miou": None}))]
+    found = compare_results(both, GateOptions())
+    assert found.count("unscored") == 1 and found.reasons == ("1 log without a score in B",)
+
+
+def test_versions_in_one_store_are_compared_and_the_latest_counts(tmp_path: Path) -> None:
+    old = [made_up(n) for n in range(4)]
+    new = [made_up(n, loss=0.2, finished_ns=FINISHED_NS + 10**15, **OTHER) for n in range(4)]
+    store = store_of(tmp_path / "store", [*old, *new])
+    found = compare_fleets(store, store, GateOptions(a={"version": "0.1.0"}, b={"version": "0.2.0"}))
+    assert found.worse and found.mean_b < found.mean_a
+    assert found.mean_b == compare_fleets(store, store, GateOptions()).mean_a
+    with pytest.raises(ConfigError, match=r"no results of `replay` have version=3.*0\.1\.0\+aaaaaaa"):
+        compare_fleets(store, store, GateOptions(a={"version": "3"}))
+
+
+def test_settings_in_one_store_are_compared(tmp_path: Path) -> None:
+    results = [made_up(n, settings={"render.scale": s}, loss=1 - s) for n in range(3) for s in (0.5, 1.0)]
+    store = store_of(tmp_path / "store", results)
+    found = compare_fleets(store, store, GateOptions(a={"render.scale": "1.0"}, b={"render.scale": "0.5"}))
+    assert found.worse and "render.scale=0.5" in found.b
+
+
+def test_a_variant_with_few_logs_is_noted(tmp_path: Path) -> None:
+    few = made_up(0, finished_ns=FINISHED_NS + 10**15, **OTHER)
+    store = store_of(tmp_path / "store", [*(made_up(n) for n in range(5)), few])
+    (note,) = compare_fleets(store, store, GateOptions(b={"version": "0.2.0"})).notes[:1]
+    assert "A has 1 log of 0.2.0+bbbbbbb" in note and "up to 5" in note
+
+
+def test_metrics_without_stretches_are_judged_over_logs_together() -> None:
+    rng = np.random.default_rng(0)
+    both = [
+        (a, with_findings(b, metrics={"ate_m": a.findings.metrics["ate_m"] + 0.01 + 0.002 * rng.random()}))  # type: ignore[operator]
+        for a, b in pairs(8)
+    ]
+    found = compare_results(both, GateOptions(metric="ate_m"))
+    assert found.lower_is_better and found.worse and found.count("worse") == 0
+    assert not compare_results(both, GateOptions(metric="ate_m", lower_is_better=False)).worse
+    assert any("judged together only" in note for note in found.notes)
+
+
+def test_a_class_can_be_the_metric() -> None:
+    found = compare_results(pairs(6, loss=0.1), GateOptions(metric="iou:lamp"))
+    assert found.worse and found.logs[0].a == pytest.approx(
+        next(row.iou for row in made_up(int(found.logs[0].log[6:10])).findings.classes if row.name == "lamp"), abs=0.01
+    )
+
+
+def test_classes_are_compared_by_name() -> None:
+    a = made_up(3)
+    order = [2, 0, 3, 1]
+    shuffled = tuple(
+        SegmentRow(s.method, s.first, s.frames, tuple(s.names[i] for i in order), _reordered(s, order))
+        for s in a.findings.segments
+    )
+    found = compare_results([(a, with_findings(a, segments=shuffled))], GateOptions(log_threshold=0.0))
+    assert found.mean_a == found.mean_b and not found.worse
+
+
+def _reordered(segment: SegmentRow, order: list[int]) -> tuple[int, ...]:
+    counts = np.reshape(segment.counts, (4, 5))[order][:, [*order, 4]]
+    return tuple(int(c) for c in counts.ravel())
+
+
+def test_a_single_log_is_judged_by_its_stretches() -> None:
+    found = compare_results(pairs(1, loss=0.05, noise=0.01, noise_seed=1), GateOptions())
+    assert found.worse and found.overall == found.logs[0].estimate
+    without = [(with_findings(a, segments=()), with_findings(b, segments=())) for a, b in pairs(1, loss=0.05)]
+    unsure = compare_results(without, GateOptions())
+    assert not unsure.worse and any("noise is unknown" in note for note in unsure.notes)
+
+
+def test_stretches_that_one_side_lacks_do_not_count() -> None:
+    a = made_up(5)
+    found = compare_results([(a, with_findings(a, segments=a.findings.segments[:8]))], GateOptions())
+    assert found.overall is not None and found.overall.freedom == 7 and found.overall.difference == 0
+    assert any("in one of the results only" in note for note in found.notes)
+
+
+def test_costs_stop_a_release_only_where_asked_for() -> None:
+    both = [(a, with_findings(b, costs={"step_ms_p50": 1.3 * a.findings.costs["step_ms_p50"]})) for a, b in pairs(6)]  # type: ignore[operator]
+    free = compare_results(both, GateOptions())
+    (cost,) = [cost for cost in free.costs if cost.name == "step_ms_p50"]
+    assert not free.worse and cost.ratio == pytest.approx(1.3)
+    assert compare_results(both, GateOptions(costs={"step_ms_p50": 0.2})).worse
+    assert not compare_results(both, GateOptions(costs={"step_ms_p50": 0.4})).worse
+    with pytest.raises(ConfigError, match="--cost step_ms: .*step_ms_p50"):
+        compare_results(both, GateOptions(costs={"step_ms": 0.2}))
+
+
+def test_what_cannot_be_compared_says_what_there_is(tmp_path: Path) -> None:
+    a = store_of(tmp_path / "a", [made_up(1), made_up(1, operation="eval")])
+    b = store_of(tmp_path / "b", [made_up(2), made_up(2, operation="eval")])
+    with pytest.raises(ConfigError, match="--operation.*eval, replay"):
+        compare_fleets(a, b, GateOptions())
+    with pytest.raises(ConfigError, match="no log has results of `eval` in both"):
+        compare_fleets(a, b, GateOptions(operation="eval"))
+    with pytest.raises(ConfigError, match="no metric|miou"):
+        compare_fleets(a, a, GateOptions(operation="eval", metric="moiu"))
+    with pytest.raises(ConfigError, match="finetune"):
+        compare_fleets(a, a, GateOptions(operation="finetune"))
+
+
+def test_the_result_is_json_also_where_there_are_no_numbers() -> None:
+    both = [(msgspec.structs.replace(a, findings=Findings({"score": 1.0})),) * 2 for a, _ in pairs(1)]
+    plain = compare_results(both, GateOptions(metric="score")).to_plain()
+    assert json.loads(json.dumps(plain, allow_nan=False))["overall"] is None
+
+
+def test_intervals_and_p_values_are_students() -> None:
+    estimate = Estimate(-0.03, 0.01, 11, 0.0, 0.0)
+    assert estimate.p_below(0.0) == pytest.approx(0.00604, abs=1e-4)  # t = -3 with 11 degrees of freedom
+    assert estimate.p_below(-0.02) > 0.1
+    assert Estimate(0.0, 0.0, 11, 0.0, 0.0).p_below(0.0) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("metric", "lower"),
+    [("miou", False), ("frames_fused", False), ("ate_m", True), ("depth_error", True), ("frames_refused", True)],
+)
+def test_names_say_whether_less_is_better(metric: str, lower: bool) -> None:
+    assert lower_is_better(metric) == lower
+
+
+def test_stores_of_many_versions_give_one_pair_a_log(tmp_path: Path) -> None:
+    store = Store(str(tmp_path / "store"), create=True)
+    for number in range(3):
+        for code in "abc":
+            store.commit(made_up(number, code=code * 64, version=f"0.{ord(code)}"))
+    assert len(compare_fleets(store, store, GateOptions()).logs) == 3

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.errors import ConfigError, StoreError
+from semantic_mapper.nodes.fleet.results import Failure, decode_result, encode_document, without_costs
+from semantic_mapper.nodes.fleet.store import Store
+from tests.nodes.fleet.documents import made_result
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(str(tmp_path / "store"), create=True)
+
+
+def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no fleet store"):
+        Store(str(tmp_path))
+    (tmp_path / "fleet.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(ConfigError, match="damaged or of something else"):
+        Store(str(tmp_path), create=True)
+    (tmp_path / "fleet.json").write_text('{"format": "semantic-mapper-fleet", "version": 99}', encoding="utf-8")
+    with pytest.raises(ConfigError, match="upgrade"):
+        Store(str(tmp_path))
+
+
+def test_a_document_comes_back_as_it_was(store: Store) -> None:
+    result = made_result("k", tags={"robot": "r1"}, settings={"max_frames": 3})
+    assert store.commit(result)
+    assert store.result("k") == result == decode_result(encode_document(result), "here")
+    assert store.result("other") is None
+
+
+def test_the_first_commit_counts_and_files_of_the_second_go(store: Store) -> None:
+    for attempt in ("one", "two"):
+        store.write(f"results/k/{attempt}/map.npz", attempt.encode())
+    assert store.commit(made_result("k", "one"))
+    assert not store.commit(made_result("k", "two"))
+    found = store.result("k")
+    assert found is not None and found.folder == "results/k/one"
+    assert store.read("results/k/one/map.npz") == b"one"
+    assert not store.exists("results/k/two/map.npz")
+
+
+def test_a_commit_whose_answer_was_lost_counts(store: Store) -> None:
+    result = made_result("k", "one")
+    store.write("results/k/one/map.npz", b"one")
+    assert store.commit(result) and store.commit(result)
+    assert store.exists("results/k/one/map.npz")
+
+
+def test_of_many_writers_at_once_one_commits(store: Store) -> None:
+    barrier = threading.Barrier(16)
+    made: list[bool] = []
+
+    def commit(number: int) -> None:
+        barrier.wait()
+        made.append(store.commit(made_result("k", f"attempt{number}")))
+
+    threads = [threading.Thread(target=commit, args=(n,)) for n in range(16)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sum(made) == 1
+
+
+def test_unfinished_attempts_are_no_results(store: Store) -> None:
+    store.write("results/begun/one/map.npz", b"half")
+    store.commit(made_result("k"))
+    assert [result.key for result in store.results()] == ["k"]
+
+
+def test_drafts_of_killed_writers_are_not_seen(store: Store) -> None:
+    assert store.local is not None
+    store.write("failed/a.json", b"{}")
+    (store.local / "failed" / ".a.json.0123456789ab.part").write_bytes(b"half")
+    assert store.names("failed") == ["a.json"]
+
+
+def test_a_damaged_result_says_what_to_do(store: Store) -> None:
+    store.write("results/k/result.json", b"{")
+    with pytest.raises(ConfigError, match="delete it"):
+        store.result("k")
+
+
+def test_quarantine_can_be_left_again(store: Store) -> None:
+    failure = Failure("k", "replay", "/logs/k.mcap", {}, "0.1.0", ("first", "second"), 1)
+    store.quarantine(failure)
+    assert list(store.failures()) == [failure]
+    store.release("k")
+    store.release("k")
+    assert not list(store.failures())
+
+
+def test_what_is_missing_is_a_clear_error(store: Store) -> None:
+    with pytest.raises(StoreError, match=r"store/nothing: is missing"):
+        store.read("nothing")
+
+
+def test_costs_are_left_out_of_comparisons() -> None:
+    one = made_result("k", "one", node="a", seconds=1.0)
+    other = made_result("k", "two", node="b", seconds=9.0, attempts=2, finished_ns=5)
+    assert without_costs(one) == without_costs(other)
+    assert without_costs(one) != without_costs(made_result("k", log_digest="another"))
