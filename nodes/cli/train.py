@@ -10,6 +10,7 @@ import typer
 
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.fleet_run import TrustedOption
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
 
@@ -33,8 +34,11 @@ def train(
     half: Annotated[bool, typer.Option("--half", help="Store weights as float16, for shipping.")] = False,
     ray: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Train on a Ray cluster; local = one of this machine, for this run."),
+        typer.Option(
+            metavar="ADDRESS", help="Train on a Ray cluster: HOST:PORT, auto, or local for one of this machine alone."
+        ),
     ] = None,
+    trusted_network: TrustedOption = False,
     ranks: Annotated[int, typer.Option(min=1, help="With --ray: processes that train, each on a GPU of its own.")] = 1,
     cpus_per_rank: Annotated[int, typer.Option(min=1, help="With --ray: cores of each of these processes.")] = 1,
 ) -> int:
@@ -70,8 +74,8 @@ def train(
                 "one process"
             )
         return train_on_maps(output, config, out, resume=resume, seconds=seconds, steps=steps, seed=seed)
-    if ray is None and (ranks > 1 or cpus_per_rank > 1):
-        raise ConfigError("--ranks and --cpus-per-rank need --ray; torchrun has --nproc_per_node")
+    if ray is None and (ranks > 1 or cpus_per_rank > 1 or trusted_network):
+        raise ConfigError("--ranks, --cpus-per-rank and --trusted-network need --ray; torchrun has --nproc_per_node")
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
     start = None if weights is None else str(weights)
     given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers, "start": start, "kind": kind}
@@ -99,7 +103,7 @@ def train(
             from semantic_mapper.nodes.fleet.cluster import connected
             from semantic_mapper.nodes.fleet.train_ranks import train_on_ray
 
-            with connected(ray):
+            with connected(ray, trusted_network=trusted_network):
                 checkpoint = train_on_ray(
                     settings,
                     folder,

@@ -35,7 +35,7 @@ _log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class RankResources:
+class _RankResources:
     """What one rank takes of the cluster.
 
     Args:
@@ -222,7 +222,7 @@ def _wait_for_lock(folder: Path) -> None:
 class _Fit(threading.Thread):
     """Ray Train's blocking call, in a thread: in the main one it would take Ctrl-C for itself, and save nothing."""
 
-    def __init__(self, task: _Task, ranks: int, resources: RankResources) -> None:
+    def __init__(self, task: _Task, ranks: int, resources: _RankResources) -> None:
         super().__init__(daemon=True)
         self._task, self._ranks, self._resources = task, ranks, resources
         self.error: Exception | None = None
@@ -306,7 +306,7 @@ def _marked(folder: Path) -> Iterator[Path]:
         shutil.rmtree(place, ignore_errors=True)
 
 
-def _resources(config: TrainConfig, ranks: int, cpus: int) -> RankResources:
+def _resources(config: TrainConfig, ranks: int, cpus: int) -> _RankResources:
     """What each rank takes; a GPU where the config asks for one, or where ``auto`` finds enough of them.
 
     Raises:
@@ -323,7 +323,7 @@ def _resources(config: TrainConfig, ranks: int, cpus: int) -> RankResources:
             f"{ranks} ranks with {config.workers} room actors each need {wanted_cpus} CPU cores and {wanted_gpus} "
             f"GPUs, the cluster has {have_cpus} and {have_gpus}; lower --ranks or --workers, or add machines"
         )
-    return RankResources(cpus, gpu)
+    return _RankResources(cpus, gpu)
 
 
 def _absolute(path: str) -> str:
