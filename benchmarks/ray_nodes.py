@@ -17,6 +17,8 @@ from pathlib import Path
 import psutil
 
 _START_TIMEOUT_S = 150.0
+# By default a node gives up after 30 s, and after 15 s without its agent: too soon on a machine that has other work.
+_PATIENT = {"RAY_raylet_start_wait_time_s": "120", "RAY_agent_register_timeout_ms": "120000"}
 _HOST = "127.0.0.1"
 # `ray start --node-ip-address=127.0.0.1` takes this machine's outer address instead, and any other address of loopback
 # makes Ray listen everywhere. This program is `ray` without that exchange.
@@ -46,7 +48,7 @@ class RayNodes:
         token.write_text(secrets.token_hex(32), encoding="ascii")
         token.chmod(0o600)
         self.environment = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), **environment}
-        self._node_environment = {"RAY_raylet_start_wait_time_s": "120", **self.environment}  # by default 30
+        self._node_environment = {**_PATIENT, **self.environment}
         self._nodes: list[subprocess.Popen[bytes]] = []
 
     def start_head(self, *, cpus: int, options: tuple[str, ...] = ()) -> None:
@@ -94,15 +96,7 @@ class RayNodes:
 
     def _start(self, *options: str) -> int:
         index = len(self._nodes)
-        command = [
-            sys.executable,
-            "-c",
-            _RAY,
-            "start",
-            "--block",
-            f"--node-ip-address={_HOST}",
-            "--disable-usage-stats",
-        ]
+        command = [sys.executable, "-c", _RAY, "start", "--block", "--disable-usage-stats"]
         # Port 0 = any free one: by default every node on this machine would count up from the same.
         command += [
             f"--node-ip-address={_HOST}",

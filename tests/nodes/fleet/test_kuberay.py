@@ -139,7 +139,7 @@ def test_the_job_has_the_token_of_the_cluster(documents: dict[str, dict[str, Any
 def test_no_secret_is_in_the_manifest(documents: dict[str, dict[str, Any]]) -> None:
     assert "Secret" not in documents
     values = re.findall(r"value: (\S+)", MANIFEST.read_text(encoding="utf-8"))
-    assert values == ['"fleet-head-svc:6379"}', "token}"]
+    assert values == ['"1"}', '"fleet-head-svc:6379"}', "token}"]
 
 
 @pytest.mark.slow
