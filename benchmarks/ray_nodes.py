@@ -57,15 +57,17 @@ class RayNodes:
         # A head started without `--ray-client-server-port` opens port 10001, which other clusters may hold.
         extra = ("--include-dashboard=false", f"--ray-client-server-port={free_port()}", *options)
         head = self._start("--head", f"--port={port}", f"--num-cpus={cpus}", f"--temp-dir={self.folder}", *extra)
-        self.wait(head)
+        self._wait(head)
 
     def start_worker(self, *, cpus: int, options: tuple[str, ...] = ()) -> int:
-        """Start one more node; it runs after ``wait``.
+        """Start one more node, and wait until it runs: nodes that start at once take the same names for their sockets.
 
         Returns:
-            Its index, for ``wait`` and ``kill``.
+            Its index, for ``kill``.
         """
-        return self._start(f"--address={self.address}", f"--num-cpus={cpus}", *options)
+        node = self._start(f"--address={self.address}", f"--num-cpus={cpus}", *options)
+        self._wait(node)
+        return node
 
     def kill(self, node: int) -> None:
         """End a node and all its workers with SIGKILL, as a machine that loses power.
@@ -116,12 +118,7 @@ class RayNodes:
         self._nodes.append(node)
         return index
 
-    def wait(self, node: int) -> None:
-        """Until a node runs.
-
-        Raises:
-            RuntimeError: It did not start; with what it printed.
-        """
+    def _wait(self, node: int) -> None:
         log = self._log(node)
         deadline = time.monotonic() + _START_TIMEOUT_S
         while b"runtime started" not in log.read_bytes():
@@ -154,8 +151,8 @@ def ray_nodes(
     nodes = RayNodes(folder, environment or {})
     try:
         nodes.start_head(cpus=head_cpus, options=head_options)
-        for node in [nodes.start_worker(cpus=cpus) for cpus in worker_cpus]:
-            nodes.wait(node)
+        for cpus in worker_cpus:
+            nodes.start_worker(cpus=cpus)
         yield nodes
     finally:
         nodes.kill_all()

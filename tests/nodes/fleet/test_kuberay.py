@@ -156,10 +156,8 @@ def test_ray_starts_with_the_parameters_of_the_manifest(
             monkeypatch.setenv(name, value)
         # Pods have ports of their own; here another process may have this one.
         port = {"node-manager-port": str(free_port())}
-        started = [nodes.start_worker(cpus=1, options=options({**worker, **port}))]
-        started.append(nodes.start_worker(cpus=0, options=tuple(start[3:])))
-        for node in started:
-            nodes.wait(node)
+        nodes.start_worker(cpus=1, options=options({**worker, **port}))
+        nodes.start_worker(cpus=0, options=tuple(start[3:]))
         monkeypatch.setenv("RAY_ADDRESS", nodes.address)
         with connected("auto") as cluster:
             assert (cluster.nodes, cluster.cpus) == (3, 1.0)
