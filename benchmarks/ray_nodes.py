@@ -17,6 +17,8 @@ from pathlib import Path
 import psutil
 
 _START_TIMEOUT_S = 150.0
+# By default a node gives up after 30 s, and after 15 s without its agent: too soon on a machine that has other work.
+_PATIENT = {"RAY_raylet_start_wait_time_s": "120", "RAY_agent_register_timeout_ms": "120000"}
 _HOST = "127.0.0.1"
 # `ray start --node-ip-address=127.0.0.1` takes this machine's outer address instead, and any other address of loopback
 # makes Ray listen everywhere. This program is `ray` without that exchange.
@@ -46,7 +48,7 @@ class RayNodes:
         token.write_text(secrets.token_hex(32), encoding="ascii")
         token.chmod(0o600)
         self.environment = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), **environment}
-        self._node_environment = {"RAY_raylet_start_wait_time_s": "120", **self.environment}  # by default 30
+        self._node_environment = {**_PATIENT, **self.environment}
         self._nodes: list[subprocess.Popen[bytes]] = []
 
     def start_head(self, *, cpus: int, options: tuple[str, ...] = ()) -> None:
@@ -55,15 +57,17 @@ class RayNodes:
         # A head started without `--ray-client-server-port` opens port 10001, which other clusters may hold.
         extra = ("--include-dashboard=false", f"--ray-client-server-port={free_port()}", *options)
         head = self._start("--head", f"--port={port}", f"--num-cpus={cpus}", f"--temp-dir={self.folder}", *extra)
-        self.wait(head)
+        self._wait(head)
 
     def start_worker(self, *, cpus: int, options: tuple[str, ...] = ()) -> int:
-        """Start one more node; it runs after ``wait``.
+        """Start one more node, and wait until it runs: nodes that start at once take the same names for their sockets.
 
         Returns:
-            Its index, for ``wait`` and ``kill``.
+            Its index, for ``kill``.
         """
-        return self._start(f"--address={self.address}", f"--num-cpus={cpus}", *options)
+        node = self._start(f"--address={self.address}", f"--num-cpus={cpus}", *options)
+        self._wait(node)
+        return node
 
     def kill(self, node: int) -> None:
         """End a node and all its workers with SIGKILL, as a machine that loses power.
@@ -94,15 +98,7 @@ class RayNodes:
 
     def _start(self, *options: str) -> int:
         index = len(self._nodes)
-        command = [
-            sys.executable,
-            "-c",
-            _RAY,
-            "start",
-            "--block",
-            f"--node-ip-address={_HOST}",
-            "--disable-usage-stats",
-        ]
+        command = [sys.executable, "-c", _RAY, "start", "--block", "--disable-usage-stats"]
         # Port 0 = any free one: by default every node on this machine would count up from the same.
         command += [
             f"--node-ip-address={_HOST}",
@@ -122,12 +118,7 @@ class RayNodes:
         self._nodes.append(node)
         return index
 
-    def wait(self, node: int) -> None:
-        """Until a node runs.
-
-        Raises:
-            RuntimeError: It did not start; with what it printed.
-        """
+    def _wait(self, node: int) -> None:
         log = self._log(node)
         deadline = time.monotonic() + _START_TIMEOUT_S
         while b"runtime started" not in log.read_bytes():
@@ -160,8 +151,8 @@ def ray_nodes(
     nodes = RayNodes(folder, environment or {})
     try:
         nodes.start_head(cpus=head_cpus, options=head_options)
-        for node in [nodes.start_worker(cpus=cpus) for cpus in worker_cpus]:
-            nodes.wait(node)
+        for cpus in worker_cpus:
+            nodes.start_worker(cpus=cpus)
         yield nodes
     finally:
         nodes.kill_all()

@@ -1,7 +1,7 @@
 """The Ray cluster that a fleet runs on: one of its own on this machine, or one that is there already.
 
 A cluster of its own listens on loopback only, and asks every client for a token that only this user can read. A cluster
-that is reached through a network must ask for a token and encrypt, unless the user vouches for the network.
+that is reached through a network must ask for a token and encrypt, unless the user says that the network is safe.
 """
 
 from __future__ import annotations
@@ -48,6 +48,8 @@ _COMMON = {
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would send the working folder to every node
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "1",  # tasks that declare no GPU see none
 }
+# By default a node gives up after 30 s, and after 15 s without its agent: too soon on a machine that has other work.
+_PATIENT = {"RAY_raylet_start_wait_time_s": "90", "RAY_agent_register_timeout_ms": "60000"}
 _HOW_TO_SECURE = (
     "start every node with RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH, RAY_USE_TLS=1, RAY_TLS_SERVER_CERT, "
     "RAY_TLS_SERVER_KEY and RAY_TLS_CA_CERT in its environment, and set the same ones here (docs/fleet-cluster.md has "
@@ -77,7 +79,7 @@ class Cluster:
         gpus: Likewise.
         memory_bytes: That tasks may declare, of all nodes.
         embedded: Started by this process, and ends with it.
-        trusted_network: Reached through a network without token or TLS, because the user vouches for it.
+        trusted_network: Reached through a network without token or TLS, because the user says that it is safe.
     """
 
     address: str
@@ -146,9 +148,9 @@ def _embedded(ray: Any, cpus: int | None, *, worker_logs: bool) -> Iterator[Clus
         token = folder / "token"
         with open(os.open(token, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
             file.write(secrets.token_hex(32))
-        # A path, because other processes of this user can show the environment, and crash reports hold it.
+        # A path, because programs that report errors often send the environment with them.
         variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), "RAY_USE_TLS": "0"}
-        end.enter_context(_environment({**_COMMON, **variables}, without=("RAY_AUTH_TOKEN",)))
+        end.enter_context(_environment({**_COMMON, **_PATIENT, **variables}, without=("RAY_AUTH_TOKEN",)))
         end.enter_context(_on_loopback())
         end.callback(_end, ray, token)
         _init(
@@ -256,7 +258,7 @@ def _probe(address: str, *, is_near: bool) -> None:
             f"{what} does not answer within {_JOIN_TIMEOUT_S:g} s: it is no Ray cluster, it has stalled, or only one "
             f"side uses TLS (RAY_USE_TLS is '{os.environ.get('RAY_USE_TLS', '0')}' here)"
         )
-    if "No node info found" in said or "find_node_ids" in said:
+    if "No node info found" in said:
         raise FleetError(
             f"{what} has no node on this machine: run `ray start --address={address} --num-cpus=0` here first, with "
             "the same token and certificates"
@@ -424,11 +426,11 @@ def _require_security(address: str, *, trusted_network: bool) -> None:
 
 
 def _missing_security() -> str | None:
-    """What lacks of token authentication and TLS in this environment; None = nothing."""
+    """What is missing of token authentication and TLS in this environment; None = nothing."""
     if os.environ.get("RAY_AUTH_MODE", "").lower() != "token":
-        return "RAY_AUTH_MODE=token is not set, so that anybody there may run code"
+        return "RAY_AUTH_MODE=token is not set, so that anybody there can run code"
     if os.environ.get("RAY_USE_TLS", "0").lower() not in ("1", "true"):
-        return "RAY_USE_TLS=1 is not set, so that anybody there may read along, the token included"
+        return "RAY_USE_TLS=1 is not set, so that anybody there can read everything, the token included"
     for name in _CERTIFICATES:
         path = os.environ.get(name)
         if not path or not Path(path).is_file():
