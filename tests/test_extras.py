@@ -10,7 +10,8 @@ import pytest
 
 HIDDEN = """
 import sys
-for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh"):
+FLEET = ("ray", "duckdb", "pyarrow", "fsspec", "s3fs", "gcsfs")
+for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh", *FLEET):
     sys.modules[name] = None
 """
 
@@ -54,6 +55,21 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh
             )
             for kind in ("foxglove", "zenoh")
         ),
+        *(
+            (
+                f"""
+                from semantic_mapper.nodes.cli.main import app
+                app({arguments!r})
+                """,
+                'pip install "semantic-mapper[fleet]"',
+            )
+            for arguments in (
+                ["fleet", "run", "replay", "a.mcap", "--out", "none"],
+                ["fleet", "table", "none"],
+                ["fleet", "merge", "a.npz", "b.npz", "--out", "none"],
+                ["train", "--out", "none", "--ray", "local"],
+            )
+        ),
     ],
 )
 def test_what_an_extra_is_needed_for_names_it(lines: str, expected: str) -> None:
@@ -64,4 +80,4 @@ def test_what_an_extra_is_needed_for_names_it(lines: str, expected: str) -> None
         timeout=120,
         check=False,
     )
-    assert expected in run.stdout, run.stderr
+    assert expected in run.stdout + run.stderr, run.stderr

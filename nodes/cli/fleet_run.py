@@ -117,11 +117,12 @@ def run(
     from semantic_mapper.nodes.fleet.inputs import find_inputs
     from semantic_mapper.nodes.fleet.operations import OPERATIONS
     from semantic_mapper.nodes.fleet.runner import FleetRun, Resources
-    from semantic_mapper.nodes.fleet.start import make_template, open_store
+    from semantic_mapper.nodes.fleet.start import make_template
+    from semantic_mapper.nodes.fleet.store import Store
 
     kind = OPERATIONS[operation.value]
     inputs = find_inputs(logs, kind.suffix)
-    store = open_store(out)
+    store = Store(out, create=True)
     assignments = [*(("render.device=cuda",) if gpus and kind.rest == "mapper" else ()), *(settings or ())]
     template = make_template(operation.value, store, weights, assignments, config, round(worker_disk * 1e9))
     resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9), max_parallel, timeout * 3600)

@@ -1,4 +1,4 @@
-"""What a fleet run checks before it starts: the store, the weights, the settings."""
+"""What a fleet run settles before it starts: the weights and the settings."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from semantic_mapper.config import to_plain
-from semantic_mapper.errors import DependencyError, WeightsError
+from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint, shipped_checkpoint
 from semantic_mapper.fields.nesf import SHIPPED, SMOOTHING, load_nesf
 from semantic_mapper.nodes.fleet.code_version import code_digest
@@ -17,20 +17,6 @@ from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_
 from semantic_mapper.nodes.fleet.worker import Task, file_digest, stored_weights
 
 MAX_WEIGHTS_BYTES = 4 << 30
-
-
-def open_store(url: str) -> Store:
-    """The store of a run, made if missing.
-
-    Raises:
-        DependencyError: the extra ``fleet`` is not installed.
-        ConfigError, StoreError: it cannot be used.
-    """
-    try:
-        import fsspec  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise DependencyError('a fleet needs more packages: pip install "semantic-mapper[fleet]"') from error
-    return Store(url, create=True)
 
 
 def make_template(

@@ -146,10 +146,18 @@ class Store:
             if target is not None:
                 self._try(name, lambda: self._place(target, data, os.link))
             else:
-                self._try(name, lambda: self._fs.pipe_file(self.path(name), data, mode="create"))
+                self._try(name, lambda: self._create_remote(name, data))
         except FileExistsError:
             return False
         return True
+
+    def _create_remote(self, name: str, data: bytes) -> None:
+        try:
+            self._fs.pipe_file(self.path(name), data, mode="create")
+        except OSError as error:  # servers do not all say in the same words that something is there
+            if self._fs.exists(self.path(name)):
+                raise FileExistsError(name) from error
+            raise
 
     def upload(self, file: Path, name: str) -> None:
         """Copy a local file into the store."""

@@ -38,10 +38,12 @@ def split_url(url: str) -> tuple[Any, str]:
     Raises:
         ConfigError: an unknown scheme.
         FleetError: a password in the URL.
-        DependencyError: the package for this scheme is missing.
+        DependencyError: the extra ``fleet``, or the package for this scheme, is missing.
     """
-    from fsspec.core import url_to_fs
-
+    try:
+        from fsspec.core import url_to_fs
+    except ModuleNotFoundError as error:
+        raise DependencyError(f'a fleet needs more packages ({error}): pip install "semantic-mapper[fleet]"') from error
     refuse_credentials(url)
     if not is_url(url) or url.startswith("file://"):
         url = str(Path(url.removeprefix("file://")).absolute())
