@@ -49,7 +49,7 @@ VOXEL_M = 0.03
 ROBOTS = 3
 NEAR_M = 0.05  # farther from the map, a true surface counts as missed
 TRUTH_VOXEL_M = 0.01
-ASKED = 20  # points of each building from which every class is looked for
+ASKED = 4  # points of each building from which every class is looked for
 
 
 class Score(msgspec.Struct, frozen=True):

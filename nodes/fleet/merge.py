@@ -113,20 +113,23 @@ class Alignment(msgspec.Struct, frozen=True):
         T_map_other: (4, 4); None = not known.
         agreeing, looked_for: Places of the other that say so, of so many.
         refusal: Why it is not known.
+        peak_bytes: Memory of the worker that has looked for it.
     """
 
     T_map_other: Rows | None
     agreeing: int = 0
     looked_for: int = 0
     refusal: str = ""
+    peak_bytes: int = 0
 
 
 class Placed(NamedTuple):
-    """A map with where it lies; ``note`` says how that is known."""
+    """A map with where it lies; ``note`` says how that is known, and ``peak_bytes`` what it took to find out."""
 
     facts: MapFacts
     source: TileSource
     note: str
+    peak_bytes: int
 
 
 class _Cut(NamedTuple):
@@ -222,7 +225,7 @@ def merge_maps(
     if not store.create(TILES_NAME, encode_tiles(manifest)):
         manifest = _there(store, plan)
     _remove_scraps(store, manifest)
-    peak = max((one.peak_bytes for one in (*cuts, *fused)), default=0)
+    peak = max((one.peak_bytes for one in (*placed, *cuts, *fused)), default=0)
     _log.info("maps_merged", store=store.shown, maps=len(maps), tiles=len(manifest.tiles), blocks=manifest.blocks)
     return MergeReport(manifest, notes, peak)
 
@@ -388,7 +391,8 @@ def _place(
         raise MapError(
             f"{names}: where it lies is not known; leave it out, or give its pose (--poses). {'; '.join(reasons)}"
         )
-    return [Placed(facts[n], known[n][1], known[n][2]) for n in range(len(facts))]
+    peak = max((alignment.peak_bytes for alignment in tried.values()), default=0)
+    return [Placed(facts[n], known[n][1], known[n][2], peak) for n in range(len(facts))]
 
 
 def _source(facts: MapFacts, T_world_map: Float64, placed: Any) -> TileSource:
@@ -427,10 +431,10 @@ def _align(store_url: str, url: str, other_url: str, digest: str, other_digest: 
         try:
             found = find_alignment(one, other, _WAY_OUT)
         except MapError as error:
-            alignment = Alignment(None, refusal=str(error))
+            alignment = Alignment(None, refusal=str(error), peak_bytes=_peak_bytes())
         else:
             rows: Any = tuple(tuple(float(x) for x in row) for row in found.T_map_other)
-            alignment = Alignment(rows, found.agreeing, found.looked_for)
+            alignment = Alignment(rows, found.agreeing, found.looked_for, "", _peak_bytes())
     store.write(name, msgspec.json.encode(alignment))
     return alignment
 
