@@ -35,10 +35,10 @@ from semantic_mapper.nodes.fleet.start import make_template
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.worker import Outcome, Task, run_task
 
-TINY_LOGS, TINY_FRAMES = 60, 2
-WORKER_LOGS, WORKER_FRAMES = 24, 40
+TINY_LOGS, TINY_FRAMES = 30, 2
+WORKER_LOGS, WORKER_FRAMES = 12, 40
 MANY = 10_000
-REPEATS = 3
+REPEATS = 2
 SETTINGS = ("quality=fast", "voxel_map.voxel_size_m=0.05")
 SMALL = Resources(cpus=1.0, memory_bytes=500_000_000)
 
