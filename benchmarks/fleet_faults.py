@@ -63,15 +63,15 @@ def write_logs(folder: Path, count: int = LOGS, frames: int = FRAMES) -> list[Pa
     return paths
 
 
-def start_fleet(logs: Path, store: Path, address: str, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+def start_fleet(logs: Path, store: Path, nodes: RayNodes) -> subprocess.Popen[bytes]:
     """The command, as a user starts it."""
     command = [str(Path(sys.executable).parent / "semantic-mapper"), "fleet", "run", "replay", f"{logs}/*.mcap"]
     with (store.parent / f"{store.name}.log").open("ab") as file:
         return subprocess.Popen(
-            [*command, "--out", str(store), "--ray", address, *SETTINGS],
+            [*command, "--out", str(store), "--ray", nodes.address, *SETTINGS],
             stdout=file,
             stderr=file,
-            env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+            env={**os.environ, "OMP_NUM_THREADS": "1", **nodes.environment},
         )
 
 
@@ -91,53 +91,50 @@ def wait_for(store: Path, results: int) -> None:
         time.sleep(0.02)
 
 
-def kill_node(logs: Path, store: Path, draw: random.Random) -> str:
+def kill_node(nodes: RayNodes, logs: Path, store: Path, draw: random.Random) -> str:
     """One of two nodes dies."""
-    with ray_nodes(head_cpus=1, worker_cpus=(1,)) as nodes:
-        fleet = start_fleet(logs, store, nodes.address, nodes.environment)
-        after = draw.randrange(1, LOGS - 3)
-        wait_for(store, after)
-        time.sleep(draw.uniform(0, 0.3))
-        nodes.kill(1)
-        finish(fleet, store)
+    node = nodes.start_worker(cpus=1)
+    fleet = start_fleet(logs, store, nodes)
+    after = draw.randrange(1, LOGS - 3)
+    wait_for(store, after)
+    time.sleep(draw.uniform(0, 0.3))
+    nodes.kill(node)
+    finish(fleet, store)
     return f"node killed after {after} logs"
 
 
-def kill_driver(logs: Path, store: Path, draw: random.Random) -> str:
+def kill_driver(nodes: RayNodes, logs: Path, store: Path, draw: random.Random) -> str:
     """The driver dies and is started again; the cluster stays."""
-    with ray_nodes(head_cpus=2) as nodes:
-        fleet = start_fleet(logs, store, nodes.address, nodes.environment)
-        after = draw.randrange(1, LOGS - 3)
-        wait_for(store, after)
-        time.sleep(draw.uniform(0, 0.3))
-        fleet.send_signal(signal.SIGKILL)
-        fleet.wait()
-        finish(start_fleet(logs, store, nodes.address, nodes.environment), store)
+    fleet = start_fleet(logs, store, nodes)
+    after = draw.randrange(1, LOGS - 3)
+    wait_for(store, after)
+    time.sleep(draw.uniform(0, 0.3))
+    fleet.send_signal(signal.SIGKILL)
+    fleet.wait()
+    finish(start_fleet(logs, store, nodes), store)
     return f"driver killed after {after} logs"
 
 
-def two_drivers(logs: Path, store: Path, draw: random.Random) -> str:
+def two_drivers(nodes: RayNodes, logs: Path, store: Path, draw: random.Random) -> str:
     """Two fleets fill one store."""
-    with ray_nodes(head_cpus=2) as nodes:
-        one = start_fleet(logs, store, nodes.address, nodes.environment)
-        time.sleep(draw.uniform(0, 2.0))
-        other = start_fleet(logs, store, nodes.address, nodes.environment)
-        finish(one, store)
-        finish(other, store)
+    one = start_fleet(logs, store, nodes)
+    time.sleep(draw.uniform(0, 2.0))
+    other = start_fleet(logs, store, nodes)
+    finish(one, store)
+    finish(other, store)
     done = [status["done"] for status in _drivers(store)]
     return f"drivers did {' and '.join(map(str, done))} of {LOGS}"
 
 
-def kill_workers(logs: Path, store: Path, draw: random.Random) -> str:
+def kill_workers(nodes: RayNodes, logs: Path, store: Path, draw: random.Random) -> str:
     """Processes that work on logs die, three in a round."""
     killed = 0
-    with ray_nodes(head_cpus=2) as nodes:
-        fleet = start_fleet(logs, store, nodes.address, nodes.environment)
-        for after in sorted(draw.sample(range(1, LOGS - 3), 3)):
-            wait_for(store, after)
-            time.sleep(draw.uniform(0, 0.2))
-            killed += _kill_worker(nodes, draw)
-        finish(fleet, store)
+    fleet = start_fleet(logs, store, nodes)
+    for after in sorted(draw.sample(range(1, LOGS - 3), 3)):
+        wait_for(store, after)
+        time.sleep(draw.uniform(0, 0.2))
+        killed += _kill_worker(nodes, draw)
+    finish(fleet, store)
     return f"{killed} workers killed"
 
 
@@ -156,7 +153,7 @@ def _title(process: psutil.Process) -> str:
         return ""
 
 
-ROUNDS: Mapping[str, Callable[[Path, Path, random.Random], str]] = {
+ROUNDS: Mapping[str, Callable[[RayNodes, Path, Path, random.Random], str]] = {
     "node": kill_node,
     "driver": kill_driver,
     "two": two_drivers,
@@ -206,6 +203,21 @@ def serial(logs: Path, store: Path) -> None:
     subprocess.run([sys.executable, "-c", program, str(logs), str(store), *sets], check=True, env=environment)
 
 
+def play(kind: str, number: int, nodes: RayNodes, out: Path, wanted: object) -> dict[str, Any]:
+    """One round; its store is kept where it did not pass."""
+    store = out / f"{kind}-{number}"
+    shutil.rmtree(store, ignore_errors=True)
+    began = time.monotonic()
+    what = ROUNDS[kind](nodes, out / "logs", store, random.Random(f"{kind} {number}"))
+    passed = contents(store) == wanted and not list(store.glob("failed/*.json"))
+    retries = sum(status["retries"] for status in _drivers(store))
+    result = f"{kind} {number}: {'passed' if passed else 'FAILED'}; {what}; {retries} retries"
+    print(f"{result}; {time.monotonic() - began:.0f} s", flush=True)
+    if passed:
+        shutil.rmtree(store)
+    return {"passed": passed, "what": what, "retries": retries}
+
+
 def main() -> None:
     """Run the rounds that are missing."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -225,26 +237,14 @@ def main() -> None:
     lines = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
     for kind in arguments.kinds:
         done = [line for line in lines if line["kind"] == kind and line["code"] == code]
-        for number in range(len(done), arguments.rounds):
-            store = out / f"{kind}-{number}"
-            shutil.rmtree(store, ignore_errors=True)
-            began = time.monotonic()
-            what = ROUNDS[kind](logs, store, random.Random(f"{kind} {number}"))
-            same = contents(store) == wanted
-            retries = sum(status["retries"] for status in _drivers(store))
-            quarantined = len(list(store.glob("failed/*.json")))
-            passed = same and not quarantined
-            line = {"kind": kind, "round": number, "passed": passed, "what": what, "retries": retries, "code": code}
-            lines.append(line)
-            with journal.open("a") as file:
-                file.write(json.dumps(line) + "\n")
-            print(
-                f"{kind} {number}: {'passed' if passed else 'FAILED'}; {what}; {retries} retries; "
-                f"{time.monotonic() - began:.0f} s",
-                flush=True,
-            )
-            if passed:
-                shutil.rmtree(store)
+        missing = range(len(done), arguments.rounds)
+        if missing:
+            with ray_nodes(head_cpus=1 if kind == "node" else 2) as nodes:
+                for number in missing:
+                    line = {"kind": kind, "round": number, **play(kind, number, nodes, out, wanted), "code": code}
+                    lines.append(line)
+                    with journal.open("a") as file:
+                        file.write(json.dumps(line) + "\n")
     for kind in arguments.kinds:
         rounds = [line for line in lines if line["kind"] == kind and line["code"] == code]
         passed = sum(line["passed"] for line in rounds)
