@@ -49,7 +49,7 @@ VOXEL_M = 0.03
 ROBOTS = 3
 NEAR_M = 0.05  # farther from the map, a true surface counts as missed
 TRUTH_VOXEL_M = 0.01
-ASKED = 4  # points of each building from which every class is looked for
+ASKED = 1  # points of each building from which every class is looked for
 
 
 class Score(msgspec.Struct, frozen=True):
@@ -236,20 +236,22 @@ def draw(parts: Sequence[Float32], merged: MapPoints, edge_blocks: int, seed: in
     of_parts, of_merged = figure.subplots(1, 2, sharex=True, sharey=True)
     for robot, xyz in enumerate(parts):
         low = xyz[(xyz[:, 2] < 2.0)][:: 1 + len(xyz) // 40_000]
-        of_parts.scatter(low[:, 0], low[:, 1], s=0.6, color=CYCLE[robot], label=f"robot {robot}", alpha=0.5, lw=0)
-    of_parts.legend(markerscale=12, loc="upper right")
+        of_parts.scatter(low[:, 0], low[:, 1], s=1.5, color=CYCLE[robot], label=f"robot {robot}", alpha=0.5, lw=0)
+    of_parts.legend(markerscale=8, loc="upper right")
     of_parts.set_title(f"building {seed}: three maps, in the building's world")
     low = np.flatnonzero(merged.xyz[:, 2] < 2.0)[:: 1 + len(merged.xyz) // 150_000]
     order = low[np.argsort(merged.xyz[low, 2])]
-    of_merged.scatter(*merged.xyz[order, :2].T, s=0.6, c=ROOMS.colorize(merged.label[order]) / 255, lw=0)
+    of_merged.scatter(*merged.xyz[order, :2].T, s=1.5, c=ROOMS.colorize(merged.label[order]) / 255, lw=0)
     edge_m = edge_blocks * 8 * VOXEL_M
     for axis, line in ((0, of_merged.axvline), (1, of_merged.axhline)):
         ends = np.floor(merged.xyz[:, axis].min() / edge_m), np.ceil(merged.xyz[:, axis].max() / edge_m)
         for n in np.arange(ends[0], ends[1] + 1):
-            line(n * edge_m, color="black", lw=0.8)
+            line(n * edge_m, color="white", lw=0.8)
     of_merged.set_title("merged, by class; lines are edges of tiles")
     for axes in (of_parts, of_merged):
         axes.set_aspect("equal")
+        axes.set_xlim(merged.xyz[:, 0].min() - 0.5, merged.xyz[:, 0].max() + 0.5)
+        axes.set_ylim(merged.xyz[:, 1].min() - 0.5, merged.xyz[:, 1].max() + 0.5)
         axes.set_xlabel("metres")
         axes.grid(visible=False)
     return figure
