@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import Settings, verb
 from semantic_mapper.nodes.process import StopRequest
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def run(
     ] = 0.0,
     timeout: Annotated[
         float,
-        typer.Option(metavar="HOURS", min=0.0, help="A log that takes longer has failed; 0 = none.  [default: 0]"),
+        typer.Option(metavar="HOURS", min=0.0, help="A log that takes longer has failed; 0 = none."),
     ] = 0.0,
     retry_quarantined: Annotated[
         bool, typer.Option("--retry-quarantined", help="Also try logs that failed in an earlier run.")
@@ -115,30 +115,31 @@ def run(
     output.quiet = json
     from semantic_mapper.nodes.fleet.cluster import connected
     from semantic_mapper.nodes.fleet.inputs import find_inputs
-    from semantic_mapper.nodes.fleet.operations import OPERATIONS
+    from semantic_mapper.nodes.fleet.operations import OPERATIONS, read_settings
     from semantic_mapper.nodes.fleet.runner import FleetRun, Resources
     from semantic_mapper.nodes.fleet.start import make_template
     from semantic_mapper.nodes.fleet.store import Store
 
     kind = OPERATIONS[operation.value]
     inputs = find_inputs(logs, kind.suffix)
-    store = Store(out, create=True)
     assignments = [*(("render.device=cuda",) if gpus and kind.rest == "mapper" else ()), *(settings or ())]
+    read_settings(operation.value, assignments, config)  # before a store is made
+    store = Store(out, create=True)
     template = make_template(operation.value, store, weights, assignments, config, round(worker_disk * 1e9))
     resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9), max_parallel, timeout * 3600)
     with (
         StopRequest() as stop,
-        connected(ray, trusted_network=trusted_network) as cluster,
+        connected(ray, trusted_network=trusted_network, worker_logs=Settings.verbose) as cluster,
         frame_progress(f"fleet {operation.value}", len(inputs), unit="logs") as bar,
     ):
         fleet = FleetRun(store, template, inputs, resources, cluster, retry_quarantined=retry_quarantined)
         status = fleet.run(lambda: stop, lambda now: bar.set(now.done + now.existing + now.failed, _note(now)))
     output.print(_sentence(status, store.shown))
-    if status.failed:
-        for failure in store.failures():
-            output.print(f"  quarantined: {failure.log}: {failure.errors[-1]}")
+    for failure in fleet.failures:
+        output.print(f"  quarantined: {failure.log}: {failure.errors[-1]}")
     if json:
-        output.json({"store": store.shown, **_plain(status)})
+        quarantined = [{"log": failure.log, "errors": list(failure.errors)} for failure in fleet.failures]
+        output.json({"store": store.shown, **_plain(status), "quarantined": quarantined})
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the same command resumes it", style="yellow")
         return stop.exit_code

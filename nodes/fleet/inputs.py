@@ -60,7 +60,7 @@ def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
 
 
 def _expand(argument: str, suffix: str) -> Iterator[LogInput]:
-    if argument.lower().endswith(MANIFEST_SUFFIXES):
+    if _without_query(argument).lower().endswith(MANIFEST_SUFFIXES):
         yield from _read_manifest(argument)
         return
     fs, path = split_url(argument)
@@ -80,9 +80,16 @@ def _expand(argument: str, suffix: str) -> Iterator[LogInput]:
         names = [name for name in names if name.lower().endswith(suffix)]
     if not names:
         kind = "folder" if folders else f"file that ends in {suffix}"
-        raise ConfigError(f"{shown(argument)}: matches no {kind}; put the pattern in quotes, and try it with `ls`")
+        raise ConfigError(
+            f"{shown(argument)}: matches no {kind}; put the pattern in quotes, try it with `ls`, and write [[] for a [ "
+            "of a name"
+        )
     for name in names:
         yield LogInput(unstripped(fs, name, argument))
+
+
+def _without_query(argument: str) -> str:
+    return argument.split("?", 1)[0] if argument.startswith(("http://", "https://")) else argument
 
 
 def _absolute(argument: str) -> str:
@@ -100,8 +107,12 @@ def _read_manifest(argument: str) -> Iterator[LogInput]:
         data: bytes = persistently(lambda: fs.cat_file(path), shown(argument))
     except FileNotFoundError as error:
         raise ConfigError(f"{shown(argument)}: no such manifest") from error
-    rows = _parquet_rows(data, argument) if path.lower().endswith(".parquet") else _csv_rows(data, argument)
-    base = argument.rsplit("/", 1)[0] if is_url(argument) else path.rsplit("/", 1)[0]
+    rows = (
+        _parquet_rows(data, argument)
+        if _without_query(path).lower().endswith(".parquet")
+        else _csv_rows(data, argument)
+    )
+    base = _without_query(argument).rsplit("/", 1)[0] if is_url(argument) else path.rsplit("/", 1)[0]
     count = 0
     for number, row in enumerate(rows, 1):
         log = (row.pop(LOG_COLUMN, "") or "").strip()
@@ -111,7 +122,7 @@ def _read_manifest(argument: str) -> Iterator[LogInput]:
         yield LogInput(_absolute(url), {name: value for name, value in row.items() if value})
         count += 1
     if not count:
-        raise ConfigError(f"{shown(argument)}: has no rows")
+        raise ConfigError(f"{shown(argument)}: has no rows; add one for each log")
 
 
 def _csv_rows(data: bytes, where: str) -> Iterator[dict[str, str]]:
@@ -121,13 +132,19 @@ def _csv_rows(data: bytes, where: str) -> Iterator[dict[str, str]]:
         raise ConfigError(f"{shown(where)}: is no text in UTF-8 ({error})") from error
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
-        if LOG_COLUMN not in (reader.fieldnames or ()):
+        names = list(reader.fieldnames or ())
+        if LOG_COLUMN not in names:
             raise ConfigError(
-                f"{shown(where)}: has no column '{LOG_COLUMN}' (it has {', '.join(reader.fieldnames or ()) or 'none'})"
+                f"{shown(where)}: has no column '{LOG_COLUMN}' (it has {', '.join(names) or 'none'}); name the column "
+                "with paths or URLs so"
             )
+        if len(set(names)) < len(names):
+            raise ConfigError(f"{shown(where)}: two columns have the same name; rename one of them")
         for row in reader:
             if None in row or None in row.values():
-                raise ConfigError(f"{shown(where)}: line {reader.line_num} has another number of columns than its head")
+                raise ConfigError(
+                    f"{shown(where)}: line {reader.line_num} has another number of columns than its head; mend it"
+                )
             yield dict(row)
     except csv.Error as error:
         raise ConfigError(f"{shown(where)}: line {reader.line_num}: {error}") from error

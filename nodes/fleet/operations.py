@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
+import numpy as np
 
 from semantic_mapper.config import (
     Config,
@@ -27,6 +29,9 @@ from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES
 from semantic_mapper.nodes.fleet.results import ClassRow, EventRow, Findings, SegmentRow
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.training.finetune import FinetuneConfig
+
+if TYPE_CHECKING:
+    from semantic_mapper.replay.session import MapSession
 
 LOG_SUFFIX, MAP_SUFFIX = ".mcap", ".npz"
 THUMBNAIL = "thumbnail.jpg"
@@ -138,7 +143,8 @@ def read_settings(operation: str, assignments: Sequence[str], config: Path | Non
         if not equals or not name:
             raise ConfigError(f"--set {text}: write NAME=VALUE, such as max_frames=100")
         path = name.split(".")
-        if path[0] not in own and rest:
+        if path[0] not in own:
+            _check_known(operation, path[0], name)
             path = [rest, *path]
         _assign(plain, path, _value(value), name)
     settings = convert_config(plain, kind, "--set")
@@ -146,6 +152,21 @@ def read_settings(operation: str, assignments: Sequence[str], config: Path | Non
         mapper = rename_settings(plain.get(_MAPPER, {}), MapperConfig, "--set")
         check_quality(mapper, settings.mapper.quality, "--set")  # pyright: ignore[reportAttributeAccessIssue]
     return settings
+
+
+def _check_known(operation: str, first: str, name: str) -> None:
+    """Refuse a setting that neither the operation nor what its other settings belong to has."""
+    kind, rest = OPERATIONS[operation].settings, OPERATIONS[operation].rest
+    fields = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
+    names = [own for own in fields if own != rest]
+    if rest:
+        inner: type[Config] = fields[rest]
+        names += [field.encode_name for field in msgspec.structs.fields(inner)]
+        names += list(inner.old_names)
+    if first not in names:
+        near = difflib.get_close_matches(first, names, n=1, cutoff=0.5)
+        mend = f"did you mean `{near[0]}`?" if near else f"there is {', '.join(names)}"
+        raise ConfigError(f"--set {name}: `{operation}` has no such setting; {mend}")
 
 
 def _value(text: str) -> Any:
@@ -165,8 +186,9 @@ def _assign(plain: dict[str, Any], path: Sequence[str], value: Any, name: str) -
 
 
 def changed_settings(settings: Config) -> dict[str, Any]:
-    """What differs from the defaults, by dotted names, for people and tables."""
-    return dict(_changes(to_plain(settings), to_plain(type(settings)()), ""))
+    """What differs from the defaults, by dotted names as ``--set`` takes them, for people and tables."""
+    changes = _changes(to_plain(settings), to_plain(type(settings)()), "")
+    return {name.removeprefix(f"{_MAPPER}.").removeprefix(f"{_FIT}."): value for name, value in changes}
 
 
 def _changes(plain: Mapping[str, Any], default: Mapping[str, Any], prefix: str) -> list[tuple[str, Any]]:
@@ -205,14 +227,13 @@ def _replay(job: Job) -> Findings:
     costs = {f"step_ms_{name}": _number(value) for name, value in summary["latency_ms"].items()}
     costs["map_memory_mb"] = _number(summary["map"]["memory_mb"])
     classes = [ClassRow("replay", name, iou) for name, iou in (dig(summary, "metrics.per_class") or {}).items()]
-    thumbnail = _write_thumbnail(job.out / "overview.png", job.out)
     return Findings(
         metrics=metrics,
         costs=costs,
         classes=tuple(classes),
         events=_events(summary),
         segments=tuple(_segments("replay", session.segments)),
-        thumbnail=thumbnail,
+        thumbnail=_write_thumbnail(session, job.out),
         report=REPORT_NAME,
     )
 
@@ -360,16 +381,17 @@ def _segments(method: str, segments: Segments) -> list[SegmentRow]:
     ]
 
 
-def _write_thumbnail(picture: Path, out: Path) -> str:
-    """A small copy of a picture, for reports of many logs; its name, empty where there is no picture."""
+def _write_thumbnail(session: MapSession, out: Path) -> str:
+    """A frame beside what was rendered for it, for reports of many logs; its name, empty where no frame was mapped."""
     import cv2
 
-    pixels = cv2.imread(str(picture))
-    if pixels is None:
+    if not session.snapshots:
         return ""
-    height = round(pixels.shape[0] * THUMBNAIL_WIDTH / pixels.shape[1])
+    frame, update = session.snapshots[len(session.snapshots) // 2]
+    pixels = np.hstack((frame.rgb, session.pipeline.label_set.colorize(update.label)))
+    height = max(round(pixels.shape[0] * THUMBNAIL_WIDTH / pixels.shape[1]), 1)
     small = cv2.resize(pixels, (THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
-    (out / THUMBNAIL).write_bytes(cv2.imencode(".jpg", small)[1].tobytes())
+    (out / THUMBNAIL).write_bytes(cv2.imencode(".jpg", small[:, :, ::-1])[1].tobytes())
     return THUMBNAIL
 
 
@@ -378,4 +400,4 @@ def _number(value: Any) -> float | None:
 
 
 def _unheard(count: int) -> None:
-    """Progress inside of a log is nobody's business: whole logs are counted."""
+    """Progress inside of a log is not shown: whole logs are counted."""

@@ -30,7 +30,7 @@ class EventRow(msgspec.Struct, frozen=True):
     """Something in a log that a person may want to look at.
 
     Args:
-        kind: "refused", "label_refused", "damaged", "warning", "retry", ...
+        kind: "note", "refused" and "damaged" (replay, eval), "unlabelled" (autolabel), "keyframes" (finetune).
         text: What happened.
         seq: Of the frame, -1 where it is of no single frame.
         stamp_ns: Of the frame, 0 where it is of no single frame.
@@ -129,8 +129,8 @@ class Failure(msgspec.Struct, frozen=True):
     """A quarantined task: it failed twice and is not tried again unless asked for.
 
     Args:
-        key: Of the task where the log could be read, else a digest of its URL.
-        operation, log, tags, version: As in ``TaskResult``.
+        key: Digest of operation, URL, weights and settings: no result's key.
+        operation, log, tags, version, code: As in ``TaskResult``.
         errors: What each attempt ended with.
         finished_ns: When the last one ended.
     """
@@ -142,6 +142,7 @@ class Failure(msgspec.Struct, frozen=True):
     version: str
     errors: tuple[str, ...]
     finished_ns: int
+    code: str = ""
     format: int = FORMAT_VERSION
 
 

@@ -7,6 +7,7 @@ of its own, so that they meet seldom.
 
 from __future__ import annotations
 
+import faulthandler
 import hashlib
 import heapq
 import os
@@ -19,29 +20,32 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgspec
-import structlog
 
 from semantic_mapper.backoff import backoff_s
-from semantic_mapper.errors import FleetError, StoreError
+from semantic_mapper.errors import FleetError, SemanticMapperError, StoreError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.cluster import Cluster
 from semantic_mapper.nodes.fleet.code_version import code_version
 from semantic_mapper.nodes.fleet.inputs import LogInput
 from semantic_mapper.nodes.fleet.results import Failure
+from semantic_mapper.nodes.fleet.scratch import DiskError
 from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.urls import shown
+from semantic_mapper.nodes.fleet.urls import shown, without_secrets
 from semantic_mapper.nodes.fleet.worker import OtherCodeError, Outcome, Task, run_task
 
 FAILURES = 2  # of a log, and it is quarantined
 CRASHES = 3  # of the process that works on a log: the first may have been the machine's fault
 LOST_NODES = 20  # that a log may have been on
-STORE_FAILURES = 5  # in a row, each after many tries of its own, and the run ends
+UNREACHABLE = 4  # times that log or store could not be reached, or the disk was full, before a log is quarantined
+LOGS_IN_A_ROW = 5  # to which that happens, none in between is done, and the run ends
 FIRST_PAUSE_S, MAX_PAUSE_S = 1.0, 60.0
 AHEAD = 2  # tasks handed to Ray for each that can run
 LOOK_S = 2.0  # how often the cluster is asked for its nodes
 REPORT_S = 5.0  # how often progress is written to the store
 MAX_ERROR = 2000  # letters
+MAX_LISTED = 50  # quarantined logs that a run names
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class DriverStatus(msgspec.Struct, frozen=True):
@@ -85,8 +89,7 @@ class Resources:
         cpus, gpus: Also fractions.
         memory_bytes: Of its node.
         max_parallel: Tasks at a time; 0 = what the cluster has room for.
-        timeout_s: A task that is not done after so long, with its wait in the cluster's queue, is ended and counts as
-            failed; 0 = none.
+        timeout_s: A task that runs for longer is ended and counts as failed; 0 = none.
     """
 
     cpus: float = 1.0
@@ -105,8 +108,8 @@ class _Try:
     failures: int = 0
     crashes: int = 0
     lost: int = 0
+    unreachable: int = 0
     since: float = 0.0  # handed to Ray
-    too_long: bool = False
 
 
 class FleetRun:
@@ -142,8 +145,9 @@ class FleetRun:
         self._running: dict[Any, _Try] = {}
         self._waiting: list[tuple[float, int, _Try]] = []  # by the time when it may be tried again
         self._order = 0
-        self._quarantined = frozenset[str]()
-        self._store_failures = 0
+        self._known_failures: dict[str, Failure] = {}  # of earlier runs
+        self.failures: list[Failure] = []  # of this run, and those that it left out; the first ones
+        self._in_a_row = set[str]()
         self._fit, self._looked = 0, -LOOK_S
         self._began = time.monotonic()
         self.status = DriverStatus(
@@ -152,7 +156,7 @@ class FleetRun:
             pid=os.getpid(),
             operation=template.operation,
             version=code_version(),
-            cluster=cluster.address,
+            cluster=cluster.address + (", trusted network" if cluster.trusted_network else ""),
             total=len(order),
             done=0,
             existing=0,
@@ -178,7 +182,7 @@ class FleetRun:
         """
         import ray
 
-        remote = ray.remote(self._function).options(
+        remote = ray.remote(_bounded(self._function, self._resources.timeout_s)).options(
             num_cpus=self._resources.cpus,
             num_gpus=self._resources.gpus,
             memory=self._resources.memory_bytes,
@@ -186,11 +190,10 @@ class FleetRun:
             scheduling_strategy="SPREAD",
             name=f"fleet {self._template.operation}",
         )
-        if not self._retry_quarantined:
-            self._quarantined = frozenset(self._store.names("failed"))
+        self._known_failures = {failure.key: failure for failure in self._store.failures()}
         self._check_fits()
         reported = 0.0
-        ended = "failed"
+        ended = "stopped by an error"
         try:
             while not stopped():
                 self._submit(remote)
@@ -198,7 +201,6 @@ class FleetRun:
                     ended = "done"
                     break
                 self._collect()
-                self._end_slow()
                 on_progress(self._updated())
                 if time.monotonic() - reported > REPORT_S:
                     self._report()
@@ -207,6 +209,9 @@ class FleetRun:
                 ended = "stopped"
                 for reference in self._running:
                     ray.cancel(reference, force=True)
+        except SemanticMapperError as error:
+            ended = str(error)[:MAX_ERROR]
+            raise
         finally:
             self.status = msgspec.structs.replace(self._updated(), ended=ended)
             self._report()
@@ -214,16 +219,14 @@ class FleetRun:
 
     def _check_fits(self) -> None:
         """Refuse at once what would wait for ever."""
-        needs = (("CPU", self._resources.cpus), ("GPU", self._resources.gpus), ("memory", self._resources.memory_bytes))
-        for name, needed in needs:
-            most = max((node.get(name, 0.0) for node in _living_nodes()), default=0.0)
-            if needed > most:
-                unit = 1e9 if name == "memory" else 1.0
-                raise FleetError(
-                    f"a task needs {needed / unit:g} {'GB of memory' if name == 'memory' else name}, and no node of "
-                    f"the cluster has more than {most / unit:.3g}; ask for less (--cpus, --gpus, --memory) or join a "
-                    "larger cluster"
-                )
+        nodes = _living_nodes()
+        if any(_fit(node, self._resources) for node in nodes):
+            return
+        found = "; ".join(sorted({_described(node) for node in nodes}))
+        raise FleetError(
+            f"a task needs {_described(_needs(self._resources))}, which no node of the cluster has ({found}); ask for "
+            "less (--cpus, --gpus, --memory) or join a larger cluster"
+        )
 
     def _room(self) -> int:
         """How many tasks may be in Ray's hands."""
@@ -237,7 +240,7 @@ class FleetRun:
     def _submit(self, remote: Any) -> None:
         room = self._room()
         while len(self._running) < room and (attempt := self._next()) is not None:
-            attempt.since, attempt.too_long = time.monotonic(), False
+            attempt.since = time.monotonic()
             self._running[remote.remote(attempt.task)] = attempt
 
     def _next(self) -> _Try | None:
@@ -245,8 +248,9 @@ class FleetRun:
             return heapq.heappop(self._waiting)[2]
         for item in self._inputs:
             task = replace(self._template, url=item.url, tags=item.tags)
-            if f"{_failure_key(task)}.json" in self._quarantined:
-                self._count(failed=1)
+            failure = self._known_failures.get(_failure_key(task))
+            if failure is not None and failure.code == task.code and not self._retry_quarantined:
+                self._note_failure(failure)
                 continue
             return _Try(task)
         return None
@@ -265,16 +269,6 @@ class FleetRun:
             for reference in more:
                 self._take(reference, self._running.pop(reference))
 
-    def _end_slow(self) -> None:
-        """End what takes longer than allowed; it comes back as a process that died."""
-        import ray
-
-        timeout_s = self._resources.timeout_s
-        for reference, attempt in self._running.items() if timeout_s else ():
-            if not attempt.too_long and time.monotonic() - attempt.since > timeout_s:
-                attempt.too_long = True
-                ray.cancel(reference, force=True)
-
     def _take(self, reference: Any, attempt: _Try) -> None:
         import ray
         from ray import exceptions
@@ -283,38 +277,37 @@ class FleetRun:
             outcome: Outcome = ray.get(reference)
         except exceptions.RayTaskError as error:
             self._failed(attempt, error.cause, str(error.cause))
-        except (exceptions.WorkerCrashedError, exceptions.TaskCancelledError) as error:
-            if attempt.too_long:
-                attempt.failures += 1
-                error_s = f"took longer than {self._resources.timeout_s:g} s"
-                self._again(attempt, error_s, attempt.failures >= FAILURES)
-            else:
-                self._died(attempt, error)
-        except exceptions.OutOfMemoryError as error:
+        except (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError) as error:
             self._died(attempt, error)
         except (
             exceptions.RayError
         ) as error:  # a node died, the answer is lost, or the cluster in trouble: not the log's fault
             self._lost(attempt, f"{type(error).__name__}: {error}")
         else:
-            self._store_failures = 0
-            if attempt.errors or self._retry_quarantined:
+            self._in_a_row.clear()
+            if _failure_key(attempt.task) in self._known_failures:
                 self._store.release(_failure_key(attempt.task))
             self._count(done=outcome.status == "done", existing=outcome.status == "exists")
 
     def _failed(self, attempt: _Try, cause: BaseException, text: str) -> None:
         if isinstance(cause, OtherCodeError):
             raise FleetError(text) from cause  # every log would fail like that
-        if isinstance(cause, StoreError):
-            self._store_failures += 1
-            if self._store_failures >= STORE_FAILURES:
-                raise StoreError(f"{text}; {STORE_FAILURES} tasks in a row; what is done is kept") from cause
-            self._again(attempt, text, False)
+        if isinstance(cause, StoreError | DiskError):
+            self._in_a_row.add(attempt.task.url)
+            if len(self._in_a_row) >= LOGS_IN_A_ROW:
+                raise type(cause)(f"{text}; so it went for {LOGS_IN_A_ROW} logs in a row; what is done is kept")
+            attempt.unreachable += 1
+            self._again(attempt, text, attempt.unreachable >= UNREACHABLE)
             return
         attempt.failures += 1
         self._again(attempt, f"{type(cause).__name__}: {text}", attempt.failures >= FAILURES)
 
     def _died(self, attempt: _Try, error: BaseException) -> None:
+        timeout_s = self._resources.timeout_s
+        if timeout_s and time.monotonic() - attempt.since >= timeout_s:
+            attempt.failures += 1
+            self._again(attempt, f"took longer than {timeout_s:g} s, and was ended", attempt.failures >= FAILURES)
+            return
         attempt.crashes += 1
         self._again(attempt, f"the process died: {error}", attempt.crashes >= CRASHES)
 
@@ -324,7 +317,7 @@ class FleetRun:
 
     def _again(self, attempt: _Try, error: str, give_up: bool) -> None:
         task = attempt.task
-        attempt.errors.append(" ".join(error.split())[:MAX_ERROR])
+        attempt.errors.append(without_secrets(" ".join(error.split()))[:MAX_ERROR])
         if give_up:
             _log.error("log_quarantined", log=shown(task.url), error=attempt.errors[-1])
             failure = Failure(
@@ -335,9 +328,10 @@ class FleetRun:
                 version=self.status.version,
                 errors=tuple(attempt.errors),
                 finished_ns=time.time_ns(),
+                code=task.code,
             )
             self._store.quarantine(failure)
-            self._count(failed=1)
+            self._note_failure(failure)
             return
         pause_s = backoff_s(len(attempt.errors), FIRST_PAUSE_S, MAX_PAUSE_S)
         _log.warning("log_failed", log=shown(task.url), error=attempt.errors[-1], again_in_s=pause_s)
@@ -345,6 +339,11 @@ class FleetRun:
         self._order += 1
         heapq.heappush(self._waiting, (time.monotonic() + pause_s, self._order, attempt))
         self._count(retries=1)
+
+    def _note_failure(self, failure: Failure) -> None:
+        if len(self.failures) < MAX_LISTED:
+            self.failures.append(failure)
+        self._count(failed=1)
 
     def _count(self, **more: int) -> None:
         changed = {name: getattr(self.status, name) + int(count) for name, count in more.items()}
@@ -366,7 +365,26 @@ class FleetRun:
         return self.status
 
     def _report(self) -> None:
-        self._store.write(f"drivers/{self.status.id}.json", msgspec.json.encode(self.status))
+        """Say in the store how far it is; a run does not end for want of that."""
+        try:
+            self._store.write(f"drivers/{self.status.id}.json", msgspec.json.encode(self.status), tries=1)
+        except StoreError as error:
+            _log.warning("progress_not_written", error=str(error))
+
+
+def _bounded(function: Callable[[Task], Outcome], timeout_s: float) -> Callable[[Task], Outcome]:
+    """The function in a process that ends itself after a time, even in native code."""
+    if not timeout_s:
+        return function
+
+    def run(task: Task) -> Outcome:
+        faulthandler.dump_traceback_later(timeout_s, exit=True)
+        try:
+            return function(task)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+    return run
 
 
 def _living_nodes() -> list[dict[str, float]]:
@@ -376,19 +394,24 @@ def _living_nodes() -> list[dict[str, float]]:
     return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
+def _needs(resources: Resources) -> dict[str, float]:
+    """By Ray's names."""
+    needed = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": float(resources.memory_bytes)}
+    return {name: amount for name, amount in needed.items() if amount}
+
+
+def _described(node: dict[str, float]) -> str:
+    """CPUs, GPUs and memory, for people."""
+    gpus = f", {node['GPU']:g} GPUs" if node.get("GPU") else ""
+    return f"{node.get('CPU', 0.0):g} CPUs{gpus}, {node.get('memory', 0.0) / 1e9:.3g} GB of memory"
+
+
 def _fit(node: dict[str, float], resources: Resources) -> int:
     """How many tasks a node has room for."""
-    counts = [
-        int(node.get(name, 0.0) / needed)
-        for name, needed in (("CPU", resources.cpus), ("GPU", resources.gpus), ("memory", resources.memory_bytes))
-        if needed
-    ]
-    return min(counts, default=0)
+    return min(int(node.get(name, 0.0) / needed) for name, needed in _needs(resources).items())
 
 
 def _failure_key(task: Task) -> str:
-    """Of a log, what is done with it, and the code: a new version tries it again."""
-    text = "\n".join(
-        (task.operation, task.url, task.weights_digest, msgspec.json.encode(task.settings).decode(), task.code)
-    )
+    """Of a log and what is done with it; other code tries it again."""
+    text = "\n".join((task.operation, task.url, task.weights_digest, msgspec.json.encode(task.settings).decode()))
     return hashlib.sha256(text.encode()).hexdigest()[:40]

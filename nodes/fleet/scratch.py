@@ -32,6 +32,10 @@ def scratch_root() -> Path:
     return root
 
 
+class DiskError(FleetError):
+    """This machine has too little disk for a task; another one may have more."""
+
+
 @contextmanager
 def task_folder(needed_bytes: int, limit_bytes: int) -> Iterator[Path]:
     """An empty folder for one task; waits while other tasks of this machine take what the limit allows.
@@ -43,7 +47,7 @@ def task_folder(needed_bytes: int, limit_bytes: int) -> Iterator[Path]:
         limit_bytes: For all tasks of this machine together; 0 = what the disk has, but for a gigabyte.
 
     Raises:
-        FleetError: the task needs more than the limit by itself, or than the disk has.
+        DiskError: the task needs more than the limit by itself, or than the disk has.
     """
     root = scratch_root()
     folder, lock = _reserve(root, needed_bytes, limit_bytes)
@@ -67,7 +71,7 @@ def _reserve(root: Path, needed: int, limit: int) -> tuple[Path, int]:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 return folder, lock
         if not taken or needed > allowed:
-            raise FleetError(
+            raise DiskError(
                 f"{root}: a task needs {needed / 1e9:.2f} GB of disk, {allowed / 1e9:.2f} GB are allowed; raise "
                 "--worker-disk, or set TMPDIR to a larger disk"
             )

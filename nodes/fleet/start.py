@@ -71,10 +71,13 @@ def _find_weights(operation: str, store: Store, weights: str | None) -> tuple[st
         with task_folder(size, 0) as folder:
             local = folder / name
             persistently(lambda: fs.get_file(path, str(local)), shown(weights))
-            if refines:
-                load_nesf(local)
-            else:
-                load_checkpoint(local)
+            try:
+                if refines:
+                    load_nesf(local)
+                else:
+                    load_checkpoint(local)
+            except WeightsError as error:
+                raise WeightsError(str(error).replace(str(local), shown(weights))) from error
             digest = file_digest(local)
             place = stored_weights(digest, name)
             if not store.exists(place):

@@ -7,6 +7,7 @@ half a result. Nothing is locked, so nothing is left locked by what was killed.
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
@@ -67,10 +68,14 @@ class Store:
 
     def _check_mark(self, *, create: bool) -> None:
         mark = {"format": STORE_FORMAT, "version": STORE_VERSION}
+        if self.local is not None and self.local.is_file():
+            raise ConfigError(f"{self.shown}: is a file, no fleet store; choose another --out")
         data = self._read_or_none(_MARK)
         if data is None:
             if not create:
                 raise ConfigError(f"{self.shown}: is no fleet store; give what `fleet run --out` has written")
+            if self.local is not None and self.names(""):
+                raise ConfigError(f"{self.shown}: is there and no fleet store; choose another --out")
             self.create(_MARK, msgspec.json.encode(mark))
             return
         try:
@@ -85,14 +90,14 @@ class Store:
 
     # Objects
 
-    def _try(self, name: str, call: Callable[[], _T]) -> _T:
+    def _try(self, name: str, call: Callable[[], _T], tries: int | None = None) -> _T:
         """Do it, again after pauses where the store could not be reached.
 
         Raises:
             StoreError: it cannot be reached, or refuses.
             FileNotFoundError, FileExistsError: as they say.
         """
-        return persistently(call, f"{self.shown}/{name}" if name else self.shown, 1 if self.local else TRIES)
+        return persistently(call, f"{self.shown}/{name}" if name else self.shown, tries or (1 if self.local else TRIES))
 
     def path(self, name: str) -> str:
         """Of an object, as the file system takes it."""
@@ -124,13 +129,13 @@ class Store:
             return False
         return True
 
-    def write(self, name: str, data: bytes) -> None:
+    def write(self, name: str, data: bytes, *, tries: int | None = None) -> None:
         """Write an object, whole or not at all; replaces one that is there."""
         if self.local is not None:
             target = self.local / name
             self._try(name, lambda: self._place(target, data, os.replace))
         else:
-            self._try(name, lambda: self._fs.pipe_file(self.path(name), data))
+            self._try(name, lambda: self._fs.pipe_file(self.path(name), data), tries)
 
     def create(self, name: str, data: bytes) -> bool:
         """Write an object where none is yet, whole or not at all.
@@ -144,7 +149,7 @@ class Store:
         target = None if self.local is None else self.local / name
         try:
             if target is not None:
-                self._try(name, lambda: self._place(target, data, os.link))
+                self._try(name, lambda: self._place(target, data, _link))
             else:
                 self._try(name, lambda: self._create_remote(name, data))
         except FileExistsError:
@@ -187,7 +192,17 @@ class Store:
     def remove(self, name: str, *, folder: bool = False) -> None:
         """Delete an object or all below a folder; it may be missing."""
         with suppress(FileNotFoundError):
-            self._try(name, lambda: self._fs.rm(self.path(name), recursive=folder))
+            self._try(name, lambda: self._remove(name, folder=folder))
+
+    def _remove(self, name: str, *, folder: bool) -> None:
+        if self.local is not None:
+            if folder:
+                shutil.rmtree(self.local / name)
+            else:
+                (self.local / name).unlink()
+            return
+        for path in self._fs.find(self.path(name)) if folder else [self.path(name)]:
+            self._fs.rm_file(path)  # not ``rm``, which takes names for patterns
 
     def names(self, folder: str) -> list[str]:
         """Names of what is directly below a folder, sorted; empty where it is missing."""
@@ -203,12 +218,17 @@ class Store:
         """Objects by name, some at once; missing ones are left out."""
         for batch in batched(names, _AT_ONCE):
             paths = {self.path(name): name for name in batch}
-            found: dict[str, Any] = self._try("", lambda: self._fs.cat(list(paths), on_error="return"))  # noqa: B023
-            for path, name in paths.items():
-                data = found.get(path)
-                if data is None or isinstance(data, FileNotFoundError):
-                    continue
-                yield name, data if isinstance(data, bytes) else self.read(name)  # again, with retries
+            whole = [None] * len(paths)
+            # Not ``cat``, which takes names for patterns.
+            found: list[Any] = self._try(
+                "",
+                lambda: self._fs.cat_ranges(list(paths), whole, whole, on_error="return"),  # noqa: B023
+            )
+            for name, data in zip(paths.values(), found, strict=True):
+                if isinstance(data, bytes):
+                    yield name, data
+                elif (again := self._read_or_none(name)) is not None:  # with retries
+                    yield name, again
 
     # Results
 
@@ -235,15 +255,20 @@ class Store:
     def commit(self, result: TaskResult) -> bool:
         """Make a result count; False where another attempt has been quicker, and this one's files are removed."""
         if self.create(f"results/{result.key}/{RESULT_FILE}", encode_document(result)):
-            for name in self.names(f"results/{result.key}"):
-                if name != RESULT_FILE and f"results/{result.key}/{name}" != result.folder:
-                    self.remove(f"results/{result.key}/{name}", folder=True)  # of attempts that were killed
+            if self.local is not None:  # elsewhere another attempt might still replace this result by its own
+                self._remove_other_attempts(result)
             return True
         winner = self.result(result.key)
         if winner is not None and winner.folder == result.folder:
             return True  # it was written, and only the answer was lost
         self.remove(result.folder, folder=True)
         return False
+
+    def _remove_other_attempts(self, result: TaskResult) -> None:
+        """What killed attempts have left."""
+        for name in self.names(f"results/{result.key}"):
+            if name != RESULT_FILE and f"results/{result.key}/{name}" != result.folder:
+                self.remove(f"results/{result.key}/{name}", folder=True)
 
     def quarantine(self, failure: Failure) -> None:
         """Note that a task failed for good."""
@@ -260,7 +285,8 @@ class Store:
 
     def describe(self) -> str:
         """How many results and quarantined logs it has, in words."""
-        return f"{counted(len(self.keys()), 'result')}, {len(self.names('failed'))} quarantined"
+        done = sum(1 for _ in self.read_many(f"results/{key}/{RESULT_FILE}" for key in self.keys()))
+        return f"{counted(done, 'result')}, {len(self.names('failed'))} quarantined"
 
     def _place(self, target: Path, data: bytes, place: Callable[[Path, Path], None]) -> None:
         """Write the data beside its target under a name of its own, then put it in place in one step."""
@@ -274,6 +300,18 @@ class Store:
             place(draft, target)
         finally:
             draft.unlink(missing_ok=True)
+
+
+def _link(draft: Path, target: Path) -> None:
+    """Put a draft in place where nothing is."""
+    try:
+        os.link(draft, target)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS):
+            raise
+        if target.exists():  # a file system without hard links
+            raise FileExistsError(str(target)) from error
+        os.replace(draft, target)
 
 
 def _move(file: Path, target: Path) -> None:

@@ -13,10 +13,11 @@ from semantic_mapper.backoff import backoff_s
 from semantic_mapper.errors import ConfigError, DependencyError, FleetError, StoreError
 from semantic_mapper.log_events import get_logger
 
-TRIES = 6
+TRIES = 8
 FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 15.0
 
 _SCHEME = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*)://(.*)", re.DOTALL)
+_URL_IN_TEXT = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://[^\s'\"<>()]+")
 _CHAIN = "::"  # between the parts of fsspec's chained URLs
 _PORT = re.compile(r"[^:]*:\d+")
 _HIDDEN = "..."
@@ -131,17 +132,34 @@ def persistently(call: Callable[[], _T], what: str, tries: int = TRIES) -> _T:
     for failures in range(1, tries + 1):
         try:
             return call()
-        except (FileNotFoundError, FileExistsError):
+        except FileExistsError:
             raise
         except (PermissionError, NotADirectoryError, IsADirectoryError) as error:
-            raise StoreError(f"{what}: is refused ({error}); check the credentials and the path") from error
+            reason = without_secrets(str(error))
+            raise StoreError(f"{what}: is refused ({reason}); check the path, and who may read and write it") from error
         except _errors_of_stores() as error:
+            if isinstance(error, FileNotFoundError) and _is_missing(error):
+                raise
+            reason = without_secrets(f"{type(error).__name__}: {error.__cause__ or error}")
             if failures == tries:
-                raise StoreError(f"{what}: cannot be reached or written ({type(error).__name__}: {error})") from error
+                raise StoreError(f"{what}: cannot be reached or written ({reason})") from error
             pause_s = backoff_s(failures, FIRST_PAUSE_S, MAX_PAUSE_S)
-            _log.warning("store_retry", what=what, failures=failures, pause_s=pause_s, error=str(error))
+            _log.warning("store_retry", what=what, failures=failures, pause_s=pause_s, error=reason)
             time.sleep(pause_s)
     raise AssertionError("unreachable")
+
+
+def _is_missing(error: FileNotFoundError) -> bool:
+    """Whether something is not there; fsspec raises the same error for whatever a web server answers."""
+    cause = error.__cause__
+    if cause is None or not type(cause).__module__.startswith("aiohttp"):
+        return True
+    return getattr(cause, "status", None) in (404, 410)  # of aiohttp's many errors only answers have one
+
+
+def without_secrets(text: str) -> str:
+    """A message of another package, whose URLs are shown as ``shown`` does."""
+    return _URL_IN_TEXT.sub(lambda match: shown(match[0]), text)
 
 
 def _errors_of_stores() -> tuple[type[BaseException], ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import secrets
@@ -15,13 +16,13 @@ from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import msgspec
-import structlog
 
 from semantic_mapper.config import convert_config
-from semantic_mapper.errors import FleetError, LogError, StoreError
+from semantic_mapper.errors import FleetError, LogError, SemanticMapperError, StoreError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.code_version import code_digest, code_version
-from semantic_mapper.nodes.fleet.results import TaskResult
-from semantic_mapper.nodes.fleet.scratch import scratch_root, task_folder
+from semantic_mapper.nodes.fleet.results import Findings, TaskResult
+from semantic_mapper.nodes.fleet.scratch import DiskError, scratch_root, task_folder
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.urls import persistently, shown, split_url, unstripped
 
@@ -29,7 +30,7 @@ CHUNK_BYTES = 8 << 20  # of a download; a cut connection costs no more
 OUTPUT_BYTES = 256 << 20  # what a task writes beside its log, about
 KEY_DIGITS = 40
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -92,12 +93,10 @@ class Outcome:
     Args:
         key: Of its result.
         status: "done", or "exists" where the result had been there, or another attempt was quicker.
-        seconds: That it took.
     """
 
     key: str
     status: Literal["done", "exists"]
-    seconds: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,13 +124,13 @@ def run_task(task: Task) -> Outcome:
         )
     store = Store(task.store)
     files = _files_of(task.url)
-    identity = ";".join(f"{file.size}:{file.version}" for file in files)
+    identity = _identity(files)
     source_name = f"sources/{_short(f'{task.url} {identity}')}.json"
     source = _read_source(store, source_name) if all(file.version for file in files) else None
     if source is not None:
         key = task_key(task, source.digest)
         if store.exists(f"results/{key}/result.json"):
-            return Outcome(key, "exists", time.monotonic() - began)
+            return Outcome(key, "exists")
     size = sum(file.size for file in files)
     local = not any("://" in file.url for file in files)
     with task_folder(OUTPUT_BYTES + (0 if local else size), task.disk_bytes) as folder:
@@ -139,26 +138,55 @@ def run_task(task: Task) -> Outcome:
         store.write(source_name, msgspec.json.encode(Source(shown(task.url), identity, digest, size)))
         key = task_key(task, digest)
         if store.exists(f"results/{key}/result.json"):  # another URL of the same log, or another driver
-            return Outcome(key, "exists", time.monotonic() - began)
-        status = _make_result(task, store, key, log, digest, size, folder, began)
-    return Outcome(key, status, time.monotonic() - began)
+            return Outcome(key, "exists")
+        findings = _operate(task, store, log, folder / "out")
+        if local and _identity(_files_of(task.url)) != identity:
+            raise LogError(f"{shown(task.url)}: has changed while it was read; run it again once it is written")
+        status = _make_result(task, store, key, digest, size, findings, folder / "out", began)
+    return Outcome(key, status)
+
+
+def _operate(task: Task, store: Store, log: Path, out: Path) -> Findings:
+    """Do the operation; its files are in ``out`` then.
+
+    Raises:
+        DiskError: there was no room for them.
+        SemanticMapperError: with what is wrong with the log, the weights or the settings.
+    """
+    from semantic_mapper.nodes.fleet.operations import OPERATIONS, Job, run_operation
+
+    out.mkdir()
+    settings = convert_config(task.settings, OPERATIONS[task.operation].settings, "settings of the fleet")
+    try:
+        return run_operation(task.operation, Job(log, out, _weights(task, store), settings))
+    except (OSError, SemanticMapperError) as error:
+        if _disk_is_full(error):
+            raise DiskError(f"{socket.gethostname()}: the disk of {scratch_root()} is full ({error})") from error
+        raise
+
+
+def _disk_is_full(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__
+    return False
 
 
 def _make_result(
-    task: Task, store: Store, key: str, log: Path, digest: str, size: int, folder: Path, began: float
+    task: Task, store: Store, key: str, digest: str, size: int, findings: Findings, out: Path, began: float
 ) -> Literal["done", "exists"]:
-    from semantic_mapper.nodes.fleet.operations import OPERATIONS, Job, run_operation
-
-    out = folder / "out"
-    out.mkdir()
-    settings = convert_config(task.settings, OPERATIONS[task.operation].settings, "settings of the fleet")
-    findings = run_operation(task.operation, Job(log, out, _weights(task, store), settings))
+    """Put files and result into the store; after an error nothing of them stays."""
     attempt = f"results/{key}/{secrets.token_hex(6)}"
     files: dict[str, int] = {}
-    for path in sorted(p for p in out.rglob("*") if p.is_file()):
-        name = path.relative_to(out).as_posix()
-        files[name] = path.stat().st_size
-        store.take(path, f"{attempt}/{name}")
+    try:
+        for path in sorted(p for p in out.rglob("*") if p.is_file()):
+            name = path.relative_to(out).as_posix()
+            files[name] = path.stat().st_size
+            store.take(path, f"{attempt}/{name}")
+    except StoreError:
+        store.remove(attempt, folder=True)
+        raise
     result = TaskResult(
         key=key,
         operation=task.operation,
@@ -245,10 +273,19 @@ def _fetch(url: str, files: list[_File], folder: Path, *, local: bool) -> tuple[
         return path, _joined(digests)
     target = folder / "log"
     target.mkdir()
-    paths = [target / Path(urlsplit(file.url).path).name for file in files]  # without what signs it
+    paths = [target / _file_name(file.url) for file in files]
     fetched = [(path, _download(file, path)) for file, path in zip(files, paths, strict=True)]
     path = target if len(fetched) > 1 else fetched[0][0]
     return path, _joined([digest for _, digest in fetched])
+
+
+def _file_name(url: str) -> str:
+    """Without what signs a web address; in buckets "?" and "#" are letters."""
+    return Path(urlsplit(url).path if url.startswith(("http://", "https://")) else url).name
+
+
+def _identity(files: list[_File]) -> str:
+    return ";".join(f"{file.size}:{file.version}" for file in files)
 
 
 def _joined(digests: list[str]) -> str:

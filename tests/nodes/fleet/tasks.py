@@ -8,13 +8,14 @@ import time
 from pathlib import Path
 
 from semantic_mapper.errors import LogError, StoreError
+from semantic_mapper.nodes.fleet.scratch import DiskError
 from semantic_mapper.nodes.fleet.worker import Outcome, Task
 
 
 def note(task: Task) -> Outcome:
     """Leave a trace of every attempt."""
     _trace(task)
-    return Outcome(task.url, "done", 0.0)
+    return Outcome(task.url, "done")
 
 
 def fail_for_bad(task: Task) -> Outcome:
@@ -22,7 +23,7 @@ def fail_for_bad(task: Task) -> Outcome:
     _trace(task)
     if task.url.startswith("bad") or (task.url.startswith("once") and task.attempt == 1):
         raise LogError(f"{task.url}: cannot be read")
-    return Outcome(task.url, "done", 0.0)
+    return Outcome(task.url, "done")
 
 
 def die_for_bad(task: Task) -> Outcome:
@@ -30,7 +31,7 @@ def die_for_bad(task: Task) -> Outcome:
     _trace(task)
     if task.url.startswith("bad") or (task.url.startswith("once") and task.attempt == 1):
         os.kill(os.getpid(), signal.SIGKILL)
-    return Outcome(task.url, "done", 0.0)
+    return Outcome(task.url, "done")
 
 
 def miss_store_once(task: Task) -> Outcome:
@@ -38,7 +39,7 @@ def miss_store_once(task: Task) -> Outcome:
     _trace(task)
     if task.attempt == 1 and task.url == "first":
         raise StoreError("the store is away")
-    return Outcome(task.url, "done", 0.0)
+    return Outcome(task.url, "done")
 
 
 def miss_store(task: Task) -> Outcome:
@@ -55,14 +56,33 @@ def refuse_company(task: Task) -> Outcome:
     mark.unlink()
     if together > 1:
         raise LogError(f"{together} at a time")
-    return Outcome(task.url, "done", 0.0)
+    return Outcome(task.url, "done")
+
+
+def fill_disk(task: Task) -> Outcome:
+    """There is no room on this machine."""
+    raise DiskError("the disk is full")
+
+
+def miss_one_log(task: Task) -> Outcome:
+    """``far`` cannot be reached, all others can."""
+    _trace(task)
+    if task.url == "far":
+        raise StoreError("far: cannot be reached")
+    return Outcome(task.url, "done")
+
+
+def sleep_for_slow(task: Task) -> Outcome:
+    """``slow`` takes for ever, all others a second."""
+    time.sleep(300 if task.url == "slow" else 1)
+    return Outcome(task.url, "done")
 
 
 def sleep_long(task: Task) -> Outcome:
     """Run until ended."""
     _trace(task)
     time.sleep(300)
-    return Outcome(task.url, "done", 0.0)
+    return Outcome(task.url, "done")
 
 
 def _trace(task: Task) -> None:

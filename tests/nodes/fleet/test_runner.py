@@ -14,6 +14,7 @@ from semantic_mapper.nodes.fleet import runner
 from semantic_mapper.nodes.fleet.cluster import Cluster, connected
 from semantic_mapper.nodes.fleet.inputs import LogInput
 from semantic_mapper.nodes.fleet.runner import DriverStatus, FleetRun, Resources
+from semantic_mapper.nodes.fleet.scratch import DiskError
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.worker import Outcome, Task
 from tests.nodes.fleet import tasks
@@ -49,9 +50,10 @@ def run_fleet(
     resources: Resources = SMALL,
     stopped: Callable[[], bool] = lambda: False,
     retry: bool = False,
+    code: str = "",
 ) -> DriverStatus:
     traces.mkdir(exist_ok=True)
-    template = Task("replay", "", {}, store.url, {}, {}, "", "", weights_stored=False, code="")
+    template = Task("replay", "", {}, store.url, {}, {}, "", "", weights_stored=False, code=code)
     inputs = [LogInput(log, {"traces": str(traces)}) for log in logs]
     fleet = FleetRun(store, template, inputs, resources, cluster, retry_quarantined=retry, function=function)
     return fleet.run(stopped, lambda status: None)
@@ -121,13 +123,51 @@ def test_a_stop_ends_tasks_at_once_and_says_so(store: Store, cluster: Cluster, t
     assert again.done == 1 and time.monotonic() - began < 250  # far less than a task that still slept
 
 
-def test_a_log_that_takes_too_long_is_quarantined(store: Store, cluster: Cluster, tmp_path: Path) -> None:
-    resources = Resources(cpus=1.0, memory_bytes=1 << 20, timeout_s=3.0)
-    status = run_fleet(store, cluster, tasks.sleep_long, ["slow"], tmp_path / "traces", resources=resources)
-    assert (status.done, status.failed) == (0, 1)
-    assert names(tmp_path / "traces") == ["slow.1", "slow.2"]
+def test_a_log_that_takes_too_long_is_quarantined_and_those_behind_it_are_done(
+    store: Store, cluster: Cluster, tmp_path: Path
+) -> None:
+    resources = Resources(cpus=1.0, memory_bytes=1 << 20, timeout_s=4.0)
+    logs = ["slow", *(f"log{n}" for n in range(12))]  # more than a time limit holds, one after the other
+    status = run_fleet(store, cluster, tasks.sleep_for_slow, logs, tmp_path / "traces", resources=resources)
+    assert (status.done, status.failed) == (12, 1)
     (failure,) = store.failures()
-    assert failure.errors == ("took longer than 3 s",) * 2
+    assert failure.log == "slow" and failure.errors == ("took longer than 4 s, and was ended",) * 2
+
+
+def test_a_full_disk_is_no_fault_of_the_logs(store: Store, cluster: Cluster, tmp_path: Path) -> None:
+    with pytest.raises(DiskError, match="5 logs in a row"):
+        run_fleet(store, cluster, tasks.fill_disk, [f"log{n}" for n in range(20)], tmp_path / "traces")
+    assert not list(store.failures())
+
+
+def test_a_log_that_cannot_be_reached_is_quarantined_and_the_rest_is_done(
+    store: Store, cluster: Cluster, tmp_path: Path
+) -> None:
+    status = run_fleet(store, cluster, tasks.miss_one_log, ["far", "a", "b"], tmp_path / "traces")
+    assert (status.done, status.failed) == (2, 1)
+    assert [failure.log for failure in store.failures()] == ["far"]
+
+
+def test_a_run_goes_on_where_its_progress_cannot_be_written(
+    store: Store, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = Store.write
+
+    def refuse(self: Store, name: str, data: bytes, **options: int) -> None:
+        if name.startswith("drivers/"):
+            raise StoreError("full")
+        write(self, name, data, **options)
+
+    monkeypatch.setattr(Store, "write", refuse)
+    assert run_fleet(store, cluster, tasks.note, ["a", "b"], tmp_path / "traces").done == 2
+
+
+def test_other_code_tries_a_quarantined_log_again_and_forgets_the_failure(
+    store: Store, cluster: Cluster, tmp_path: Path
+) -> None:
+    run_fleet(store, cluster, tasks.fail_for_bad, ["bad"], tmp_path / "one")
+    status = run_fleet(store, cluster, tasks.note, ["bad"], tmp_path / "two", code="newer")
+    assert (status.done, status.failed) == (1, 0) and not list(store.failures())
 
 
 @pytest.mark.parametrize("max_parallel", [0, 1])
@@ -140,7 +180,7 @@ def test_no_more_run_at_a_time_than_allowed(store: Store, cluster: Cluster, tmp_
 
 @pytest.mark.parametrize(
     ("resources", "what"),
-    [(Resources(cpus=64), "CPU"), (Resources(gpus=1), "GPU"), (Resources(memory_bytes=1 << 50), "GB of memory")],
+    [(Resources(cpus=64), "64 CPUs"), (Resources(gpus=1), "1 GPUs"), (Resources(memory_bytes=1 << 50), "GB of memory")],
 )
 def test_what_no_node_has_is_refused_at_once(
     store: Store, cluster: Cluster, tmp_path: Path, resources: Resources, what: str

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.errors import FleetError
 from semantic_mapper.nodes.fleet import scratch
-from semantic_mapper.nodes.fleet.scratch import scratch_root, task_folder
+from semantic_mapper.nodes.fleet.scratch import DiskError, scratch_root, task_folder
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +42,7 @@ def test_a_task_waits_until_there_is_room() -> None:
 
 
 def test_a_task_that_never_fits_is_refused() -> None:
-    with pytest.raises(FleetError, match="--worker-disk"), task_folder(200, 100):
+    with pytest.raises(DiskError, match="--worker-disk"), task_folder(200, 100):
         pass
 
 

@@ -16,6 +16,28 @@ def store(tmp_path: Path) -> Store:
     return Store(str(tmp_path / "store"), create=True)
 
 
+def test_letters_of_patterns_in_its_path_are_letters(tmp_path: Path) -> None:
+    (tmp_path / "a b 1").mkdir()
+    store = Store(str(tmp_path / "a b [1]*? ü"), create=True)
+    store.write("failed/x.json", b"{}")
+    assert store.commit(made_result("k"))
+    assert [result.key for result in store.results()] == ["k"]
+    assert list(store.read_many(["failed/x.json", "failed/y.json"])) == [("failed/x.json", b"{}")]
+    assert store.describe() == "1 result, 1 quarantined"
+    store.remove("failed/x.json")
+    store.remove("results", folder=True)
+    assert store.keys() == [] and store.names("failed") == []
+
+
+def test_a_folder_with_something_else_does_not_become_a_store(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(ConfigError, match="choose another --out"):
+        Store(str(tmp_path), create=True)
+    with pytest.raises(ConfigError, match="choose another --out"):
+        Store(str(tmp_path / "notes.txt"), create=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
 def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no fleet store"):
         Store(str(tmp_path))

@@ -6,7 +6,7 @@ import pytest
 
 from semantic_mapper.errors import ConfigError, FleetError, StoreError
 from semantic_mapper.nodes.fleet import urls
-from semantic_mapper.nodes.fleet.urls import is_url, persistently, refuse_credentials, shown, split_url
+from semantic_mapper.nodes.fleet.urls import is_url, persistently, refuse_credentials, shown, split_url, without_secrets
 
 SECRET = "wJalrXUtnFEMI/K7MDENG/bPxRfiCYEXAMPLEKEY"
 
@@ -86,6 +86,11 @@ def test_what_keeps_failing_ends_with_the_reason() -> None:
         persistently(lambda: (_ for _ in ()).throw(ConnectionResetError("cut")), "s3://bucket/x")
 
 
+def test_messages_of_other_packages_are_shown_without_what_signs_their_urls() -> None:
+    text = "403, url='https://u:p@host/a.mcap?X-Amz-Signature=SECRET' and s3://k:SECRET@bucket/x"
+    assert without_secrets(text) == "403, url='https://host/a.mcap?...' and s3://bucket/x"
+
+
 def test_what_is_missing_or_refused_is_not_tried_again() -> None:
     calls = []
 
@@ -100,6 +105,6 @@ def test_what_is_missing_or_refused_is_not_tried_again() -> None:
         calls.append(1)
         raise PermissionError("forbidden")
 
-    with pytest.raises(StoreError, match="credentials"):
+    with pytest.raises(StoreError, match="who may read and write"):
         persistently(refused, "x")
     assert len(calls) == 2

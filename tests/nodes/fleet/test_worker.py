@@ -1,16 +1,22 @@
 from __future__ import annotations
 
+import errno
 import shutil
+import threading
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
-from semantic_mapper.errors import LogError
+from semantic_mapper.errors import ConfigError, LogError, StoreError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.fleet import scratch, worker
-from semantic_mapper.nodes.fleet.results import without_costs
+from semantic_mapper.nodes.fleet import operations, scratch, urls, worker
+from semantic_mapper.nodes.fleet.operations import changed_settings, read_settings
+from semantic_mapper.nodes.fleet.results import Findings, without_costs
+from semantic_mapper.nodes.fleet.scratch import DiskError
 from semantic_mapper.nodes.fleet.start import make_template
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.worker import OtherCodeError, Task, run_task
@@ -125,6 +131,82 @@ def test_refine_takes_maps(store: Store, replayed: Path) -> None:
     refined = VoxelMap.load(store.local / found.folder / "map.npz")
     assert len(refined.points().xyz) >= found.findings.metrics["surface"] > 0
     assert refined.block_count == VoxelMap.load(replayed / "map.npz").block_count
+
+
+def test_settings_are_shown_by_the_names_that_set_them() -> None:
+    settings = read_settings("replay", ["voxel_map.voxel_size_m=0.05", "max_frames=3"])
+    assert changed_settings(settings) == {"voxel_map.voxel_size_m": 0.05, "max_frames": 3}
+    assert changed_settings(read_settings("finetune", ["steps=5"])) == {"steps": 5}
+
+
+@pytest.mark.parametrize(
+    ("operation", "text", "why"),
+    [
+        ("replay", "max_frame=3", r"--set max_frame: `replay` has no such setting; did you mean `max_frames`"),
+        ("finetune", "second=3", "did you mean `seconds`"),
+        ("refine", "seconds=3", "there is fill, up, by_name"),
+        ("replay", "voxel_map.size=3", "unknown key `size`"),
+        ("replay", "quality", "NAME=VALUE"),
+        ("replay", "max_frames=many", "max_frames"),
+    ],
+)
+def test_a_wrong_setting_says_what_there_is(operation: str, text: str, why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        read_settings(operation, [text])
+
+
+def test_a_log_that_changes_while_it_is_read_fails(
+    store: Store, log: Path, weights: Path, config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    growing = Path(shutil.copy(log, tmp_path / "growing.mcap"))
+    operate = worker._operate
+
+    def grow(*arguments: Any) -> Findings:
+        found = operate(*arguments)
+        growing.touch()
+        return found
+
+    monkeypatch.setattr(worker, "_operate", grow)
+    with pytest.raises(LogError, match="changed while it was read"):
+        run_task(task_of("replay", store, growing, weights, config))
+    assert list(store.results()) == []
+
+
+def test_a_full_disk_is_told_apart_from_a_bad_log(
+    store: Store, log: Path, weights: Path, config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(operation: str, job: operations.Job) -> Findings:
+        raise ConfigError("map.npz: cannot be written") from OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(operations, "run_operation", fill)
+    with pytest.raises(DiskError, match="is full"):
+        run_task(task_of("replay", store, log, weights, config))
+
+
+class _Answer(BaseHTTPRequestHandler):
+    """``/404/...`` answers with 404, and so on."""
+
+    def do_GET(self) -> None:
+        self.send_error(int(self.path.split("/")[1]))
+
+    do_HEAD = do_GET  # noqa: N815
+
+    def log_message(self, *arguments: Any) -> None:
+        """Nothing."""
+
+
+@pytest.mark.parametrize(("status", "error"), [(404, LogError), (403, StoreError), (500, StoreError)])
+def test_only_what_a_server_does_not_have_is_missing(
+    store: Store, weights: Path, monkeypatch: pytest.MonkeyPatch, status: int, error: type[Exception]
+) -> None:
+    monkeypatch.setattr(urls.time, "sleep", lambda seconds: None)
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Answer) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/{status}/a.mcap?X-Amz-Signature=SECRET"
+        with pytest.raises(error) as caught:
+            run_task(replace(task_of("replay", store, Path("a"), weights), url=url))
+        server.shutdown()
+    assert "SECRET" not in str(caught.value) and f"/{status}/a.mcap" in str(caught.value)
 
 
 def test_a_log_that_is_no_log_fails_with_its_name(store: Store, weights: Path, tmp_path: Path) -> None:
