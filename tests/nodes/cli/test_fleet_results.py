@@ -142,6 +142,11 @@ def test_compare_finds_a_worse_version_and_not_a_rerun(tmp_path: Path) -> None:
     assert done.returncode == 1 and "6 logs lost more than 0.02" in done.stdout
 
 
+@pytest.mark.parametrize(("verb", "usage"), [("compare", "{STORE_A} [STORE_B]"), ("table", "{STORE} [SQL]")])
+def test_usage_shows_which_arguments_may_be_left_out(verb: str, usage: str) -> None:
+    assert f"{usage}\n" in run("fleet", verb, "--help").stdout
+
+
 def test_compare_within_a_store(store: Store) -> None:
     done = run("fleet", "compare", store.url, "--a", "version=0.1.0", "--b", "version=0.2.0")
     assert done.returncode == 1 and "the mean of miou over logs is worse" in done.stdout
