@@ -289,6 +289,10 @@ def _value(value: float) -> str:
     return f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
+def _figure(value: float) -> str:
+    return f"{value:.4g}" if abs(value) < 10_000 else f"{value:.0f}"
+
+
 @dataclass(frozen=True, slots=True)
 class Histogram:
     """How often which values occur.
@@ -323,7 +327,7 @@ def draw_histograms(histograms: Sequence[Histogram], columns: int = 3, size: tup
         if len(values):
             middle = float(np.median(values))
             axes.axvline(middle, color=_hex(WARN), linewidth=1.5)
-            axes.set_title(f"median {middle:.4g}", loc="right", color=_hex(WARN), fontsize=SMALL_PT)
+            axes.set_title(f"median {_figure(middle)}", loc="right", color=_hex(WARN), fontsize=SMALL_PT)
         axes.set(xlabel=histogram.x_label, ylabel="logs")
         axes.set_title(cut(histogram.title, size[0] - 170, TEXT_PT), loc="left")
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -355,7 +359,7 @@ def draw_boxes(title: str, boxes: Sequence[PercentileBox], x_label: str) -> Figu
     medians = [_hex(GOOD) if width < 0.01 * reach else _hex(BACKGROUND) for width in third - first]
     axes.vlines(middle, places - 0.3, places + 0.3, color=medians, linewidth=2.5, zorder=3)
     for place, box in enumerate(boxes):
-        text = f"{box.percentiles[2]:.4g}  n = {box.count}"
+        text = f"{_figure(box.percentiles[2])}  n = {box.count}"
         beside = axes.get_yaxis_transform()  # to the right of the axes, where no grid line crosses it
         axes.text(1.01, place, text, va="center", fontsize=SMALL_PT, color=_hex(DIM_TEXT), transform=beside)
     axes.set_yticks(places, [cut(box.name, 260, TEXT_PT) for box in boxes], fontsize=TEXT_PT, color=_hex(TEXT))

@@ -189,7 +189,9 @@ def _with_unit(value: float, units: Sequence[tuple[str, float]]) -> str:
     """In the largest unit of which there is at least one."""
     unit, scale = next((pair for pair in units if value >= pair[1]), units[-1])
     number = value / scale
-    return f"{number:.0f} {unit}" if number >= 100 else f"{number:.2g} {unit}" if number < 10 else f"{number:.3g} {unit}"
+    return (
+        f"{number:.0f} {unit}" if number >= 100 else f"{number:.2g} {unit}" if number < 10 else f"{number:.3g} {unit}"
+    )
 
 
 def _classes(tables: Tables, operation: str, where: str) -> Iterator[Section]:
