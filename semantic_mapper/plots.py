@@ -289,6 +289,10 @@ def _value(value: float) -> str:
     return f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
+def _figure(value: float) -> str:
+    return f"{value:.4g}" if abs(value) < 10_000 else f"{value:.0f}"
+
+
 @dataclass(frozen=True, slots=True)
 class Histogram:
     """How often which values occur.
@@ -322,9 +326,10 @@ def draw_histograms(histograms: Sequence[Histogram], columns: int = 3, size: tup
         axes.hist(values, bins=bins, range=(low, high), color=_hex(GOOD))
         if len(values):
             middle = float(np.median(values))
-            axes.axvline(middle, color=_hex(WARN), linewidth=1.5, label=f"median {middle:.4g}")
-            axes.legend(loc="best")
-        axes.set(title=cut(histogram.title, size[0] - 60, TEXT_PT), xlabel=histogram.x_label, ylabel="logs")
+            axes.axvline(middle, color=_hex(WARN), linewidth=1.5)
+            axes.set_title(f"median {_figure(middle)}", loc="right", color=_hex(WARN), fontsize=SMALL_PT)
+        axes.set(xlabel=histogram.x_label, ylabel="logs")
+        axes.set_title(cut(histogram.title, size[0] - 170, TEXT_PT), loc="left")
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
@@ -349,15 +354,17 @@ def draw_boxes(title: str, boxes: Sequence[PercentileBox], x_label: str) -> Figu
     low, first, middle, third, high = np.array([box.percentiles for box in boxes], np.float64).T
     axes.hlines(places, low, high, color=_hex(DIM_TEXT), linewidth=1.5, zorder=1.5)
     axes.barh(places, third - first, 0.6, first, color=_hex(GOOD), zorder=2)
-    axes.vlines(middle, places - 0.3, places + 0.3, color=_hex(BACKGROUND), linewidth=2.5, zorder=3)
     reach = max(float(high.max() - low.min()), 1e-9)
+    # A median is dark on its box; without a box wide enough to see, it is as light as the box would be.
+    medians = [_hex(GOOD) if width < 0.01 * reach else _hex(BACKGROUND) for width in third - first]
+    axes.vlines(middle, places - 0.3, places + 0.3, color=medians, linewidth=2.5, zorder=3)
     for place, box in enumerate(boxes):
-        end = float(high.max()) + 0.02 * reach
-        text = f"{box.percentiles[2]:.4g}  n = {box.count}"
-        axes.text(end, place, text, va="center", fontsize=SMALL_PT, color=_hex(DIM_TEXT))
+        text = f"{_figure(box.percentiles[2])}  n = {box.count}"
+        beside = axes.get_yaxis_transform()  # to the right of the axes, where no grid line crosses it
+        axes.text(1.01, place, text, va="center", fontsize=SMALL_PT, color=_hex(DIM_TEXT), transform=beside)
     axes.set_yticks(places, [cut(box.name, 260, TEXT_PT) for box in boxes], fontsize=TEXT_PT, color=_hex(TEXT))
     axes.set(xlabel=x_label, ylim=(len(boxes) - 0.4, -0.6))
-    axes.set_xlim(float(low.min()) - 0.03 * reach, float(high.max()) + 0.2 * reach)
+    axes.set_xlim(float(low.min()) - 0.03 * reach, float(high.max()) + 0.03 * reach)
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
     return figure

@@ -187,7 +187,20 @@ def test_histograms_count_values_and_mark_the_median() -> None:
     heights = [sum(patch.get_height() for patch in axes.patches) for axes in figure.axes]
     assert heights == [4, 7, 0]
     assert figure.axes[0].lines[0].get_xdata()[0] == pytest.approx(0.2)
+    assert figure.axes[0].get_title("right") == "median 0.2" and figure.axes[0].get_legend() is None
     assert not misplaced_texts(figure)
+
+
+def test_single_values_are_visible_and_no_figure_lies_on_the_axes() -> None:
+    boxes = [PercentileBox("one", (0.4,) * 5, 1), PercentileBox("many", (0.1, 0.2, 0.3, 0.5, 1.0), 12)]
+    figure = figure_of(draw_boxes, "", boxes, "IoU")
+    (axes,) = figure.axes
+    panel, medians = axes.get_facecolor(), axes.collections[-1].get_colors()
+    assert np.abs(np.subtract(medians[0], panel)).max() > 0.5, "light on the dark panel"
+    assert np.abs(np.subtract(medians[1], axes.patches[1].get_facecolor())).max() > 0.5, "dark on its box"
+    right = axes.get_window_extent().x1
+    assert [text.get_text() for text in axes.texts] == ["0.4  n = 1", "0.3  n = 12"]
+    assert all(text.get_window_extent().x0 >= right for text in axes.texts)
 
 
 def test_boxes_reach_from_quartile_to_quartile() -> None:

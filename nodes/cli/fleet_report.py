@@ -44,7 +44,8 @@ MAX_HISTOGRAMS = 9
 MAX_ERROR = 2000  # letters
 THUMBNAIL_WIDTH = 360
 MAX_THUMBNAIL_BYTES = 16 * 2**20
-_FIRST = ("miou", "map_miou", "cost_step_ms_p50", "seconds")  # these metrics and costs come first
+# These metrics and costs come first.
+_FIRST = ("miou", "map_miou", "cost_step_ms_p50", "cost_step_ms_p95", "cost_map_memory_mb", "seconds")
 _NO_FIGURES = ("log_bytes", "attempts")
 _PERCENTILES = "[0.05, 0.25, 0.5, 0.75, 0.95]"
 
@@ -77,17 +78,35 @@ def write_fleet_report(store: Store, out: Path | None) -> Path:
 
 
 def _failures(tables: Tables) -> Iterator[Section]:
-    (total,) = tables.query("SELECT count(*) AS n FROM failures")["n"].to_pylist()
+    latest = """
+        WITH latest AS (SELECT operation, arg_max(version, finished) AS version, max(finished) AS finished
+                        FROM logs GROUP BY operation)
+        SELECT f.*, coalesce(f.version <> l.version AND f.finished < l.finished, false) AS old
+        FROM failures f LEFT JOIN latest l USING (operation)
+        """
+    (counts,) = tables.query(f"SELECT count(*) AS n, count_if(old)::BIGINT AS old FROM ({latest})").to_pylist()
+    total, old = counts["n"], counts["old"]
     if not total:
         return
     rows = tables.query(
-        f"SELECT operation, log, version, attempts, left(error, {MAX_ERROR}) AS error FROM failures "
-        f"ORDER BY finished DESC, log LIMIT {MAX_FAILURES}",
+        f"SELECT operation, log, version, old, attempts, left(error, {MAX_ERROR}) AS error FROM ({latest}) "
+        f"ORDER BY old, finished DESC, log LIMIT {MAX_FAILURES}",
     ).to_pylist()
-    first = "" if total <= MAX_FAILURES else f", the latest {MAX_FAILURES}"
-    cells = [(r["log"], r["operation"], r["version"], str(r["attempts"]), r["error"].split("\n")[-1]) for r in rows]
+    cells = [
+        (
+            row["log"],
+            row["operation"],
+            f"{row['version']} (older)" if row["old"] else row["version"],
+            str(row["attempts"]),
+            row["error"].split("\n")[-1],
+        )
+        for row in rows
+    ]
     table = table_of(("log", "operation", "version", "attempts", "error"), cells)
-    yield Section("Logs that were given up", [f"{counted(total, 'log')} failed{first}."], tables=[table])
+    text = f"{counted(total, 'log')} failed"
+    text += f", {old} of them in an older version than that of the latest results" if old else ""
+    text += "" if total <= MAX_FAILURES else f"; the latest {MAX_FAILURES}"
+    yield Section("Logs that were given up", [f"{text}."], tables=[table])
 
 
 def _operation(tables: Tables, operation: str, folder: Path) -> Iterator[Section]:
@@ -101,7 +120,8 @@ def _operation(tables: Tables, operation: str, folder: Path) -> Iterator[Section
     yield Section(f"{operation}: runs", tables=[_variants_table(tables, operation, found)])
     if metric is not None:
         yield from _trend(tables, operation, found, metric)
-    histograms = [Histogram(n, _unit(n), _floats(figures, n)) for n in names[:MAX_HISTOGRAMS]]
+    telling = [name for name in names if _is_telling(_floats(figures, name))]
+    histograms = [Histogram(n, _unit(n), _floats(figures, n)) for n in telling[:MAX_HISTOGRAMS]]
     if histograms:
         caption = f"Logs of {latest.describe()}: {counted(figures.num_rows, 'log')}"
         yield Section(f"{operation}: distributions", pictures=[picture(draw_histograms(histograms), caption)])
@@ -127,6 +147,11 @@ def _figures(table: Any) -> list[str]:
     return sorted(names, key=lambda n: (_FIRST.index(n) if n in _FIRST else len(_FIRST), n.startswith("cost_"), n))
 
 
+def _is_telling(values: Float64) -> bool:
+    """Whether a figure differs between logs; that of a single log, where it is not 0."""
+    return bool(np.ptp(values) > 0 if len(values) > 1 else values.any())
+
+
 def _unit(name: str) -> str:
     """For the axis; figures in 0..1 and counts have none."""
     for word, unit in (("ms", "milliseconds"), ("mb", "MB"), ("bytes", "bytes"), ("seconds", "seconds")):
@@ -144,12 +169,29 @@ def _variants_table(tables: Tables, operation: str, found: Sequence[Variant]) ->
     rows = []
     for variant in found[:MAX_VERSIONS]:
         (row,) = tables.query(
-            "SELECT count(*) AS logs, count(DISTINCT node) AS nodes, sum(seconds) / 3600 AS hours, "
-            f"sum(log_bytes) / 1e9 AS gb, max(finished) AS finished FROM logs WHERE {variant.condition(operation)}",
+            "SELECT count(*) AS logs, count(DISTINCT node) AS nodes, sum(seconds) AS seconds, "
+            f"sum(log_bytes)::DOUBLE AS bytes, max(finished) AS finished FROM logs WHERE {variant.condition(operation)}",
         ).to_pylist()
-        times = f"{row['hours']:.2f}", f"{row['gb']:.2f}", str(row["finished"])[:16]
+        times = _duration_text(row["seconds"]), _size_text(row["bytes"]), str(row["finished"])[:16]
         rows.append((variant.describe(), str(row["logs"]), str(row["nodes"]), *times))
-    return table_of(("version, weights, settings", "logs", "hosts", "hours", "GB of logs", "finished, UTC"), rows)
+    return table_of(("version, weights, settings", "logs", "hosts", "time", "size of logs", "finished, UTC"), rows)
+
+
+def _duration_text(seconds: float) -> str:
+    return _with_unit(seconds, (("h", 3600), ("min", 60), ("s", 1)))
+
+
+def _size_text(size: float) -> str:
+    return _with_unit(size, (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3), ("bytes", 1)))
+
+
+def _with_unit(value: float, units: Sequence[tuple[str, float]]) -> str:
+    """In the largest unit of which there is at least one."""
+    unit, scale = next((pair for pair in units if value >= pair[1]), units[-1])
+    number = value / scale
+    return (
+        f"{number:.0f} {unit}" if number >= 100 else f"{number:.2g} {unit}" if number < 10 else f"{number:.3g} {unit}"
+    )
 
 
 def _classes(tables: Tables, operation: str, where: str) -> Iterator[Section]:
@@ -180,7 +222,7 @@ def _worst(
     tables: Tables, operation: str, where: str, metric: str, folder: Path, names: Sequence[str]
 ) -> Iterator[Section]:
     order = "DESC" if lower_is_better(metric) else ""
-    shown = list(dict.fromkeys((metric, *names[:5])))
+    shown = list(dict.fromkeys((metric, *names[: len(_FIRST)])))
     columns = ", ".join(f'"{name}"' for name in shown)
     rows = tables.query(
         f"SELECT key, log, folder, thumbnail, report, weights, {columns} FROM logs WHERE {where} AND "

@@ -35,7 +35,7 @@ def table(
     store: StoreArgument,
     sql: Annotated[
         str | None,
-        typer.Argument(metavar="[SQL]", help="A SELECT on logs, classes, events, segments and failures, for DuckDB."),
+        typer.Argument(metavar="SQL", help="A SELECT on logs, classes, events, segments and failures, for DuckDB."),
     ] = None,
     csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all rows here, as CSV.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all rows here, as Parquet.")] = None,
@@ -103,7 +103,7 @@ def report(
 def compare(
     store_a: Annotated[str, typer.Argument(metavar="STORE_A", help="Path or URL of the store with results before.")],
     store_b: Annotated[
-        str | None, typer.Argument(metavar="[STORE_B]", help="Of that with results after.  [default: STORE_A]")
+        str | None, typer.Argument(metavar="STORE_B", help="Of that with results after.  [default: STORE_A]")
     ] = None,
     a: Annotated[
         list[str] | None,
@@ -148,7 +148,7 @@ def compare(
 
     Results are paired by the content of their logs. B is worse where the mean over logs has surely fallen below that of
     A, where single logs have surely lost more than --log-threshold, or where logs with a result in A failed in B, are
-    missing there or have no score. Of several versions, weights or settings in a store, the latest count; --a and --b
+    missing there or have no score, also where B has no result at all. Of several versions, weights or settings in a store, the latest count; --a and --b
     choose others. Exit codes: 0 not worse, 1 worse, 2 wrong usage, or something that cannot be read.
 
     Example: semantic-mapper fleet compare runs/released runs/candidate
@@ -213,13 +213,15 @@ def cell_text(value: Any) -> str:
 
 def _overview(output: Output, tables: Tables, *, as_json: bool) -> None:
     from semantic_mapper.nodes.fleet.tables import plain_rows
+    from semantic_mapper.nodes.fleet.variants import DEFAULT_WEIGHTS, quoted
 
     there = tables.columns()
     scored = any(name == "miou" for name, _ in there["logs"])
     figures = "round(median(miou), 4) AS miou_median, round(min(miou), 4) AS miou_worst, " if scored else ""
     found = tables.query(
         f"""
-        SELECT operation, version, weights, settings, count(*) AS logs, {figures}
+        SELECT operation, version, coalesce(nullif(weights, ''), {quoted(DEFAULT_WEIGHTS)}) AS weights, settings,
+            count(*) AS logs, {figures}
             round(median(seconds), 1) AS seconds_median, max(finished) AS finished
         FROM logs GROUP BY ALL ORDER BY operation, finished
         """,
@@ -324,7 +326,8 @@ def _show_comparison(output: Output, found: FleetComparison) -> None:
     output.print(table)
     if len(found.logs) > len(shown):
         output.print(f"{len(found.logs) - len(shown)} more logs; --json gives all")
-    output.print(cost_table(found))
+    if found.costs:
+        output.print(cost_table(found))
     for note in found.notes:
         output.print(f"note: {note}")
     if found.new:

@@ -9,6 +9,7 @@ from rich.box import SIMPLE
 from rich.live import Live
 from rich.table import Table
 
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.fleet.runner import REPORT_S, DriverStatus
 from semantic_mapper.nodes.fleet.store import Store
@@ -16,6 +17,8 @@ from semantic_mapper.nodes.fleet.store import Store
 SILENT_S = 12 * REPORT_S  # after which a driver is taken for dead
 SHOWN = 20
 DEAD = "no report any more"
+
+_log = get_logger(__name__)
 
 
 def show_drivers(url: str, output: Output, *, once: bool, json: bool) -> None:
@@ -25,24 +28,38 @@ def show_drivers(url: str, output: Output, *, once: bool, json: bool) -> None:
         ConfigError, StoreError: no store, or it cannot be reached.
     """
     store = Store(url)
+    unreadable: set[str] = set()
+    statuses = read_drivers(store, unreadable)
     if json:
-        output.json({"store": store.shown, "drivers": [_plain(status) for status in read_drivers(store)]})
+        output.json({"store": store.shown, "drivers": [_plain(status) for status in statuses]})
         return
-    statuses = read_drivers(store)
     if once or not output.console.is_terminal or not any(_goes_on(s) for s in statuses):
         output.print(_table(store, statuses))
         return
     with Live(_table(store, statuses), console=output.console, auto_refresh=False) as live:
         while any(_goes_on(s) for s in statuses):
             time.sleep(REPORT_S / 2)
-            statuses = read_drivers(store)
+            statuses = read_drivers(store, unreadable)
             live.update(_table(store, statuses), refresh=True)
 
 
-def read_drivers(store: Store) -> list[DriverStatus]:
-    """The newest ``SHOWN`` runs, newest first."""
+def read_drivers(store: Store, unreadable: set[str]) -> list[DriverStatus]:
+    """The newest ``SHOWN`` runs, newest first.
+
+    Args:
+        store: Where they report.
+        unreadable: Documents that were left out, because they are damaged or of another version. Each is warned of
+            once and added.
+    """
     names = sorted(store.names("drivers"), reverse=True)[:SHOWN]  # their names begin with the time
-    found = [msgspec.json.decode(data, type=DriverStatus) for _, data in store.read_many(f"drivers/{n}" for n in names)]
+    found: list[DriverStatus] = []
+    for name, data in store.read_many(f"drivers/{n}" for n in names):
+        try:
+            found.append(msgspec.json.decode(data, type=DriverStatus))
+        except msgspec.DecodeError as error:
+            if name not in unreadable:
+                _log.warning("driver_status_skipped", file=f"{store.shown}/{name}", error=str(error))
+                unreadable.add(name)
     return sorted(found, key=lambda status: status.started_ns, reverse=True)
 
 

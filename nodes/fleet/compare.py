@@ -25,10 +25,10 @@ import numpy as np
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.bootstrap import class_sums, miou_of_sums
-from semantic_mapper.nodes.fleet.results import SegmentRow, TaskResult
+from semantic_mapper.nodes.fleet.results import Failure, SegmentRow, TaskResult
 from semantic_mapper.nodes.fleet.store import Store, batched
 from semantic_mapper.nodes.fleet.tables import Tables
-from semantic_mapper.nodes.fleet.variants import Variant, choose_variant, operations, variants
+from semantic_mapper.nodes.fleet.variants import Variant, choose_variant, failed_variant, operations, variants
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
 
@@ -192,22 +192,29 @@ class FleetComparison:
 def compare_fleets(store_a: Store, store_b: Store, options: GateOptions) -> FleetComparison:
     """Compare results of the same logs; a bounded number of them is in memory.
 
+    Logs of A that failed in B, or are missing there, count as worse, also where B has no result at all.
+
     Args:
         store_a: With the results before.
         store_b: With those after; may be the same store.
         options: What is compared, and what counts as worse.
 
     Raises:
-        ConfigError: there is nothing to compare: no such operation, version, metric or cost, or no log in both.
+        ConfigError: there is nothing to compare: no such operation, version, metric or cost, or B has results of other
+            logs only, and no failures of those of A.
         StoreError: a store cannot be reached.
         DependencyError: DuckDB or pyarrow is missing.
     """
     with Tables(store_a) as tables_a, Tables(store_b) as tables_b:
-        operation = options.operation or _only_operation(tables_a, tables_b)
-        a, b = choose_variant(tables_a, operation, options.a), choose_variant(tables_b, operation, options.b)
+        failures = sorted(store_b.failures(), key=lambda failure: failure.finished_ns)
+        operation = options.operation or _only_operation(tables_a, tables_b, failures)
+        failures = [failure for failure in failures if failure.operation == operation]
+        a = choose_variant(tables_a, operation, options.a)
+        b = _candidate(tables_b, operation, options.b, [f for f in failures if f.log in set(a.logs.values())])
         notes = _partial(tables_a, operation, a, "A") + _partial(tables_b, operation, b, "B")
     shared = [digest for digest in a.keys if digest in b.keys]
-    if not shared:
+    lost = list(_lost(failures, a, b))
+    if not shared and b.keys and not any(change.status == FAILED for change in lost):
         raise ConfigError(
             f"{store_a.shown} and {store_b.shown}: no log has results of `{operation}` in both; A has "
             f"{counted(len(a.keys), 'log')} of {a.describe()}, B {counted(len(b.keys), 'log')} of {b.describe()}"
@@ -220,7 +227,7 @@ def compare_fleets(store_a: Store, store_b: Store, options: GateOptions) -> Flee
         operation=operation,
         a=f"{store_a.shown}: {a.describe()}",
         b=f"{store_b.shown}: {b.describe()}",
-        lost=list(_lost(store_b, a, b, operation)),
+        lost=lost,
         new=sorted(b.logs[digest] for digest in b.keys.keys() - a.keys.keys()),
         notes=notes,
     )
@@ -248,25 +255,28 @@ def compare_results(
         notes: What is known already.
 
     Raises:
-        ConfigError: no result has the metric, or a cost that ``options`` limits.
+        ConfigError: no result has the metric, or a cost that ``options`` limits; or there are neither pairs nor logs
+            that were lost.
     """
     found = Counter(notes)
+    paired = False
     metric = _Metric(options)
     changes: list[LogChange] = []
     costs: dict[str, list[tuple[float, float]]] = {}
     for first, second in pairs:
+        paired = True
         if (change := metric.change(first, second, found)) is not None:
             changes.append(change)
         for name, pair in _costs(first, second):
             costs.setdefault(name, []).append(pair)
-    if not changes:
+    if not changes and (paired or not lost):
         raise ConfigError(
             f"{a}: no result has the metric {options.metric!r}; there are: "
             f"{', '.join(sorted(metric.others)) or 'no metrics'}"
         )
     changes = [*_judged(changes, options, metric.sign), *lost]
     overall, means = _overall(changes)
-    cost_changes = _cost_changes(costs, options)
+    cost_changes = _cost_changes(costs, options) if paired else ()
     changes.sort(key=lambda change: _rank(change, metric.sign))
     unknown = sum(c.estimate is None for c in changes if c.status in (WORSE, BETTER, SAME))
     if unknown:
@@ -290,9 +300,10 @@ def compare_results(
     )
 
 
-def _only_operation(tables_a: Tables, tables_b: Tables) -> str:
-    there = operations(tables_b)
-    both = [name for name in operations(tables_a) if name in there]
+def _only_operation(tables_a: Tables, tables_b: Tables, failures_b: Iterable[Failure]) -> str:
+    """Where B has nothing at all, that of A: all of its logs are missing in B."""
+    there = {*operations(tables_b), *(failure.operation for failure in failures_b)}
+    both = [name for name in operations(tables_a) if name in there or not there]
     if len(both) == 1:
         return both[0]
     found = ", ".join(both) if both else "none in both"
@@ -301,8 +312,31 @@ def _only_operation(tables_a: Tables, tables_b: Tables) -> str:
     )
 
 
+def _candidate(tables: Tables, operation: str, wanted: Mapping[str, str], failures: Sequence[Failure]) -> Variant:
+    """The variant of B; one without results where all logs failed, or none were done.
+
+    Args:
+        tables: Of B.
+        operation: Of the variant.
+        wanted: What ``--b`` says.
+        failures: Of logs of A, in this operation of B, the latest last.
+    """
+    found = variants(tables, operation)
+    if not found:
+        return failed_variant(failures[-1].version if failures else "")
+    versions = {variant.version for variant in found}
+    failed = [failure for failure in failures if failure.version not in versions]
+    if wanted:
+        failed = [f for f in failed if wanted.keys() == {"version"} and f.version.startswith(wanted["version"])]
+        if failed and not any(variant.is_meant(wanted) for variant in found):
+            return failed_variant(failed[-1].version)
+    elif failed and failed[-1].finished_ns // 1000 > found[0].finished_us:
+        return failed_variant(failed[-1].version)  # the latest version has failures only
+    return choose_variant(tables, operation, wanted)
+
+
 def _partial(tables: Tables, operation: str, chosen: Variant, side: str) -> list[str]:
-    most = max(len(variant.keys) for variant in variants(tables, operation))
+    most = max((len(variant.keys) for variant in variants(tables, operation)), default=0)
     if len(chosen.keys) == most:
         return []
     return [f"{side} has {counted(len(chosen.keys), 'log')} of {chosen.describe()}, and up to {most} of other variants"]
@@ -448,13 +482,10 @@ def _flipped(estimate: Estimate, direction: float) -> Estimate:
     return e if direction > 0 else Estimate(-e.difference, e.error, e.freedom, -e.high, -e.low)
 
 
-def _lost(store_b: Store, a: Variant, b: Variant, operation: str) -> Iterator[LogChange]:
-    """Logs with a result in A only."""
-    lost = [digest for digest in a.keys if digest not in b.keys]
-    if not lost:
-        return
-    failures = {f.log: f for f in store_b.failures() if f.operation == operation}
-    for digest in lost:
+def _lost(failures_b: Iterable[Failure], a: Variant, b: Variant) -> Iterator[LogChange]:
+    """Logs with a result in A only; of several failures of a log, the last one counts."""
+    failures = {failure.log: failure for failure in failures_b}
+    for digest in [digest for digest in a.keys if digest not in b.keys]:
         log = a.logs[digest]
         failure = failures.get(log)
         reason = failure.errors[-1] if failure and failure.errors else ""

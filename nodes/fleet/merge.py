@@ -1,7 +1,7 @@
 """Many maps of one building merged into tiles, in parallel and out of core.
 
 Three steps, each of independent tasks: find where the maps lie, cut each map into pieces, fuse the pieces of each tile.
-Names of pieces and tiles hold digests of all that decides their content, so that what is there is not done again, and
+Names of alignments, pieces and tiles say all that decides their content, so that what is there is not done again, and
 the same maps give the same bytes in whichever order tasks run. ``tiles.json`` is created last, once; before, no reader
 sees a tile. A task has one map in memory (``tiles.MEMORY_MB`` of it; two where maps are aligned), or one tile.
 
@@ -9,7 +9,7 @@ Layout, beside what ``Store`` has:
 
     tiles.json                      the manifest (``mapping.files.tiles``)
     tiles/X_Y_Z-PLAN.npz            a tile
-    alignments/MAP-MAP.json         where one map lies in another, or why that is not known
+    alignments/MAP-MAP-VERSION.json where one map lies in another, or why that is not known
     pieces/KEY/X_Y_Z.npz            while a merge runs: what a map says of a tile; pieces.json is written last
     tiles/X_Y_Z-PLAN.json           while a merge runs: the tile's row of the manifest
 """
@@ -56,7 +56,7 @@ from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_
 from semantic_mapper.queries.tiles import describe_tile
 from semantic_mapper.types import Float64
 
-MERGE_VERSION = 1  # part of all digests: raise it where the same maps would give other tiles
+MERGE_VERSION = 1  # part of all names: raise it where the same maps would give other places or tiles
 TASK_BYTES = 3_000_000_000  # of memory that a task declares: two maps of ``tiles.MEMORY_MB`` and the libraries
 MAP_NAME = "map.npz"
 _WAY_OUT = "Give it in the file of --poses"
@@ -241,7 +241,7 @@ def run_on_ray(cluster: Cluster, max_parallel: int = 0) -> Run:
 
     def run(function: Callable[..., _R], jobs: Sequence[tuple[Any, ...]], done: Callable[[], None]) -> list[_R]:
         import ray
-        from ray.exceptions import RayError
+        from ray.exceptions import RayError, RayTaskError
 
         task = ray.remote(num_cpus=1, memory=memory)(_caught)
         waiting = list(enumerate(jobs))[::-1]
@@ -254,12 +254,19 @@ def run_on_ray(cluster: Cluster, max_parallel: int = 0) -> Run:
                 running[task.remote(function, job)] = number
             (ready, *_), _ = ray.wait(list(running))
             number = running.pop(ready)
+            where = f"task {number + 1} of {len(jobs)} ({function.__name__.strip('_')})"
             try:
                 result, error = ray.get(ready)
+            except RayTaskError as failure:
+                cause = failure.cause
+                raise FleetError(
+                    f"{where} failed: {type(cause).__name__}: {cause}; run the merge again once that is mended, what is "
+                    "done stays done"
+                ) from cause
             except RayError as failure:
                 raise FleetError(
-                    f"task {number + 1} of {len(jobs)} ({function.__name__.strip('_')}) was lost with its worker "
-                    f"({str(failure).splitlines()[0]}); run the merge again, what is done stays done"
+                    f"{where} was lost with its worker ({str(failure).splitlines()[0]}); run the merge again, what is "
+                    "done stays done"
                 ) from failure
             if error is not None:
                 raise error
@@ -423,7 +430,7 @@ def _read_facts(url: str, name: str) -> MapFacts:
 
 def _align(store_url: str, url: str, other_url: str, digest: str, other_digest: str) -> Alignment:
     store = Store(store_url)
-    name = f"alignments/{digest[:16]}-{other_digest[:16]}.json"
+    name = f"alignments/{digest[:16]}-{other_digest[:16]}-{MERGE_VERSION}.json"
     if store.exists(name):
         return msgspec.json.decode(store.read(name), type=Alignment)
     with _local(url) as path, _local(other_url) as other_path:

@@ -41,22 +41,6 @@ _log = get_logger(__name__)
 _T = TypeVar("_T")
 
 
-def refresh(store: Store) -> int:
-    """Add results to the tables that they lack.
-
-    Returns:
-        How many were added.
-
-    Raises:
-        ConfigError: a document or a part is damaged.
-        StoreError: the store cannot be reached. A store that can only be read is no error: the event
-            ``tables_not_saved`` is logged, and readers derive the rows for themselves.
-        DependencyError: DuckDB or pyarrow is missing.
-    """
-    with Tables(store) as tables:
-        return tables.refresh()
-
-
 def query(store: Store, sql: str) -> pa.Table:
     """The rows that one statement selects; see ``Tables.query``."""
     with Tables(store) as tables:
@@ -65,6 +49,9 @@ def query(store: Store, sql: str) -> pa.Table:
 
 class Tables:
     """Reads the tables of a store; a context manager. The first query adds results that they lack.
+
+    Into a store that can only be read nothing is added: the event ``tables_not_saved`` is logged, and the rows are
+    derived for this reader alone.
 
     Args:
         store: Whose results.
@@ -81,11 +68,6 @@ class Tables:
 
     def __exit__(self, *_: object) -> None:
         self._folder.cleanup()
-
-    def refresh(self) -> int:
-        """As the function ``refresh``."""
-        self._parts = None
-        return self._retried(lambda parts: parts.added)
 
     def query(self, sql: str) -> pa.Table:
         """The rows that a statement of SQL selects.
@@ -281,12 +263,10 @@ class _Parts:
     Attributes:
         folder: Of this reader: what it has fetched or made.
         owner: The part that counts, by key.
-        added: How many keys this reader has added.
     """
 
     folder: Path
     owner: dict[str, str] = field(default_factory=dict)
-    added: int = 0
 
     def names(self) -> list[str]:
         return sorted(set(self.owner.values()))
@@ -323,7 +303,6 @@ def _up_to_date(store: Store, names: Sequence[str], folder: Path) -> _Parts:
     for draft in _drafts(store, unknown):
         draft.write(folder)
         parts.owner.update(dict.fromkeys(draft.keys, draft.name))
-        parts.added += len(draft.keys)
         rows[draft.name] = len(draft.keys)
         saved = saved and _save(store, folder, draft.name)
     small = [name for name, count in rows.items() if count < PART_RESULTS]
@@ -438,17 +417,22 @@ def _select(store: Store, parts: _Parts, sql: str, named: set[str]) -> pa.Table:
 
     duckdb = _duckdb()
     with duckdb.connect(config={"temp_directory": str(parts.folder / "spilled")}) as database:
+        needed = named | {"logs"} if FAILURES in named else named
         chosen = pa.table({"key": list(parts.owner), "part": list(parts.owner.values())}, _chosen_schema())
         database.register("_chosen", chosen)
         for table in TABLES:
             # Segments are most of the bytes; files of a remote store are fetched only where the statement needs them.
-            names = parts.names() if table in named else []
+            names = parts.names() if table in needed else []
             database.register(f"_{table}", _dataset(store, parts, table, names))
             database.execute(
                 f"CREATE VIEW {table} AS SELECT * EXCLUDE (part) FROM _{table} SEMI JOIN _chosen USING (key, part)"
             )
         failures = [_failure_row(f) for f in store.failures()] if FAILURES in named else []
-        database.register(FAILURES, pa.Table.from_pylist(failures, _failure_schema()))
+        database.register("_failures", pa.Table.from_pylist(failures, _failure_schema()))
+        database.execute(
+            f"CREATE VIEW {FAILURES} AS SELECT * FROM _failures f WHERE NOT EXISTS (FROM logs l WHERE l.log = f.log AND "
+            "l.operation = f.operation AND l.version <> f.version AND l.finished > f.finished)"
+        )
         database.execute("SET enable_external_access = false")
         database.execute("SET lock_configuration = true")
         found = database.sql(sql)

@@ -27,7 +27,7 @@ from semantic_mapper.training.train_checks import check_nothing_is_overwritten, 
 from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.training.train_state import unfinished_step
 
-MAX_LOSSES = 10  # of a group of ranks in one sitting; preemptions that Ray knows of do not count
+MAX_RESTARTS = 10  # of a group of ranks in one sitting; preemptions that Ray knows of do not count
 POLL_S = 0.3  # between two looks at how far the ranks are
 LOCK_WAIT_S = 60.0  # for the folder, which a lost rank may hold until its machine's file server notices
 
@@ -89,9 +89,9 @@ def train_on_ray(
         encoder_from=_absolute(config.encoder_from),
     )
     with _marked(folder) as marker:
-        desk: Any = _open_desk()
-        task = _Task(placed, folder, marker, resume, desk)
-        return _wait_for(_Fit(task, ranks, resources), desk, on_progress, stopped)
+        coordinator: Any = _open_coordinator()
+        task = _Task(placed, folder, marker, resume, coordinator)
+        return _wait_for(_Fit(task, ranks, resources), coordinator, on_progress, stopped)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,17 +100,17 @@ class _Task:
 
     Args:
         marker: A file in ``folder``, which shows that a rank sees this very folder.
-        desk: Handle of the ``_Desk`` actor.
+        coordinator: Handle of the ``_Coordinator`` actor.
     """
 
     config: TrainConfig
     folder: Path
     marker: Path
     resume: bool
-    desk: Any
+    coordinator: Any
 
 
-class _Desk:
+class _Coordinator:
     """An actor on the driver's machine where ranks and driver meet."""
 
     def __init__(self) -> None:
@@ -148,11 +148,11 @@ class _Desk:
         return self._checkpoint, self._error
 
 
-class _DriverLine:
-    """The first rank's line to the desk: one message under way at a time, so that no step waits for an answer."""
+class _ProgressReporter:
+    """Reports from the first rank: one message under way at a time, so that no step waits for an answer."""
 
-    def __init__(self, desk: Any) -> None:
-        self._desk = desk
+    def __init__(self, coordinator: Any) -> None:
+        self._coordinator = coordinator
         self._answer: Any = None
         self.stop = False
 
@@ -163,7 +163,7 @@ class _DriverLine:
             if not ray.wait([self._answer], timeout=0)[0]:
                 return
             self.stop = bool(ray.get(self._answer))
-        self._answer = self._desk.report.remote(progress)
+        self._answer = self._coordinator.report.remote(progress)
 
 
 def _run_rank(setup: dict[str, Any]) -> None:
@@ -174,7 +174,7 @@ def _run_rank(setup: dict[str, Any]) -> None:
     prepare_process()
     keep_freed_memory()
     ranks = ranks_from_environment()
-    if not ray.get(task.desk.start.remote(ranks.first)):
+    if not ray.get(task.coordinator.start.remote(ranks.first)):
         return
     try:
         if not task.marker.is_file():
@@ -186,20 +186,20 @@ def _run_rank(setup: dict[str, Any]) -> None:
             _wait_for_lock(task.folder)
         # The driver has made sure that a state is of this run: there was none before, or --resume goes on with it.
         resume = task.resume or (task.folder / STATE_FILE).is_file()
-        line = _DriverLine(task.desk)
+        reporter = _ProgressReporter(task.coordinator)
         checkpoint = train(
             task.config,
             task.folder,
             resume=resume,
-            on_progress=line.report,
-            stopped=lambda: line.stop,
+            on_progress=reporter.report,
+            stopped=lambda: reporter.stop,
             feed=open_actor_feed,
         )
     except SemanticMapperError as error:
-        ray.get(task.desk.refuse.remote(error))
+        ray.get(task.coordinator.refuse.remote(error))
         raise
     if ranks.first:
-        ray.get(task.desk.finish.remote(checkpoint))
+        ray.get(task.coordinator.finish.remote(checkpoint))
 
 
 def _wait_for_lock(folder: Path) -> None:
@@ -245,7 +245,7 @@ class _Fit(threading.Thread):
             run_config=RunConfig(
                 name=self._task.marker.parent.name,
                 storage_path=str(self._task.folder),
-                failure_config=FailureConfig(max_failures=MAX_LOSSES),
+                failure_config=FailureConfig(max_failures=MAX_RESTARTS),
                 worker_runtime_env={"env_vars": {"OMP_NUM_THREADS": str(self._resources.cpus)}},
             ),
         )
@@ -256,7 +256,7 @@ class _Fit(threading.Thread):
 
 
 def _wait_for(
-    fit: _Fit, desk: Any, on_progress: Callable[[TrainProgress], None] | None, stopped: Callable[[], object]
+    fit: _Fit, coordinator: Any, on_progress: Callable[[TrainProgress], None] | None, stopped: Callable[[], object]
 ) -> Checkpoint:
     """Show progress and hand on a stop until the ranks have ended; returns their weights."""
     import ray
@@ -265,14 +265,14 @@ def _wait_for(
     shown, starts = None, 1
     while fit.is_alive():
         fit.join(POLL_S)
-        progress, started = ray.get(desk.look.remote(bool(stopped())))
+        progress, started = ray.get(coordinator.look.remote(bool(stopped())))
         if started > starts:
             _log.warning("ranks_restarted", restarts=started - 1, step=0 if progress is None else progress.step)
             starts = started
         if on_progress is not None and progress is not None and progress != shown:
             on_progress(progress)
             shown = progress
-    checkpoint, refused = ray.get(desk.result.remote())
+    checkpoint, refused = ray.get(coordinator.result.remote())
     if refused is not None:
         raise refused
     if checkpoint is None:  # the first rank hands it in as the last thing that it does
@@ -283,13 +283,13 @@ def _wait_for(
     return checkpoint
 
 
-def _open_desk() -> Any:
-    """A ``_Desk`` on this machine, so that it is lost with the driver alone."""
+def _open_coordinator() -> Any:
+    """A ``_Coordinator`` on this machine, so that it is lost with the driver alone."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-    actor: Any = ray.remote(_Desk).options(num_cpus=0, scheduling_strategy=here)
+    actor: Any = ray.remote(_Coordinator).options(num_cpus=0, scheduling_strategy=here)
     return actor.remote()
 
 

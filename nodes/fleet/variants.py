@@ -15,12 +15,15 @@ from semantic_mapper.plain_text import counted
 _COLUMNS = "key, log, log_digest, version, code, weights, weights_digest, settings, epoch_us(finished) AS finished_us"
 
 
+DEFAULT_WEIGHTS = "default"  # what people are shown and write for weights that were not named
+
+
 @dataclass(frozen=True, slots=True)
 class Variant:
     """One way in which an operation was run.
 
     Args:
-        version, weights: For people, of the latest result.
+        version, weights: For people, of the latest result; no weights = those that ship with the package.
         code, weights_digest: Of contents.
         settings: What ``--set`` said; ``settings_text`` is that as the tables have it.
         finished_us: When the latest result was finished, microseconds since 1970.
@@ -40,8 +43,10 @@ class Variant:
 
     def describe(self) -> str:
         """For people, on one line."""
-        settings = [f"{name}={value}" for name, value in sorted(self.settings.items())]
-        return ", ".join([self.version, f"weights {self.weights or '-'}", *settings])
+        if not self.keys:
+            return ", ".join([*([self.version] if self.version else []), "no results"])
+        settings = [f"{name}={_written(value)}" for name, value in sorted(self.settings.items())]
+        return ", ".join([self.version, f"weights {self.weights or DEFAULT_WEIGHTS}", *settings])
 
     def condition(self, operation: str) -> str:
         """Of SQL, for rows of ``logs``."""
@@ -59,8 +64,18 @@ class Variant:
         if name == "code":
             return self.code.startswith(value)
         if name == "weights":
-            return value == self.weights or self.weights_digest.startswith(value)
-        return name in self.settings and str(self.settings[name]) == value
+            return value == (self.weights or DEFAULT_WEIGHTS) or self.weights_digest.startswith(value)
+        return name in self.settings and _written(self.settings[name]) == value
+
+
+def _written(value: Any) -> str:
+    """A setting as ``--set`` takes it."""
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()
+
+
+def failed_variant(version: str) -> Variant:
+    """A variant without results; ``version`` may be empty."""
+    return Variant(version, "", "", "", {}, "{}", 0, {}, {})
 
 
 def quoted(text: str) -> str:

@@ -7,13 +7,15 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from semantic_mapper.nodes.cli import fleet_report
 from semantic_mapper.nodes.cli.report import linked, safe_link
 from semantic_mapper.nodes.fleet.results import Failure
 from semantic_mapper.nodes.fleet.store import Store
-from tests.nodes.cli.test_report import pictures, read_page
+from tests.nodes.cli.test_report import cells, pictures, read_page
 from tests.nodes.fleet.made_up import FINISHED_NS, made_up, store_of, with_files
 from tests.nodes.support import error_line, run
 
@@ -95,6 +97,50 @@ def test_report_has_pictures_links_failures_and_trend(store: Store) -> None:
     assert "bad &lt;b&gt;.mcap" in path.read_text(encoding="utf-8")
 
 
+def test_report_says_which_failures_are_of_an_older_version(tmp_path: Path) -> None:
+    store = store_of(tmp_path / "store", [made_up(n, weights="") for n in range(3)])
+    version = made_up(0).version
+    for name, of, log in (
+        ("old", "0.0.9", "/logs/old.mcap"),
+        ("new", version, "/logs/new.mcap"),
+        ("done", "0.0.9", made_up(1).log),
+    ):
+        store.quarantine(Failure(name, "replay", log, {}, of, ("E: no",), FINISHED_NS - 1))
+    done = run("fleet", "report", store.url, "--out", tmp_path / "page")
+    assert done.returncode == 0, done.stderr
+    page = read_page(tmp_path / "page" / "report.html")
+    found = cells(page)
+    assert found["/logs/old.mcap"][1] == "0.0.9 (older)" and found["/logs/new.mcap"][1] == version
+    assert any((p.text or "").startswith("2 logs failed, 1 of them in an older version") for p in page.iter("p"))
+    assert f"{version}, weights default" in found
+
+
+@pytest.mark.parametrize(
+    ("values", "shown"), [([0, 0], False), ([3, 3], False), ([3, 4], True), ([3], True), ([0], False)]
+)
+def test_figures_that_say_nothing_are_not_drawn(values: list[float], shown: bool) -> None:
+    assert fleet_report._is_telling(np.array(values, np.float64)) == shown
+
+
+@pytest.mark.parametrize(
+    ("seconds", "size", "shown"),
+    [(0.4, 1000, "0.4 s, 1 kB"), (36, 15_900_000, "36 s, 15.9 MB"), (138, 2.5e9, "2.3 min, 2.5 GB")],
+)
+def test_times_and_sizes_have_units_that_fit(seconds: float, size: float, shown: str) -> None:
+    assert f"{fleet_report._duration_text(seconds)}, {fleet_report._size_text(size)}" == shown
+
+
+def test_a_candidate_without_results_exits_with_1_and_its_errors(tmp_path: Path) -> None:
+    results = [made_up(n) for n in range(2)]
+    a, b = store_of(tmp_path / "a", results), Store(str(tmp_path / "b"), create=True)
+    for n, result in enumerate(results):
+        b.quarantine(Failure(f"k{n}", "replay", result.log, {}, "0.2.0", ("WeightsError: no",), FINISHED_NS))
+    done = run("fleet", "compare", a.url, b.url)
+    assert done.returncode == 1 and "worse: 2 logs failed in B" in done.stdout, done.stderr
+    assert "WeightsError" in done.stdout and "nan" not in done.stdout
+    assert json.loads(run("fleet", "compare", a.url, b.url, "--json").stdout)["worse"]
+
+
 def test_report_of_one_log_without_files_or_score(tmp_path: Path) -> None:
     import msgspec
 
@@ -140,6 +186,11 @@ def test_compare_finds_a_worse_version_and_not_a_rerun(tmp_path: Path) -> None:
     assert found["overall"]["high"] < 0
     done = run("fleet", "compare", a.url, worse.url)
     assert done.returncode == 1 and "6 logs lost more than 0.02" in done.stdout
+
+
+@pytest.mark.parametrize(("verb", "usage"), [("compare", "{STORE_A} [STORE_B]"), ("table", "{STORE} [SQL]")])
+def test_usage_shows_which_arguments_may_be_left_out(verb: str, usage: str) -> None:
+    assert f"{usage}\n" in run("fleet", verb, "--help").stdout
 
 
 def test_compare_within_a_store(store: Store) -> None:

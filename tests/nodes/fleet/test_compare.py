@@ -18,6 +18,7 @@ from semantic_mapper.nodes.fleet.compare import (
     compare_results,
     lower_is_better,
 )
+from semantic_mapper.nodes.fleet.operations import changed_settings, read_settings
 from semantic_mapper.nodes.fleet.results import Failure, Findings, SegmentRow, TaskResult
 from semantic_mapper.nodes.fleet.store import Store
 from tests.nodes.fleet.made_up import FINISHED_NS, VERSION, made_up, store_of
@@ -79,6 +80,32 @@ def test_logs_that_failed_or_are_missing_are_worse_and_say_why(tmp_path: Path) -
     assert not reverse.worse and reverse.new == tuple(result.log for result in results[2:])
 
 
+def test_a_candidate_whose_logs_all_failed_is_worse(tmp_path: Path) -> None:
+    results = [made_up(n) for n in range(3)]
+    a, b = store_of(tmp_path / "a", results), Store(str(tmp_path / "b"), create=True)
+    nothing = compare_fleets(a, b, GateOptions(costs={"seconds": 0.1}))
+    assert nothing.reasons == ("3 logs missing in B",) and "no results" in nothing.b
+    for n, result in enumerate(results[:2]):
+        b.quarantine(Failure(f"k{n}", "replay", result.log, {}, "0.2.0", ("LogError: cut off",), FINISHED_NS))
+    found = compare_fleets(a, b, GateOptions())
+    assert found.reasons == ("2 logs failed in B", "1 log missing in B") and "0.2.0, no results" in found.b
+    assert [log.reason for log in found.logs] == ["LogError: cut off"] * 2 + [""]
+    assert json.loads(json.dumps(found.to_plain(), allow_nan=False))["mean_a"] is None
+
+
+@pytest.mark.parametrize("wanted", [{}, {"version": "0.2.0"}])
+def test_a_later_version_with_failures_only_is_worse_than_earlier_results(
+    tmp_path: Path, wanted: dict[str, str]
+) -> None:
+    results = [made_up(n) for n in range(3)]
+    store = store_of(tmp_path / "store", results)
+    for n, result in enumerate(results):
+        store.quarantine(Failure(f"k{n}", "replay", result.log, {}, "0.2.0", ("E: no",), FINISHED_NS + 10**15))
+    found = compare_fleets(store, store, GateOptions(a={"version": "0.1.0"}, b=wanted))
+    assert found.reasons == ("3 logs failed in B",)
+    assert not compare_fleets(store, store, GateOptions(b={"version": "0.1.0"})).worse
+
+
 def test_a_log_without_a_score_in_b_is_worse() -> None:
     a, b = made_up(1), made_up(1)
     both = [*pairs(3), (with_findings(a, segments=()), with_findings(b, segments=(), metrics={"miou": None}))]
@@ -98,10 +125,23 @@ def test_versions_in_one_store_are_compared_and_the_latest_counts(tmp_path: Path
 
 
 def test_settings_in_one_store_are_compared(tmp_path: Path) -> None:
-    results = [made_up(n, settings={"render.scale": s}, loss=1 - s) for n in range(3) for s in (0.5, 1.0)]
+    given = {"quality=fast": 0.3, "render.scale=0.5": 0.2, "max_frames=3": 0.1, "moving.classes=true": 0.05}
+    settings = {text: changed_settings(read_settings("replay", [text])) for text in given}
+    results = [made_up(n, settings=settings[text], loss=loss) for text, loss in given.items() for n in range(3)]
+    store = store_of(tmp_path / "store", [*results, *(made_up(n) for n in range(3))])
+    for text in given:
+        name, _, value = text.partition("=")
+        found = compare_fleets(store, store, GateOptions(a={"weights": "small"}, b={name: value}))
+        assert found.b.endswith(f", {text}"), "what --set takes is what --b takes"
+    with pytest.raises(ConfigError, match=r"have quality=best; there are: .*quality=fast"):
+        compare_fleets(store, store, GateOptions(b={"quality": "best"}))
+
+
+def test_weights_that_were_not_named_are_the_default(tmp_path: Path) -> None:
+    results = [made_up(n, weights=name, weights_digest=name or "d") for n in range(3) for name in ("", "small")]
     store = store_of(tmp_path / "store", results)
-    found = compare_fleets(store, store, GateOptions(a={"render.scale": "1.0"}, b={"render.scale": "0.5"}))
-    assert found.worse and "render.scale=0.5" in found.b
+    found = compare_fleets(store, store, GateOptions(a={"weights": "default"}, b={"weights": "small"}))
+    assert "weights default" in found.a and "weights small" in found.b and not found.worse
 
 
 def test_a_variant_with_few_logs_is_noted(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -14,10 +15,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.errors import ConfigError, FleetError, MapError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import Place, make_place
@@ -244,6 +246,19 @@ def test_a_map_joins_whichever_placed_map_it_agrees_with_most(maps: list[str], t
     assert report.notes[2] == "c: 4 of 9 places found in b"
 
 
+def test_alignments_of_another_version_are_not_used(maps: list[str], tmp_path: Path) -> None:
+    a, b = (str(Path(url, "map.npz")) for url in maps[:2])
+    store = Store(str(tmp_path), create=True)
+    first = merge_module._align(store.url, a, b, "a" * 64, "b" * 64)
+    (name,) = store.names("alignments")
+    store.write(f"alignments/{name}", msgspec.json.encode(Alignment(None, refusal="from the store")))
+    assert merge_module._align(store.url, a, b, "a" * 64, "b" * 64).refusal == "from the store"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(merge_module, "MERGE_VERSION", merge_module.MERGE_VERSION + 1)
+        assert merge_module._align(store.url, a, b, "a" * 64, "b" * 64).refusal == first.refusal
+    assert len(store.names("alignments")) == 2
+
+
 def _rows(T: Float64) -> Any:
     return tuple(tuple(row) for row in T.tolist())
 
@@ -328,6 +343,19 @@ def test_workers_of_ray_give_the_same_bytes(maps: list[str], tmp_path: Path) -> 
         with pytest.raises(MapError, match="b: where it lies is not known"):
             merged(maps, tmp_path / "third", run_on_ray(cluster, 1), poses={"a": np.eye(4), "c": POSES["c"]})
     assert content(tmp_path / "one") == content(tmp_path / "other")
+
+
+def _disk_full() -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.slow
+def test_an_error_of_a_task_is_reported_with_its_cause(tmp_path: Path) -> None:
+    with connected("local") as cluster:
+        with pytest.raises(FleetError, match=r"task 1 of 1 \(disk_full\) failed: OSError: .*No space left") as caught:
+            run_on_ray(cluster)(_disk_full, [()], lambda: None)
+    assert "lost" not in str(caught.value) and "\x1b" not in str(caught.value)
+    assert isinstance(caught.value.__cause__, OSError)
 
 
 KILLED = """

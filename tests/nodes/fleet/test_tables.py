@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 from pathlib import Path
 
 import msgspec
+import pyarrow.parquet as pq
 import pytest
 
 from semantic_mapper.errors import ConfigError, StoreError
 from semantic_mapper.nodes.fleet import tables as module
 from semantic_mapper.nodes.fleet.results import Failure
 from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.tables import TABLES, Tables, query, refresh
+from semantic_mapper.nodes.fleet.tables import TABLES, Tables, query
 from tests.nodes.fleet.made_up import FINISHED_NS, NAMES, made_up, store_of
 
 EACH = "SELECT count(*) AS n, count(DISTINCT key) AS keys FROM "
@@ -22,6 +24,18 @@ EACH = "SELECT count(*) AS n, count(DISTINCT key) AS keys FROM "
 def counts(store: Store, table: str = "logs") -> tuple[int, int]:
     (row,) = query(store, EACH + table).to_pylist()
     return row["n"], row["keys"]
+
+
+def refresh(store: Store) -> int:
+    """Query, which adds results that the tables lack; returns how many rows the parts have more."""
+    before = _saved_rows(store)
+    query(store, "SELECT 1")
+    return _saved_rows(store) - before
+
+
+def _saved_rows(store: Store) -> int:
+    names = store.names("tables/logs")
+    return sum(pq.read_metadata(io.BytesIO(store.read(f"tables/logs/{name}"))).num_rows for name in names)
 
 
 def test_a_log_is_a_row_with_its_metrics_costs_and_tags(tmp_path: Path) -> None:
@@ -166,6 +180,21 @@ def test_quarantined_tasks_are_rows_of_failures(tmp_path: Path) -> None:
     store.quarantine(Failure("k", "replay", "/logs/x.mcap", {"robot": "r9"}, "0.1.0", ("first", "last"), FINISHED_NS))
     (row,) = query(store, "SELECT log, error, attempts, tags ->> 'robot' AS robot FROM failures").to_pylist()
     assert row == {"log": "/logs/x.mcap", "error": "last", "attempts": 2, "robot": "r9"}
+
+
+def test_failures_of_logs_that_another_version_has_done_since_are_no_rows(tmp_path: Path) -> None:
+    store = store_of(tmp_path / "store", [made_up(n) for n in range(4)])
+    logs = [made_up(n).log for n in range(4)]
+    for n, (operation, version, finished_ns) in enumerate(
+        [
+            ("replay", "0.0.9", FINISHED_NS - 1),  # done since
+            ("replay", "0.2.0", FINISHED_NS + 10**15),  # a later version fails
+            ("eval", "0.0.9", FINISHED_NS - 1),  # only another operation has been done
+            ("replay", made_up(3).version, FINISHED_NS - 1),  # with other weights, say
+        ]
+    ):
+        store.quarantine(Failure(f"k{n}", operation, logs[n], {}, version, ("E: no",), finished_ns))
+    assert [row["log"] for row in query(store, "SELECT log FROM failures ORDER BY log").to_pylist()] == logs[1:]
 
 
 def test_an_empty_store_has_empty_tables(tmp_path: Path) -> None:
