@@ -170,7 +170,8 @@ def _variants_table(tables: Tables, operation: str, found: Sequence[Variant]) ->
     for variant in found[:MAX_VERSIONS]:
         (row,) = tables.query(
             "SELECT count(*) AS logs, count(DISTINCT node) AS nodes, sum(seconds) AS seconds, "
-            f"sum(log_bytes)::DOUBLE AS bytes, max(finished) AS finished FROM logs WHERE {variant.condition(operation)}",
+            "sum(log_bytes)::DOUBLE AS bytes, max(finished) AS finished "
+            f"FROM logs WHERE {variant.condition(operation)}",
         ).to_pylist()
         times = _duration_text(row["seconds"]), _size_text(row["bytes"]), str(row["finished"])[:16]
         rows.append((variant.describe(), str(row["logs"]), str(row["nodes"]), *times))
@@ -189,9 +190,7 @@ def _with_unit(value: float, units: Sequence[tuple[str, float]]) -> str:
     """In the largest unit of which there is at least one."""
     unit, scale = next((pair for pair in units if value >= pair[1]), units[-1])
     number = value / scale
-    return (
-        f"{number:.0f} {unit}" if number >= 100 else f"{number:.2g} {unit}" if number < 10 else f"{number:.3g} {unit}"
-    )
+    return f"{number:.0f} {unit}" if number >= 100 else f"{number:.{2 if number < 10 else 3}g} {unit}"
 
 
 def _classes(tables: Tables, operation: str, where: str) -> Iterator[Section]:

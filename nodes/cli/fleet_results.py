@@ -148,8 +148,9 @@ def compare(
 
     Results are paired by the content of their logs. B is worse where the mean over logs has surely fallen below that of
     A, where single logs have surely lost more than --log-threshold, or where logs with a result in A failed in B, are
-    missing there or have no score, also where B has no result at all. Of several versions, weights or settings in a store, the latest count; --a and --b
-    choose others. Exit codes: 0 not worse, 1 worse, 2 wrong usage, or something that cannot be read.
+    missing there or have no score, also where B has no result at all. Of several versions, weights or settings in a
+    store, the latest count; --a and --b choose others. Exit codes: 0 not worse, 1 worse, 2 wrong usage, or something
+    that cannot be read.
 
     Example: semantic-mapper fleet compare runs/released runs/candidate
     Example: semantic-mapper fleet compare runs/fleet --a version=0.1.0 --b version=0.2.0 --cost step_ms_p50=0.1

@@ -260,8 +260,8 @@ def run_on_ray(cluster: Cluster, max_parallel: int = 0) -> Run:
             except RayTaskError as failure:
                 cause = failure.cause
                 raise FleetError(
-                    f"{where} failed: {type(cause).__name__}: {cause}; run the merge again once that is mended, what is "
-                    "done stays done"
+                    f"{where} failed: {type(cause).__name__}: {cause}; run the merge again after you have mended that, "
+                    "what is done stays done"
                 ) from cause
             except RayError as failure:
                 raise FleetError(

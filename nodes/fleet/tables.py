@@ -430,8 +430,8 @@ def _select(store: Store, parts: _Parts, sql: str, named: set[str]) -> pa.Table:
         failures = [_failure_row(f) for f in store.failures()] if FAILURES in named else []
         database.register("_failures", pa.Table.from_pylist(failures, _failure_schema()))
         database.execute(
-            f"CREATE VIEW {FAILURES} AS SELECT * FROM _failures f WHERE NOT EXISTS (FROM logs l WHERE l.log = f.log AND "
-            "l.operation = f.operation AND l.version <> f.version AND l.finished > f.finished)"
+            f"CREATE VIEW {FAILURES} AS SELECT * FROM _failures f WHERE NOT EXISTS (FROM logs l WHERE "
+            "l.log = f.log AND l.operation = f.operation AND l.version <> f.version AND l.finished > f.finished)"
         )
         database.execute("SET enable_external_access = false")
         database.execute("SET lock_configuration = true")

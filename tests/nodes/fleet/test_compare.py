@@ -94,9 +94,7 @@ def test_a_candidate_whose_logs_all_failed_is_worse(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wanted", [{}, {"version": "0.2.0"}])
-def test_a_later_version_with_failures_only_is_worse_than_earlier_results(
-    tmp_path: Path, wanted: dict[str, str]
-) -> None:
+def test_a_later_version_with_failures_only_is_worse(tmp_path: Path, wanted: dict[str, str]) -> None:
     results = [made_up(n) for n in range(3)]
     store = store_of(tmp_path / "store", results)
     for n, result in enumerate(results):

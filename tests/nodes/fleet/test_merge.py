@@ -351,9 +351,9 @@ def _disk_full() -> None:
 
 @pytest.mark.slow
 def test_an_error_of_a_task_is_reported_with_its_cause(tmp_path: Path) -> None:
-    with connected("local") as cluster:
-        with pytest.raises(FleetError, match=r"task 1 of 1 \(disk_full\) failed: OSError: .*No space left") as caught:
-            run_on_ray(cluster)(_disk_full, [()], lambda: None)
+    said = r"task 1 of 1 \(disk_full\) failed: OSError: .*No space left"
+    with connected("local") as cluster, pytest.raises(FleetError, match=said) as caught:
+        run_on_ray(cluster)(_disk_full, [()], lambda: None)
     assert "lost" not in str(caught.value) and "\x1b" not in str(caught.value)
     assert isinstance(caught.value.__cause__, OSError)
 
