@@ -47,7 +47,7 @@ class FaultPlan:
         error: Answered with 500 or 503; the server never sees them.
         slow: Answered in pieces, with pauses.
         cut: The connection ends in the middle of the answer's body.
-        lost: The server does what it is asked to, and the connection ends before any answer.
+        lost: The server does what it is asked to, and the connection ends before any answer; not of PUT, nor is that cut.
         in_a_row: Faults of one method and path, after which the next request passes: clients give up at some point.
     """
 
@@ -108,7 +108,7 @@ def s3_server(folder: Path, plan: FaultPlan | None = None) -> Iterator[S3Server]
     program = Path(sys.executable).parent / "rclone"
     command = [str(program), "serve", "s3", "--addr", f"127.0.0.1:{port}", "--auth-key", f"{ACCESS_KEY},{SECRET_KEY}"]
     # What another process writes into the folder is seen at once.
-    command += ["--dir-cache-time", "0s", "--config", os.devnull, str(folder)]
+    command += ["--dir-cache-time", "0s", "--vfs-write-wait", "0s", "--no-modtime", "--config", os.devnull, str(folder)]
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     ) as rclone:
@@ -132,6 +132,8 @@ def _proxy(upstream: str, folder: Path, plan: FaultPlan) -> Iterator[S3Server]:
     def fault_of(method: str, path: str) -> Fault:
         with drawing:
             (kind,) = draws.choices(kinds, weights)
+            if kind in ("lost", "cut") and method == "PUT":  # rclone 1.75 hangs where a PUT comes again at once
+                kind = "passed"
             if failed[method, path] >= plan.in_a_row:
                 kind = "passed"
             failed[method, path] = 0 if kind in ("passed", "slow") else failed[method, path] + 1
@@ -154,7 +156,7 @@ def _proxy(upstream: str, folder: Path, plan: FaultPlan) -> Iterator[S3Server]:
                 self._answer(code, {"Content-Type": "application/xml"}, _error_body(code), pause_s=0.0)
                 return
             code, headers, answer = self._forwarded(body)
-            if kind == "lost" or (kind == "cut" and not answer):
+            if kind in ("lost", "cut") and not (kind == "cut" and answer):
                 self._end_connection()
                 return
             length = len(answer)

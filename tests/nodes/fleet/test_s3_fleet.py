@@ -27,7 +27,7 @@ from tests.small import tiny_frames
 
 FAULTS = FaultPlan(seed=5, error=0.08, slow=0.08, cut=0.05, lost=0.05)
 SMALL = Resources(cpus=1.0, memory_bytes=1 << 20)
-LOGS = 4
+LOGS = 3
 
 
 @pytest.fixture
