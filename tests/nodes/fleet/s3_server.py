@@ -47,7 +47,7 @@ class FaultPlan:
         error: Answered with 500 or 503; the server never sees them.
         slow: Answered in pieces, with pauses.
         cut: The connection ends in the middle of the answer's body.
-        lost: The server does what it is asked to, and the connection ends before any answer; not of PUT, nor is that cut.
+        lost: The server does what it is asked to, and the connection ends before any answer. PUT is neither lost nor cut.
         in_a_row: Faults of one method and path, after which the next request passes: clients give up at some point.
     """
 
