@@ -19,9 +19,10 @@ from semantic_mapper.nodes.fleet.runner import FleetRun, Resources
 from semantic_mapper.nodes.fleet.start import make_template
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.tables import query
+from semantic_mapper.nodes.fleet.urls import persistently
 from semantic_mapper.nodes.fleet.worker import run_task
 from tests.nodes.fleet.documents import made_result
-from tests.nodes.fleet.s3_server import ACCESS_KEY, SECRET_KEY, FaultPlan, S3Server, s3_server
+from tests.nodes.fleet.s3_server import ACCESS_KEY, SECRET_KEY, FaultPlan, S3Server, failing_s3_server, s3_server
 from tests.nodes.support import write_log
 from tests.small import tiny_frames
 
@@ -95,12 +96,11 @@ def test_a_fleet_gets_over_errors_slow_reads_and_cut_connections(
     wanted = {result.key: without_costs(result) for result in serial.results()}
 
     monkeypatch.setattr(urls, "FIRST_PAUSE_S", 0.05)
-    for bucket in ("logs", "results"):
-        (tmp_path / "served" / bucket).mkdir(parents=True)
-    for log in logs:
-        log.rename(tmp_path / "served" / "logs" / log.name)
-    with s3_server(tmp_path / "served", FAULTS) as server:
+    with failing_s3_server(FAULTS, "logs", "results") as server:
         server.use(monkeypatch)
+        files = fsspec.filesystem("s3", use_listings_cache=False)
+        for log in logs:
+            persistently(lambda: files.pipe_file(f"logs/{log.name}", log.read_bytes()), log.name)  # noqa: B023
         store = Store("s3://results/fleet", create=True)
         template = make_template("replay", store, str(weights), (), config)
         inputs = find_inputs(["s3://logs/*.mcap"], ".mcap")
@@ -116,6 +116,6 @@ def test_a_fleet_gets_over_errors_slow_reads_and_cut_connections(
         (rows,) = query(store, "SELECT count(*) AS n FROM logs").to_pylist()
         assert rows["n"] == LOGS
         assert all(server.counts[kind] for kind in ("error", "slow", "cut", "lost"))
-    kept = [path for path in (tmp_path / "served" / "results").rglob("*") if path.is_file()]
+        kept = [files.cat_file(path) for path in files.find("results")]
     assert kept
-    assert not any(key.encode() in path.read_bytes() for path in kept for key in (ACCESS_KEY, SECRET_KEY))
+    assert not any(key.encode() in data for data in kept for key in (ACCESS_KEY, SECRET_KEY))

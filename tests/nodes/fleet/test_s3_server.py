@@ -11,7 +11,7 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from tests.nodes.fleet.s3_server import ACCESS_KEY, SECRET_KEY, FaultPlan, S3Server, s3_server
+from tests.nodes.fleet.s3_server import ACCESS_KEY, SECRET_KEY, FaultPlan, S3Server, failing_s3_server, s3_server
 
 READING = """
 import fsspec
@@ -56,11 +56,10 @@ def test_an_object_is_created_once(served: S3Server, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_faults_come_as_planned_and_clients_get_over_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "logs").mkdir()
+def test_faults_come_as_planned_and_clients_get_over_them(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = []
     for _ in range(2):
-        with s3_server(tmp_path, FaultPlan(seed=1, error=0.1, slow=0.1, cut=0.1, lost=0.1)) as server:
+        with failing_s3_server(FaultPlan(seed=1, error=0.1, slow=0.1, cut=0.1, lost=0.1), "logs") as server:
             server.use(monkeypatch)
             files = fsspec.filesystem("s3", use_listings_cache=False)
             for index in range(20):
