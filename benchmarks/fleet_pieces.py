@@ -5,7 +5,7 @@
 
 Example:
     python -m benchmarks.fleet_pieces logs kitchen.mcap --out runs/pieces
-    python -m benchmarks.fleet_pieces worse --noise 0.03 --out runs/pieces/worse.safetensors
+    python -m benchmarks.fleet_pieces worse --noise 0.15 --out runs/pieces/worse.safetensors
     semantic-mapper fleet run replay runs/pieces/fleet.csv --out runs/fleet-a
     semantic-mapper fleet run replay runs/pieces/fleet.csv --out runs/fleet-b --weights runs/pieces/worse.safetensors
     semantic-mapper fleet compare runs/fleet-a runs/fleet-b
@@ -80,7 +80,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("logs", "worse"))
     parser.add_argument("source", type=Path, nargs="?", help="logs: the log to cut")
-    parser.add_argument("--noise", type=float, default=0.03)
+    parser.add_argument("--noise", type=float, default=0.15)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     if arguments.what == "worse":
