@@ -66,7 +66,6 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh
             for arguments in (
                 ["fleet", "run", "replay", "a.mcap", "--out", "none"],
                 ["fleet", "table", "none"],
-                ["fleet", "merge", "a.npz", "b.npz", "--out", "none"],
                 ["train", "--out", "none", "--ray", "local"],
             )
         ),

@@ -11,7 +11,7 @@ from rich.table import Table
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.report import Section, table_of, write_page
+from semantic_mapper.nodes.cli.report import Card, Section, table_of, write_page
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.plain_text import visible
@@ -109,7 +109,9 @@ def test_report_pages_hold_names_as_text(results: Path) -> None:
     assert r"log [/b]\x1b[2J" in page and "IoU [/b]" in page
     hostile = "</script><b>\u202e"
     view = {"classes": [{"id": 1, "name": hostile, "color": "red", "share": "1 %"}], "data": {"name": hostile}}
-    section = Section(hostile, [hostile], view, (), [table_of(("<i>",), [("\x1b[2J",)])], [hostile], {hostile: hostile})
+    table = table_of(("<i>",), [("\x1b[2J",)])
+    cards = [Card(hostile, lines=[hostile])]
+    section = Section(hostile, [hostile], view, cards=cards, tables=[table], lines=[hostile], folded={hostile: hostile})
     write_page(results / "made.html", hostile, [section])
     text = (results / "made.html").read_text(encoding="utf-8")
     assert visible(text, keep="\n") == text and text.count("</script>") == 2

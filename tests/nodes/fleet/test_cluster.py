@@ -165,12 +165,14 @@ def test_a_network_needs_token_and_tls(tmp_path: Path, monkeypatch: pytest.Monke
         pass
 
 
-def test_a_trusted_network_is_logged(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trusted_network_is_logged(
+    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
     monkeypatch.setattr(cluster, "_CONNECT_TIMEOUT_S", 0.2)
     with pytest.raises(FleetError, match="answers"), connected("192.0.2.1:6379", trusted_network=True):
         pass
-    assert "fleet_network_trusted" in caplog.text
+    assert "fleet_network_trusted" in caplog.text + capfd.readouterr().err  # a command line has set up events before
 
 
 def test_a_token_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
