@@ -77,7 +77,7 @@ def _plain(status: DriverStatus) -> dict[str, object]:
 
 
 def _table(store: Store, statuses: list[DriverStatus]) -> Table:
-    table = Table(title=f"{store.shown}: {store.describe()}", title_justify="left", box=SIMPLE, pad_edge=False)
+    table = Table(title=store.shown, title_justify="left", box=SIMPLE, pad_edge=False)
     for name in ("run", "operation", "version", "host", "state"):
         table.add_column(name)
     for name in ("done", "were there", "failed", "running", "of", "logs/s", "left"):

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -70,7 +70,8 @@ class FinetuneSettings(Config, frozen=True):
     """Of ``finetune``."""
 
     keyframes: Annotated[int, msgspec.Meta(ge=2)] = DEFAULT_KEYFRAMES
-    kind: str = ""  # of a field of one scene; empty = finetune the weights
+    # Of a field of one scene; empty = finetune the weights. No "panoptic", which needs boxes of each log.
+    kind: Literal["", "irt", "grid"] = ""
     fit: FinetuneConfig = FinetuneConfig()
 
 
@@ -315,7 +316,7 @@ def _finetune(job: Job) -> Findings:
     settings: FinetuneSettings = job.settings
     request = FinetuneRequest(
         job.log,
-        settings.keyframes,
+        0 if settings.kind == "grid" else settings.keyframes,  # a grid learns no classes
         job.out / "weights.safetensors",
         settings.fit,
         None if settings.kind else job.weights,

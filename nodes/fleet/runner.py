@@ -279,9 +279,7 @@ class FleetRun:
             self._failed(attempt, error.cause, str(error.cause))
         except (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError) as error:
             self._died(attempt, error)
-        except (
-            exceptions.RayError
-        ) as error:  # a node died, the answer is lost, or the cluster in trouble: not the log's fault
+        except exceptions.RayError as error:  # the node died, or the answer is lost: not the log's fault
             self._lost(attempt, f"{type(error).__name__}: {error}")
         else:
             self._in_a_row.clear()

@@ -28,7 +28,6 @@ from semantic_mapper.nodes.fleet.results import (
     encode_document,
 )
 from semantic_mapper.nodes.fleet.urls import TRIES, persistently, shown, split_url
-from semantic_mapper.plain_text import counted
 
 STORE_FORMAT = "semantic-mapper-fleet"
 STORE_VERSION = 1
@@ -283,13 +282,11 @@ class Store:
         for name, data in self.read_many(f"failed/{name}" for name in self.names("failed")):
             yield decode_failure(data, f"{self.shown}/{name}")
 
-    def describe(self) -> str:
-        """How many results and quarantined logs it has, in words."""
-        done = sum(1 for _ in self.read_many(f"results/{key}/{RESULT_FILE}" for key in self.keys()))
-        return f"{counted(done, 'result')}, {len(self.names('failed'))} quarantined"
-
     def _place(self, target: Path, data: bytes, place: Callable[[Path, Path], None]) -> None:
-        """Write the data beside its target under a name of its own, then put it in place in one step."""
+        """Write the data beside its target under a name of its own, then put it in place in one step.
+
+        Not ``files.atomic_write``, which looks through the folder for leftovers: folders here have thousands of files.
+        """
         target.parent.mkdir(parents=True, exist_ok=True)
         draft = target.with_name(f".{target.name}.{secrets.token_hex(6)}.part")
         try:

@@ -93,7 +93,7 @@ class TiledMap:
         """Tiles in a local folder.
 
         Raises:
-            MapError: there are none, or their manifest is damaged.
+            MapError: their manifest is missing or damaged.
         """
         return cls(read_tiles(folder), lambda row: nullcontext(folder / row.file))
 

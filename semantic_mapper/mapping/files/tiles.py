@@ -371,7 +371,7 @@ def read_tiles(folder: Path) -> TileManifest:
     """The manifest of the tiles in a folder.
 
     Raises:
-        MapError: there is none, or it is damaged; see ``parse_tiles``.
+        MapError: it is missing or damaged; see ``parse_tiles``.
     """
     path = folder / TILES_NAME
     try:

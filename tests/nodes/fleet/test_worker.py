@@ -145,6 +145,7 @@ def test_settings_are_shown_by_the_names_that_set_them() -> None:
         ("replay", "max_frame=3", r"--set max_frame: `replay` has no such setting; did you mean `max_frames`"),
         ("finetune", "second=3", "did you mean `seconds`"),
         ("refine", "seconds=3", "there is fill, up, by_name"),
+        ("finetune", "kind=panoptic", "kind"),
         ("replay", "voxel_map.size=3", "unknown key `size`"),
         ("replay", "quality", "NAME=VALUE"),
         ("replay", "max_frames=many", "max_frames"),
