@@ -22,9 +22,10 @@ ray = pytest.importorskip("ray")
 
 # Prints the folder of an embedded cluster, and waits inside it.
 WAITING = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 from semantic_mapper.nodes.fleet.cluster import connected
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 with connected("local", cpus=1):
     print(Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent, flush=True)
     time.sleep(300)
