@@ -51,7 +51,7 @@ def merge(
     output.quiet = json
     from semantic_mapper.nodes.cli.saved_maps import map_path
     from semantic_mapper.nodes.fleet.cluster import connected
-    from semantic_mapper.nodes.fleet.merge import merge_maps, read_poses, run_on_ray
+    from semantic_mapper.nodes.fleet.merge import check_names, merge_maps, read_poses, run_on_ray
     from semantic_mapper.nodes.fleet.store import Store
     from semantic_mapper.nodes.fleet.urls import is_url
 
@@ -61,6 +61,7 @@ def merge(
         if not is_url(name):
             map_path(Path(name))
     given = {} if poses is None else read_poses(poses)
+    check_names(maps, given)
     store = Store(out, create=True)
     with connected(ray, trusted_network=trusted_network) as cluster:
         report = merge_maps(maps, store, given, run_on_ray(cluster, max_parallel), frame_progress, tile_blocks)

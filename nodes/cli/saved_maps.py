@@ -14,6 +14,7 @@ MAP_NAME = "map.npz"
 MAP_SUFFIX = ".npz"
 LOG_SUFFIX = ".mcap"
 TILES_NAME = "tiles.json"
+STORE_MARK = "fleet.json"
 SOCKETS = ("ipc", "inproc", "tcp")  # schemes of running mappers
 
 
@@ -37,6 +38,8 @@ def _instead_of_map(folder: Path) -> str:
     if holds_tiles(str(folder)):
         return "it holds a map in tiles, which `query` and `export` read"
     maps = sorted(file.name for file in folder.glob(f"*{MAP_SUFFIX}"))
+    if (folder / STORE_MARK).is_file():
+        return "a fleet's store, and no merge into it has finished; run `fleet merge` again, or name a map in results/"
     if maps:
         return f"name the map itself, such as {folder / maps[0]}"
     results = sorted(file.parent.name for file in folder.glob(f"*/{MAP_NAME}"))
@@ -48,9 +51,10 @@ def _instead_of_map(folder: Path) -> str:
 
 
 def holds_tiles(source: str) -> bool:
-    """Whether a map in tiles is meant, as `fleet merge` writes it: a folder with their manifest, or a URL of files."""
+    """Whether a map in tiles is meant, as `fleet merge` writes it: a folder with their manifest, this, or a URL."""
     scheme, found, _ = source.partition("://")
-    return scheme not in SOCKETS if found else (Path(source) / TILES_NAME).is_file()
+    path = Path(source)
+    return scheme not in SOCKETS if found else path.name == TILES_NAME or (path / TILES_NAME).is_file()
 
 
 def refuse_overwriting(out: Path, *sources: Path) -> None:

@@ -68,10 +68,10 @@ def train(
     if kind == MAP_KIND or (kind is None and config is not None and _kind_of(config) == MAP_KIND):
         from semantic_mapper.nodes.cli.train_nesf import train_on_maps
 
-        if workers or weights or encoder or ray:
+        if workers or weights or encoder or ray or ranks > 1 or cpus_per_rank > 1 or trusted_network:
             raise ConfigError(
-                "--workers, --weights, --encoder and --ray are for fields; --kind nesf starts from random weights, in "
-                "one process"
+                "--workers, --weights, --encoder, --ray and its options are for fields; --kind nesf starts from random "
+                "weights, in one process"
             )
         return train_on_maps(output, config, out, resume=resume, seconds=seconds, steps=steps, seed=seed)
     if ray is None and (ranks > 1 or cpus_per_rank > 1 or trusted_network):

@@ -51,12 +51,12 @@ from semantic_mapper.mapping.files.tiles import (
 )
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.nodes.fleet.cluster import Cluster
-from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.store import Store, open_store
 from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url
 from semantic_mapper.queries.tiles import describe_tile
 from semantic_mapper.types import Float64
 
-MERGE_VERSION = 1  # part of all names: raise it where the same maps would give other places or tiles
+MERGE_VERSION = 2  # part of all names: raise it where the same maps would give other places or tiles
 TASK_BYTES = 3_000_000_000  # of memory that a task declares: two maps of ``tiles.MEMORY_MB`` and the libraries
 MAP_NAME = "map.npz"
 _WAY_OUT = "Give it in the file of --poses"
@@ -184,10 +184,7 @@ def merge_maps(
         MapError: maps that do not fit each other, have seen the same frames, or fit nowhere; a map is damaged.
         StoreError: the store cannot be reached.
     """
-    names = map_names(maps)
-    unknown = sorted(set(poses) - set(names) - set(maps))
-    if unknown:
-        raise ConfigError(f"--poses names {', '.join(unknown)}, but the maps are {', '.join(names)}")
+    names = check_names(maps, poses)
     with stage("read", len(maps), "maps") as bar:
         facts = run(_read_facts, list(zip(map(_file_of, maps), names, strict=True)), bar.advance)
     header = merged_header([one.header for one in facts], names)
@@ -197,8 +194,12 @@ def merge_maps(
     sources = tuple(one.source for one in placed)
     plan = _digest([MERGE_VERSION, edge_blocks, [(s.digest, s.T_world_map) for s in sources]])
     notes = tuple(one.note for one in placed)
-    if store.exists(TILES_NAME):
-        return MergeReport(_there(store, plan), notes, 0)
+    manifest = _there(store, plan) if store.exists(TILES_NAME) else None
+    lost = set() if manifest is None else _lost_tiles(store, manifest)
+    if manifest is not None and not lost:
+        return MergeReport(manifest, notes, 0)
+    if lost:
+        _log.warning("tiles_missing", store=store.shown, tiles=len(lost), then="they are made again")
 
     jobs = [(store.url, one.facts.url, one.source, edge_blocks) for one in placed]
     with stage("cut", len(jobs), "maps") as bar:
@@ -207,23 +208,25 @@ def merge_maps(
     for cut in cuts:
         for index in cut.tiles:
             reached.setdefault(index, []).append(f"pieces/{cut.key}/{_name_of(index)}.npz")
-    jobs = [(store.url, plan, index, pieces, header, edge_blocks) for index, pieces in sorted(reached.items())]
+    wanted = sorted(index for index in reached if manifest is None or index in lost)
+    jobs = [(store.url, plan, index, reached[index], header, edge_blocks) for index in wanted]
     with stage("fuse", len(jobs), "tiles") as bar:
         fused = run(_fuse, jobs, bar.advance)
-    manifest = TileManifest(
-        plan=plan,
-        config=header.config,
-        label_set=header.label_set,
-        edge_blocks=edge_blocks,
-        frames=header.frames,
-        last_stamp_ns=header.last_stamp_ns,
-        refined=header.refined,
-        scale=header.scale,
-        sources=sources,
-        tiles=tuple(tile.row for tile in fused if tile.row.blocks),
-    )
-    if not store.create(TILES_NAME, encode_tiles(manifest)):
-        manifest = _there(store, plan)
+    if manifest is None:
+        manifest = TileManifest(
+            plan=plan,
+            config=header.config,
+            label_set=header.label_set,
+            edge_blocks=edge_blocks,
+            frames=header.frames,
+            last_stamp_ns=header.last_stamp_ns,
+            refined=header.refined,
+            scale=header.scale,
+            sources=sources,
+            tiles=tuple(tile.row for tile in fused if tile.row.blocks),
+        )
+        if not store.create(TILES_NAME, encode_tiles(manifest)):
+            manifest = _there(store, plan)
     _remove_scraps(store, manifest)
     peak = max((one.peak_bytes for one in (*placed, *cuts, *fused)), default=0)
     _log.info("maps_merged", store=store.shown, maps=len(maps), tiles=len(manifest.tiles), blocks=manifest.blocks)
@@ -307,8 +310,23 @@ def read_poses(path: Path) -> dict[str, Float64]:
                 name, x, y, z, yaw = words[0], *map(float, words[1:])
             except ValueError as error:
                 raise ConfigError(f"--poses {path}, line {number}: write NAME x y z yaw_deg") from error
+            if name in found:
+                raise ConfigError(f"--poses {path}, line {number}: {name} has a pose already; give it one")
             found[name] = [x, y, z, yaw]
     return {name: _pose_of(values, f"--poses {path}: {name}") for name, values in found.items()}
+
+
+def check_names(maps: Sequence[str], poses: Mapping[str, Float64]) -> list[str]:
+    """Names of the maps, after a look at whether the poses are of them.
+
+    Raises:
+        ConfigError: a map comes twice, or a pose is of no map.
+    """
+    names = map_names(maps)
+    unknown = sorted(set(poses) - set(names) - set(maps))
+    if unknown:
+        raise ConfigError(f"--poses names {', '.join(unknown)}, but the maps are {', '.join(names)}")
+    return names
 
 
 def map_names(maps: Sequence[str]) -> list[str]:
@@ -429,7 +447,7 @@ def _read_facts(url: str, name: str) -> MapFacts:
 
 
 def _align(store_url: str, url: str, other_url: str, digest: str, other_digest: str) -> Alignment:
-    store = Store(store_url)
+    store = open_store(store_url)
     name = f"alignments/{digest[:16]}-{other_digest[:16]}-{MERGE_VERSION}.json"
     if store.exists(name):
         return msgspec.json.decode(store.read(name), type=Alignment)
@@ -447,7 +465,7 @@ def _align(store_url: str, url: str, other_url: str, digest: str, other_digest: 
 
 
 def _cut(store_url: str, url: str, source: TileSource, edge_blocks: int) -> _Cut:
-    store = Store(store_url)
+    store = open_store(store_url)
     key = _digest([MERGE_VERSION, source.digest, source.T_world_map, edge_blocks])[:32]
     done = f"pieces/{key}/pieces.json"
     if store.exists(done):
@@ -466,10 +484,12 @@ def _cut(store_url: str, url: str, source: TileSource, edge_blocks: int) -> _Cut
 def _fuse(
     store_url: str, plan: str, index: TileIndex, pieces: Sequence[str], header: MapManifest, edge_blocks: int
 ) -> _Fused:
-    store = Store(store_url)
+    store = open_store(store_url)
     name = f"tiles/{_name_of(index)}-{plan[:12]}"
     if store.exists(f"{name}.json"):
-        return _Fused(msgspec.json.decode(store.read(f"{name}.json"), type=TileRow), 0)
+        row = msgspec.json.decode(store.read(f"{name}.json"), type=TileRow)
+        if not row.blocks or store.exists(row.file):
+            return _Fused(row, 0)
     with ExitStack() as stack:
         tile = fuse_pieces([stack.enter_context(_reading(store, piece)) for piece in pieces], header)
     blocks, surface = describe_tile(tile, index, edge_blocks)
@@ -497,6 +517,12 @@ def _there(store: Store, plan: str) -> TileManifest:
             f"{store.shown}: has tiles of other maps ({names}), places or tile sizes; choose another --out"
         )
     return manifest
+
+
+def _lost_tiles(store: Store, manifest: TileManifest) -> set[TileIndex]:
+    """Tiles of the manifest whose files are not there."""
+    there = set(store.names("tiles"))
+    return {row.index for row in manifest.tiles if row.file.removeprefix("tiles/") not in there}
 
 
 def _remove_scraps(store: Store, manifest: TileManifest) -> None:

@@ -11,6 +11,7 @@ import errno
 import os
 import secrets
 import shutil
+import socket
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from itertools import islice
@@ -27,7 +28,7 @@ from semantic_mapper.nodes.fleet.results import (
     decode_result,
     encode_document,
 )
-from semantic_mapper.nodes.fleet.urls import TRIES, persistently, shown, split_url
+from semantic_mapper.nodes.fleet.urls import TRIES, persistently, shown, split_store_url
 
 STORE_FORMAT = "semantic-mapper-fleet"
 STORE_VERSION = 1
@@ -59,10 +60,10 @@ class Store:
     """
 
     def __init__(self, url: str, *, create: bool = False) -> None:
-        self.url = url
         self.shown = shown(url)
-        self._fs, self._root = split_url(url)
+        self._fs, self._root = split_store_url(url)
         self.local = Path(self._root) if "file" in self._fs.protocol else None
+        self.url = url if self.local is None else str(self.local)  # tasks run in other folders
         self._check_mark(create=create)
 
     def _check_mark(self, *, create: bool) -> None:
@@ -314,3 +315,17 @@ def _link(draft: Path, target: Path) -> None:
 def _move(file: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.move(file, target)
+
+
+def open_store(url: str) -> Store:
+    """The store of a task, on the machine of its worker.
+
+    Raises:
+        StoreError: it cannot be reached, or this machine does not have the driver's folder.
+    """
+    try:
+        return Store(url)
+    except ConfigError as error:
+        raise StoreError(
+            f"{socket.gethostname()}: {error}. Where nodes share no folder of this name, --out must be a bucket"
+        ) from error

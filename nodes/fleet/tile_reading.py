@@ -9,21 +9,23 @@ from pathlib import Path
 
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.files.tiles import TILES_NAME, TileRow, parse_tiles
-from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url
+from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_store_url
 from semantic_mapper.queries.tiles import TiledMap
 
 
 def open_tiles(url: str) -> TiledMap:
-    """The tiles in a store; each is fetched to a temporary file when it is needed.
+    """The tiles in a store, which may be named by their manifest; each is fetched to a temporary file when needed.
 
     Raises:
         ConfigError: there are no tiles.
         MapError: their manifest is damaged.
         StoreError: the store cannot be reached.
     """
+    url = url.removesuffix(TILES_NAME) or "."
     if not is_url(url):
         return TiledMap.open(Path(url))
-    fs, root = split_url(url)
+    url = url.rstrip("/")
+    fs, root = split_store_url(url)
     where = f"{shown(url)}/{TILES_NAME}"
     try:
         content = persistently(lambda: fs.cat_file(f"{root}/{TILES_NAME}"), where)
@@ -39,7 +41,9 @@ def open_tiles(url: str) -> TiledMap:
             try:
                 persistently(lambda: fs.get_file(f"{root}/{row.file}", str(file)), f"{shown(url)}/{row.file}")
             except FileNotFoundError as error:
-                raise MapError(f"{shown(url)}/{row.file}: is missing; merge the maps again") from error
+                raise MapError(
+                    f"{shown(url)}/{row.file}: this tile is missing; `fleet merge` of the same maps makes it again"
+                ) from error
             yield file
 
     return TiledMap(parse_tiles(content, where), fetch)

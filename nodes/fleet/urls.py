@@ -57,6 +57,19 @@ def split_url(url: str) -> tuple[Any, str]:
     return fs, str(path).rstrip("/")
 
 
+def split_store_url(url: str) -> tuple[Any, str]:
+    """As ``split_url``, of a folder that files are below.
+
+    Raises:
+        ConfigError: as there; or a query, which would be a part of every file's name.
+    """
+    if is_url(url) and shown(url).endswith("?" + _HIDDEN):
+        raise ConfigError(
+            f"{shown(url)}: the URL of a folder cannot have a query or fragment; a signed URL is of one file only"
+        )
+    return split_url(url)
+
+
 def shown(url: str) -> str:
     """A URL for logs, results and messages: without user information, query and fragment.
 
@@ -70,18 +83,19 @@ def shown(url: str) -> str:
 
 
 def refuse_credentials(url: str) -> None:
-    """Check that a URL holds no password: it would be in the shell's history and in the process table.
+    """Check that a URL holds no key, token or password: it would be in the shell's history and in the process table.
 
     Raises:
         FleetError: It does; names the ways that are there instead.
     """
     for part in url.split(_CHAIN):
         scheme, rest = _split(part)
-        if ":" in rest[: _user_length(scheme, rest)]:
+        user = rest[: _user_length(scheme, rest)]
+        if user and (":" in user or scheme.lower() not in _NAMING_SCHEMES):
             raise FleetError(
-                f"{shown(url)}: a URL must not hold a key or password; leave it out, and give it to every node in its "
-                "environment (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, GOOGLE_APPLICATION_CREDENTIALS), in ~/.aws, or "
-                "in fsspec's configuration (~/.config/fsspec)"
+                f"{shown(url)}: a URL must not hold a key, token or password; leave it out, and give it to every node "
+                "in its environment (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, GOOGLE_APPLICATION_CREDENTIALS), in "
+                "~/.aws, or in fsspec's configuration (~/.config/fsspec)"
             )
 
 

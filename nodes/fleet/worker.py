@@ -23,7 +23,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.code_version import code_digest, code_version
 from semantic_mapper.nodes.fleet.results import Findings, TaskResult
 from semantic_mapper.nodes.fleet.scratch import DiskError, scratch_root, task_folder
-from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.store import Store, open_store
 from semantic_mapper.nodes.fleet.urls import persistently, shown, split_url, unstripped
 
 CHUNK_BYTES = 8 << 20  # of a download; a cut connection costs no more
@@ -122,7 +122,7 @@ def run_task(task: Task) -> Outcome:
             f"{socket.gethostname()}: this worker has other code ({code_version()}) than the driver, or other versions "
             "of torch, numpy, scipy, open3d or opencv; install the same everywhere"
         )
-    store = Store(task.store)
+    store = open_store(task.store)
     files = _files_of(task.url)
     identity = _identity(files)
     source_name = f"sources/{_short(f'{task.url} {identity}')}.json"

@@ -10,20 +10,27 @@ import numpy as np
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import project
-from semantic_mapper.localization.consensus import agreed, find_consensus, sighting
+from semantic_mapper.localization.consensus import Sighting, agreed, agreeing_with, find_consensus, sighting
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import Place
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.merge import check_fit
 from semantic_mapper.mapping.map_scale import require_same_scale
+from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 LOOKED_FOR = 60  # places, at most
 SURE = 0.7  # confidence from which on a class counts
+_NEAR_M = (0.06, 0.03)  # of two surfaces that are taken for one, at first and then
+_POINTS = 300_000  # of the other map, at most
+_ROUNDS = 50
 _VIEW = CameraIntrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
 _WAY_OUT = 'Give it: --transform "x y z yaw_deg", or "0 0 0 0" where both are in one world'
+
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +107,40 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
             f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
             f"first ({told or 'none was refused'}), and {consensus.refusal}. {way_out}"
         )
-    return MapAlignment(agreed(consensus.agreeing), len(consensus.agreeing), len(chosen))
+    T = agreed(consensus.agreeing)
+    refined = _refine(voxel_map, other, T)
+    if 2 * sum(bool(agreeing_with(Sighting(refined, s.T_world_camera, 0), [s])) for s in consensus.agreeing) >= len(
+        consensus.agreeing
+    ):
+        T = refined
+    else:
+        _log.warning("alignment_not_refined", reason="the surfaces fit best where the places do not agree")
+    return MapAlignment(T, len(consensus.agreeing), len(chosen))
+
+
+def _refine(voxel_map: VoxelMap, other: VoxelMap, T_map_other: Float64) -> Float64:
+    """Fit the surfaces of two maps: ICP of points to planes, with Tukey's weights.
+
+    Single views leave 0.1 to 0.3 degrees, which is centimetres at the far end of a building.
+    """
+    open3d = load_open3d()
+    registration = open3d.pipelines.registration
+    voxel_m = voxel_map.config.voxel_size_m
+    target, source = (
+        open3d.geometry.PointCloud(open3d.utility.Vector3dVector(one.points().xyz.astype(np.float64)))
+        for one in (voxel_map, other)
+    )
+    if not len(target.points) or not len(source.points):
+        return T_map_other
+    target.estimate_normals(open3d.geometry.KDTreeSearchParamHybrid(3.5 * voxel_m, 30))
+    source = source.uniform_down_sample(-(-len(source.points) // _POINTS))
+    criteria = registration.ICPConvergenceCriteria(max_iteration=_ROUNDS)
+    for factor, near_m in zip((2, 1), _NEAR_M, strict=True):
+        limit_m = max(near_m, factor * voxel_m)
+        estimation = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(limit_m))
+        fit = registration.registration_icp(source, target, limit_m, T_map_other, estimation, criteria)
+        T_map_other = np.array(fit.transformation)
+    return T_map_other
 
 
 def _find(finder: Relocalizer, other: VoxelMap, place: Place) -> Relocalized | NotFound:

@@ -95,7 +95,7 @@ class TiledMap:
         Raises:
             MapError: their manifest is missing or damaged.
         """
-        return cls(read_tiles(folder), lambda row: nullcontext(folder / row.file))
+        return cls(read_tiles(folder), lambda row: nullcontext(_there(folder / row.file)))
 
     def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
         """As ``queries.nearest.nearest``; loads only tiles whose surface of the class may be nearer than what is found.
@@ -250,6 +250,12 @@ class TiledMap:
                 f"{voxels:,} surface voxels are more than are held in memory at a time ({MAX_SURFACE:,}); ask single "
                 "tiles, each of which is a map: `semantic-mapper query STORE/tiles/NAME.npz ...`"
             )
+
+
+def _there(file: Path) -> Path:
+    if not file.is_file():
+        raise MapError(f"{file}: this tile is missing; `fleet merge` of the same maps makes it again")
+    return file
 
 
 def describe_tile(tile: VoxelMap, index: TileIndex, edge_blocks: int) -> tuple[int, TileSurface]:

@@ -11,6 +11,7 @@ from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping import map_alignment
 from semantic_mapper.mapping.correction.pose_correction import ALWAYS
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -169,7 +170,7 @@ def test_two_maps_of_a_room_find_each_other_and_others_do_not() -> None:
     with pytest.raises(MapError, match="would count twice"):
         even_map().merged(even_map(), np.eye(4))
     moved, turned = off(found.T_map_other @ other_world(), np.eye(4))
-    assert found.agreeing >= 3 and moved < 0.04 and turned < 1.0
+    assert found.agreeing >= 3 and moved < 0.004 and turned < 0.1  # single views leave 5 to 12 mm
     elsewhere = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)
     for frame in walk(TRAIN_SEEDS[19], 8)[::3]:
         elsewhere.process(frame)
@@ -177,3 +178,17 @@ def test_two_maps_of_a_room_find_each_other_and_others_do_not() -> None:
         find_alignment(even_map(), elsewhere.pipeline.voxel_map)
     with pytest.raises(MapError, match="nothing to find itself by"):
         find_alignment(even_map(), VoxelMap(SETTINGS.voxel_map, even_map().label_set))
+
+
+def test_surfaces_that_fit_where_the_views_do_not_agree_do_not_move_a_map(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    session = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)
+    for frame in walk()[1::2]:
+        session.process(abroad(frame))
+    far = np.eye(4)
+    far[0, 3] = 0.5
+    monkeypatch.setattr(map_alignment, "_refine", lambda one, other, T: far @ T)
+    found = find_alignment(even_map(), session.pipeline.voxel_map)
+    assert off(found.T_map_other @ other_world(), np.eye(4))[0] < 0.04
+    assert "alignment_not_refined" in caplog.text + capfd.readouterr().err

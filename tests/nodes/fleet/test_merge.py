@@ -26,6 +26,7 @@ from semantic_mapper.localization.places import Place, make_place
 from semantic_mapper.mapping.files.tiles import TILES_NAME, parse_tiles
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.cli.saved_maps import holds_tiles
 from semantic_mapper.nodes.fleet import merge as merge_module
 from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.fleet.merge import Alignment, MergeReport, map_names, merge_maps, read_poses, run_on_ray
@@ -190,6 +191,23 @@ def test_a_finished_merge_is_not_done_again(maps: list[str], tmp_path: Path) -> 
     assert content(tmp_path) == before
 
 
+def test_a_lost_tile_is_named_and_made_again(maps: list[str], tmp_path: Path) -> None:
+    report = merged(maps, tmp_path)
+    before = content(tmp_path)
+    lost = tmp_path / report.manifest.tiles[1].file
+    lost.unlink()
+    with pytest.raises(MapError, match=rf"{lost.name}: this tile is missing; `fleet merge` of the same maps"):
+        open_tiles(str(tmp_path)).load()
+    again = merged(maps, tmp_path)
+    assert again.manifest == report.manifest and content(tmp_path) == before
+
+
+def test_tiles_are_named_by_their_manifest_as_well(maps: list[str], tmp_path: Path) -> None:
+    report = merged(maps, tmp_path)
+    assert holds_tiles(str(tmp_path / TILES_NAME))
+    assert open_tiles(str(tmp_path / TILES_NAME)).manifest == report.manifest
+
+
 def test_maps_that_cannot_be_merged_are_refused_before_anything_is_written(maps: list[str], tmp_path: Path) -> None:
     twin = tmp_path / "twin.npz"
     shutil.copy(Path(maps[0], "map.npz"), twin)
@@ -279,6 +297,7 @@ def test_poses_are_read_from_text_and_json(tmp_path: Path) -> None:
     [
         ("a 1 2 3\n", "line 1: write NAME x y z yaw_deg"),
         ("a 1 2 3 east\n", "line 1: write NAME"),
+        ("a 1 2 3 0\nb 1 2 3 0\na 4 2 3 0\n", "line 3: a has a pose already"),
         ('{"a": [1, 2, 3]}', r"expected 4 rows of 4 numbers or \[x, y, z, yaw_deg\]"),
         ('{"a": "here"}', "write {NAME"),
         ('{"a": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}', "rigid|rotation"),

@@ -7,7 +7,7 @@ import pytest
 
 from semantic_mapper.errors import ConfigError, StoreError
 from semantic_mapper.nodes.fleet.results import Failure, decode_result, encode_document, without_costs
-from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.store import Store, open_store
 from tests.nodes.fleet.documents import made_result
 
 
@@ -27,6 +27,27 @@ def test_letters_of_patterns_in_its_path_are_letters(tmp_path: Path) -> None:
     store.remove("failed/x.json")
     store.remove("results", folder=True)
     assert store.keys() == [] and store.names("failed") == []
+
+
+def test_tasks_in_other_folders_find_a_store_of_a_relative_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    store = Store("runs/fleet", create=True)
+    store.write("failed/x.json", b"{}")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert open_store(store.url).names("failed") == ["x.json"] and store.shown == "runs/fleet"
+
+
+def test_a_machine_without_the_drivers_folder_says_so(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="is no fleet store.* --out must be a bucket"):
+        open_store(str(tmp_path / "not here"))
+
+
+def test_a_store_has_no_signed_url() -> None:
+    with pytest.raises(ConfigError, match="cannot have a query"):
+        Store("memory://bucket/fleet?X-Amz-Signature=abc", create=True)
 
 
 def test_a_folder_with_something_else_does_not_become_a_store(tmp_path: Path) -> None:
