@@ -41,7 +41,7 @@ def test_tasks_in_other_folders_find_a_store_of_a_relative_path(
 
 
 def test_a_machine_without_the_drivers_folder_says_so(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="is no fleet store.* --out must be a bucket"):
+    with pytest.raises(StoreError, match=r"is no fleet store.* --out must be a bucket"):
         open_store(str(tmp_path / "not here"))
 
 
