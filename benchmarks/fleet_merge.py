@@ -2,8 +2,8 @@
 
 Each robot surveys two thirds of the rooms of a generated storey with an OAK-D's depth and the shipped weights; every
 room is seen by two of them, from other poses. Where their maps lie is found, not given. The merged map and its parts
-are held against what perfect cameras at the same poses see: each part against what it has seen itself, the merged map
-against what any of them has seen. Maps, tiles and scores are kept: a run that ended early goes on where it was.
+are compared with what perfect cameras at the same poses see: each part with what it has seen itself, the merged map
+with what any of them has seen. Maps, tiles and scores are kept: a run that ended early goes on where it was.
 
 Example: python -m benchmarks.fleet_merge --buildings 12 --keep runs/fleet-merge
 Example: python -m benchmarks.fleet_merge --buildings 1 --keep runs/fleet-merge --picture building.png

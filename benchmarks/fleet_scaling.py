@@ -2,7 +2,7 @@
 
     overhead     tiny logs, one after the other, in one process and by a fleet with one worker: milliseconds a log
     many         10,000 tiny files through scheduler and store with an operation that only counts bytes: rate, memory
-    workers      replay by one process, by two processes that know nothing of each other, and by a fleet of two workers
+    workers      replay by one process, by two independent processes, and by a fleet of two workers
 
 Example: python -m benchmarks.fleet_scaling overhead many workers --out runs/fleet-scaling
 """

@@ -249,7 +249,8 @@ def _probe(address: str, *, is_near: bool) -> None:
     what = f"the Ray cluster at {address}"
     if "InvalidAuthToken" in said or "AuthenticationError" in said:
         raise FleetError(
-            f"{what} asks for another token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN_PATH to the file of its token"
+            f"{what} asks for another token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN_PATH to the file of its token "
+            "(by itself `ray start` takes ~/.ray/auth_token, where there is one)"
         )
     if "Version mismatch" in said:
         raise FleetError(f"{what} runs another version: {_reason(said[said.index('Version mismatch') :])}")
