@@ -277,7 +277,7 @@ def compare_results(
     if paired and options.method and options.method not in metric.methods:
         raise ConfigError(
             f"{a}: no result has the method {options.method!r}; there are: "
-            f"{', '.join(sorted(metric.methods)) or 'no methods'}"
+            f"{'; '.join(sorted(metric.methods)) or 'no methods'}"
         )
     if not changes and (paired or not lost):
         raise ConfigError(

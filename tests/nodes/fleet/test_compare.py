@@ -199,7 +199,8 @@ def test_a_method_without_stretches_is_judged_by_its_own_figures() -> None:
 
 
 def test_a_metric_without_values_is_not_among_those_that_there_are() -> None:
-    both = [(with_findings(a, metrics={**a.findings.metrics, "depth_disagreement": None}),) * 2 for a, _ in pairs(2)]
+    results = [with_findings(a, metrics={**a.findings.metrics, "depth_disagreement": None}) for a, _ in pairs(2)]
+    both = list(zip(results, results, strict=True))
     with pytest.raises(
         ConfigError, match="no result has a value of the metric 'depth_disagreement'; there are: "
     ) as error:
