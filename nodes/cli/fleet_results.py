@@ -124,7 +124,7 @@ def compare(
         str, typer.Option(metavar="NAME", help="miou, iou:CLASS, or any other metric of the results.")
     ] = "miou",
     method: Annotated[
-        str, typer.Option(metavar="NAME", help="eval: whose labels count, such as sray.  [default: the first]")
+        str, typer.Option(metavar="NAME", help="eval: whose labels count, such as sray.  [default: that of miou]")
     ] = "",
     threshold: Annotated[
         float, typer.Option(min=0, help="Allowed loss of the mean over logs, in units of the metric.")
@@ -132,7 +132,7 @@ def compare(
     log_threshold: Annotated[float, typer.Option(min=0, help="Allowed loss of a single log.")] = 0.02,
     lower_is_better: Annotated[
         bool | None,
-        typer.Option("--lower-is-better/--higher-is-better", help="Of the metric.  [default: by its name]"),
+        typer.Option("--lower-is-better/--higher-is-better", help="Of the metric.  [default: as declared for it]"),
     ] = None,
     cost: Annotated[
         list[str] | None,
@@ -315,7 +315,7 @@ def _show_comparison(output: Output, found: FleetComparison) -> None:
 
     for line in (f"A {found.a}", f"B {found.b}"):
         output.print(line)
-    table = Table(title=f"{found.operation}, {found.metric}", title_justify="left")
+    table = Table(title=f"{found.operation}, {found.metric} ({found.direction})", title_justify="left")
     table.add_column("log")
     for name in ("A", "B", "difference", "95 % interval"):
         table.add_column(name, justify="right")

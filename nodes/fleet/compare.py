@@ -25,6 +25,7 @@ import numpy as np
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.bootstrap import class_sums, miou_of_sums
+from semantic_mapper.nodes.fleet.metrics import CLASS_PREFIX, METHOD_PREFIX, Direction, is_lower_better
 from semantic_mapper.nodes.fleet.results import Failure, SegmentRow, TaskResult
 from semantic_mapper.nodes.fleet.store import Store, batched
 from semantic_mapper.nodes.fleet.tables import Tables
@@ -32,12 +33,9 @@ from semantic_mapper.nodes.fleet.variants import Variant, choose_variant, failed
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
 
-CLASS_PREFIX = "iou:"
 RESAMPLES = 1000
 CONFIDENCE = 0.95  # of intervals; a fleet that is no worse is called worse in at most one of twenty comparisons
 _PAIRS_AT_ONCE = 64  # results of each side that are in memory
-_LOWER_IS_BETTER = ("ate", "error", "refused", "dropped", "damaged", "rmse", "loss", "drift", "rpe")
-_LOWER_ENDINGS = ("_m", "_mm", "_deg", "_s", "_ms", "_mb", "_bytes")
 
 WORSE, BETTER, SAME = "worse", "better", "same"
 FAILED, MISSING, UNSCORED = "failed", "missing", "unscored"
@@ -50,11 +48,11 @@ class GateOptions:
     Args:
         operation: Empty = the only one that both stores have.
         metric: "miou", "iou:CLASS", or another metric of the results.
-        method: Whose stretches count in "miou" and "iou:CLASS"; empty = the first one in A.
+        method: Whose labels count in "miou" and "iou:CLASS"; empty = that of the metric "miou" in A.
         a, b: Names and values that choose results: version, weights, code, or a setting. Of several, the latest count.
         threshold: The fleet is worse where the interval of its mean lies below minus this, in units of the metric.
         log_threshold: A log is worse where it is sure to have lost more than this.
-        lower_is_better: None = by the name of the metric.
+        lower_is_better: None = as declared for the metric.
         costs: Allowed rise of a cost, as a fraction of it, by name.
     """
 
@@ -176,6 +174,11 @@ class FleetComparison:
     reasons: tuple[str, ...]
 
     @property
+    def direction(self) -> Direction:
+        """What is better."""
+        return Direction.LOWER if self.lower_is_better else Direction.HIGHER
+
+    @property
     def worse(self) -> bool:
         """Whether a release should stop."""
         return bool(self.reasons)
@@ -186,7 +189,7 @@ class FleetComparison:
 
     def to_plain(self) -> dict[str, Any]:
         """For JSON: NaN as None."""
-        return {"worse": self.worse, **_finite(msgspec.to_builtins(self))}
+        return {"worse": self.worse, "direction": self.direction.value, **_finite(msgspec.to_builtins(self))}
 
 
 def compare_fleets(store_a: Store, store_b: Store, options: GateOptions) -> FleetComparison:
@@ -200,8 +203,9 @@ def compare_fleets(store_a: Store, store_b: Store, options: GateOptions) -> Flee
         options: What is compared, and what counts as worse.
 
     Raises:
-        ConfigError: there is nothing to compare: no such operation, version, metric or cost, or B has results of other
-            logs only, and no failures of those of A.
+        ConfigError: there is nothing to compare: no such operation, version, metric, method or cost, or B has results
+            of other logs only, and no failures of those of A.
+        FleetError: it is not known whether more or less of the metric is better.
         StoreError: a store cannot be reached.
         DependencyError: DuckDB or pyarrow is missing.
     """
@@ -255,8 +259,9 @@ def compare_results(
         notes: What is known already.
 
     Raises:
-        ConfigError: no result has the metric, or a cost that ``options`` limits; or there are neither pairs nor logs
-            that were lost.
+        ConfigError: no result has the metric, the method, or a cost that ``options`` limits; or there are neither pairs
+            nor logs that were lost.
+        FleetError: it is not known whether more or less of the metric is better.
     """
     found = Counter(notes)
     paired = False
@@ -269,15 +274,22 @@ def compare_results(
             changes.append(change)
         for name, pair in _costs(first, second):
             costs.setdefault(name, []).append(pair)
+    if paired and options.method and options.method not in metric.methods:
+        raise ConfigError(
+            f"{a}: no result has the method {options.method!r}; there are: "
+            f"{'; '.join(sorted(metric.methods)) or 'no methods'}"
+        )
     if not changes and (paired or not lost):
         raise ConfigError(
-            f"{a}: no result has the metric {options.metric!r}; there are: "
+            f"{a}: no result has a value of the metric {options.metric!r}; there are: "
             f"{', '.join(sorted(metric.others)) or 'no metrics'}"
         )
-    changes = [*_judged(changes, options, metric.sign), *lost]
+    lower = is_lower_better(options.metric) if options.lower_is_better is None else options.lower_is_better
+    sign = -1.0 if lower else 1.0
+    changes = [*_judged(changes, options, sign), *lost]
     overall, means = _overall(changes)
     cost_changes = _cost_changes(costs, options) if paired else ()
-    changes.sort(key=lambda change: _rank(change, metric.sign))
+    changes.sort(key=lambda change: _rank(change, sign))
     unknown = sum(c.estimate is None for c in changes if c.status in (WORSE, BETTER, SAME))
     if unknown:
         found[f"{counted(unknown, 'log')} without stretches in both: judged together only, not each by itself"] += 1
@@ -288,7 +300,7 @@ def compare_results(
         options.metric,
         a,
         b,
-        metric.sign < 0,
+        lower,
         overall,
         means[0] if means else math.nan,
         means[1] if means else math.nan,
@@ -296,7 +308,7 @@ def compare_results(
         tuple(new),
         cost_changes,
         tuple(note if count == 1 else f"{note} ({counted(count, 'log')})" for note, count in found.items()),
-        tuple(_reasons(changes, overall, cost_changes, options, metric.sign)),
+        tuple(_reasons(changes, overall, cost_changes, options, sign)),
     )
 
 
@@ -360,19 +372,23 @@ class _Metric:
     """Computes the metric of pairs of results.
 
     Attributes:
-        sign: 1 where higher is better, else -1.
-        others: Names of metrics that results have.
+        others: Names of metrics of which results in A have a value.
+        methods: Names of methods in A.
     """
 
     def __init__(self, options: GateOptions) -> None:
         self._name, self._method = options.metric, options.method
-        lower = lower_is_better(options.metric) if options.lower_is_better is None else options.lower_is_better
-        self.sign = -1.0 if lower else 1.0
         self.others: set[str] = set()
+        self.methods: set[str] = set()
+        if self._method and not self._has_methods():
+            raise ConfigError(f"--method {self._method}: {self._name} is no metric of a method; miou and iou:CLASS are")
 
     def change(self, first: TaskResult, second: TaskResult, notes: Counter[str]) -> LogChange | None:
         """None where A has no score. The status of the rest is left open."""
-        self.others |= {*first.findings.metrics, *(f"{CLASS_PREFIX}{row.name}" for row in first.findings.classes)}
+        found = first.findings
+        self.others |= {name for name, value in found.metrics.items() if value is not None}
+        self.others |= {f"{CLASS_PREFIX}{row.name}" for row in found.classes if math.isfinite(row.iou)}
+        self.methods |= {row.method for row in (*found.classes, *found.segments)}
         sums = self._stretches(first, second, notes)
         if sums is None:
             a, b = self._value(first), self._value(second)
@@ -386,19 +402,24 @@ class _Metric:
         status, reason = (UNSCORED, f"has no {self._name} in B") if b is None else (SAME, "")
         return LogChange(first.log, first.log_digest, status, a, b, estimate, reason, first.key, second.key)
 
+    def _has_methods(self) -> bool:
+        return self._name == "miou" or self._name.startswith(CLASS_PREFIX)
+
     def _value(self, result: TaskResult) -> float | None:
-        if not self._name.startswith(CLASS_PREFIX):
-            return result.findings.metrics.get(self._name)
-        wanted = self._name.removeprefix(CLASS_PREFIX)
-        rows = [row for row in result.findings.classes if row.name == wanted]
-        method = self._method or (rows[0].method if rows else "")
-        return next((row.iou for row in rows if row.method == method), None)
+        method = self._method or main_method(result)
+        if self._name.startswith(CLASS_PREFIX):
+            wanted = self._name.removeprefix(CLASS_PREFIX)
+            rows = (row for row in result.findings.classes if (row.name, row.method) == (wanted, method))
+            return next((row.iou for row in rows), None)
+        if self._name == "miou" and method != main_method(result):
+            return result.findings.metrics.get(f"{METHOD_PREFIX}{method}")
+        return result.findings.metrics.get(self._name)
 
     def _stretches(self, first: TaskResult, second: TaskResult, notes: Counter[str]) -> tuple[Float64, Float64] | None:
         """(S, 3, L) of the S stretches that both have, by ``class_sums``, classes in the same order; None for < 2."""
-        if self._name != "miou" and not self._name.startswith(CLASS_PREFIX):
+        if not self._has_methods():
             return None
-        method = self._method or next((row.method for row in first.findings.segments), "")
+        method = self._method or main_method(first)
         a, b = (
             {row.first: row for row in result.findings.segments if row.method == method} for result in (first, second)
         )
@@ -446,10 +467,9 @@ class _Metric:
         return _estimate(float(observed[0]), error, stretches - 1)
 
 
-def lower_is_better(metric: str) -> bool:
-    """By its name: errors, lengths, angles, times, sizes, and frames that were refused."""
-    words = metric.lower().split("_")
-    return any(word in words for word in _LOWER_IS_BETTER) or metric.lower().endswith(_LOWER_ENDINGS)
+def main_method(result: TaskResult) -> str:
+    """Whose labels the metric "miou" of a result is about; empty where it has no rows of classes or stretches."""
+    return next((row.method for row in (*result.findings.segments, *result.findings.classes)), "")
 
 
 def _estimate(difference: float, error: float, freedom: int) -> Estimate:

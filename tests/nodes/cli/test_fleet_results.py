@@ -7,14 +7,18 @@ import json
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from semantic_mapper import plots
 from semantic_mapper.nodes.cli import fleet_report
 from semantic_mapper.nodes.cli.report import linked, safe_link
-from semantic_mapper.nodes.fleet.results import Failure
+from semantic_mapper.nodes.fleet.results import ClassRow, Failure, TaskResult
 from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.plots import Histogram, PercentileBox
+from semantic_mapper.types import UInt8
 from tests.nodes.cli.test_report import cells, pictures, read_page
 from tests.nodes.fleet.made_up import FINISHED_NS, made_up, store_of, with_files
 from tests.nodes.support import error_line, run
@@ -142,8 +146,6 @@ def test_a_candidate_without_results_exits_with_1_and_its_errors(tmp_path: Path)
 
 
 def test_report_of_one_log_without_files_or_score(tmp_path: Path) -> None:
-    import msgspec
-
     plain = made_up(0)
     findings = msgspec.structs.replace(plain.findings, metrics={"miou": None}, classes=(), segments=(), costs={})
     store = store_of(tmp_path / "one", [msgspec.structs.replace(plain, findings=findings)])
@@ -163,9 +165,74 @@ def test_links_lead_to_pages_only(link: str) -> None:
     assert safe_link(link) == "" and not str(getattr(linked("x", link).style, "link", None) or "")
 
 
-def test_files_outside_the_store_are_no_links(tmp_path: Path) -> None:
-    import msgspec
+def evaluated(number: int) -> TaskResult:
+    """As ``eval`` writes it: several methods, figures that are constant, and one that is there twice; no picture."""
+    result = made_up(number, operation="eval")
+    found, miou = result.findings, result.findings.metrics["miou"]
+    assert miou is not None
+    metrics = {"miou": miou, "miou sray": miou, "miou sray, novel view": miou - 0.1, "frames_damaged": 0.0}
+    metrics |= {"ece": 0.1 + 0.01 * number, "frames_scored": 12.0}
+    methods = "own image alone", "points of the map", "sray"
+    rows = [ClassRow(method, f"class {n}", 0.5) for method in methods for n in range(fleet_report.MAX_CLASSES + 5)]
+    segments = [msgspec.structs.replace(segment, method="sray") for segment in found.segments]
+    findings = msgspec.structs.replace(found, metrics=metrics, classes=tuple(rows), segments=tuple(segments))
+    return msgspec.structs.replace(result, findings=findings)
 
+
+def test_report_of_eval_is_about_the_method_of_miou_and_says_what_it_leaves_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    histograms: list[str] = []
+    classes: list[str] = []
+
+    def draw_histograms(drawn: list[Histogram]) -> UInt8:
+        histograms.extend(histogram.title for histogram in drawn)
+        return plots.draw_histograms(drawn)
+
+    def draw_boxes(title: str, boxes: list[PercentileBox], x_label: str) -> UInt8:
+        classes.extend(box.name for box in boxes if box.name.startswith("class "))
+        return plots.draw_boxes(title, boxes, x_label)
+
+    monkeypatch.setattr(fleet_report, "draw_histograms", draw_histograms)
+    monkeypatch.setattr(fleet_report, "draw_boxes", draw_boxes)
+    store = store_of(tmp_path / "store", [evaluated(n) for n in range(4)])
+    page = fleet_report.write_fleet_report(store, tmp_path / "page")
+    assert {"miou", "miou sray, novel view", "ece"} <= set(histograms)
+    assert not {"miou sray", "frames_damaged", "frames_scored"} & set(histograms)
+    assert len(classes) == len(set(classes)) == fleet_report.MAX_CLASSES
+    lines = [p.text or "" for p in read_page(page).iter("p")]
+    assert any("40 of 45 classes" in line for line in lines)
+    assert any("Method sray" in line and "own image alone; points of the map" in line for line in lines)
+    assert any("frames_damaged 0, frames_scored 12" in line for line in lines)
+    assert any("miou sray (miou)" in line for line in lines)
+    assert "miou_sray" not in page.read_text(encoding="utf-8")
+
+
+def test_worst_logs_of_eval_have_the_pictures_of_replay(tmp_path: Path) -> None:
+    store = store_of(tmp_path / "store", [evaluated(n) for n in range(3)])
+    alone = fleet_report.write_fleet_report(store, tmp_path / "alone").read_text(encoding="utf-8")
+    assert "data:image/jpeg" not in alone
+    for number in range(3):
+        store.commit(with_files(store, made_up(number)))
+    both = fleet_report.write_fleet_report(store, tmp_path / "both").read_text(encoding="utf-8")
+    assert both.count("data:image/jpeg") == 6 and "Pictures are of replay with the same weights." in both
+
+
+def test_worst_logs_are_those_with_most_of_a_metric_of_which_less_is_better(tmp_path: Path) -> None:
+    results = []
+    for number in range(3):
+        result = made_up(number, operation="finetune")
+        findings = msgspec.structs.replace(
+            result.findings, metrics={"best_step": 3.0 - number, "held_out_loss": 0.1 * (number + 1)}
+        )
+        results.append(msgspec.structs.replace(result, findings=findings))
+    path = fleet_report.write_fleet_report(store_of(tmp_path / "store", results), tmp_path / "page")
+    page = read_page(path)
+    assert "finetune: worst logs by held_out_loss (lower is better)" in [head.text for head in page.iter("h2")]
+    assert [name for name in cells(page) if name.startswith("/logs/")] == [r.log for r in reversed(results)]
+
+
+def test_files_outside_the_store_are_no_links(tmp_path: Path) -> None:
     result = made_up(0)
     findings = msgspec.structs.replace(result.findings, report="../../../outside.html", thumbnail="/etc/passwd")
     store = store_of(tmp_path / "store", [msgspec.structs.replace(result, findings=findings)])
@@ -180,6 +247,7 @@ def test_compare_finds_a_worse_version_and_not_a_rerun(tmp_path: Path) -> None:
     worse = store_of(tmp_path / "worse", [made_up(n, loss=0.15) for n in range(6)])
     done = run("fleet", "compare", a.url, same.url)
     assert done.returncode == 0 and done.stdout.rstrip().endswith("not worse"), done.stderr
+    assert "replay, miou (higher is better)" in done.stdout
     done = run("fleet", "compare", a.url, worse.url, "--json")
     found = json.loads(done.stdout)
     assert done.returncode == 1 and found["worse"] and len(found["logs"]) == 6
@@ -204,6 +272,8 @@ def test_compare_within_a_store(store: Store) -> None:
         ((), "STORE_B"),
         (("{store}", "--a", "version"), "--a version: write NAME=VALUE"),
         (("{store}", "--metric", "moiu"), "moiu"),
+        (("{store}", "--method", "srey"), "no result has the method 'srey'; there are: replay"),
+        (("{store}", "--metric", "ate_m"), "ate_m: it is not known whether more or less"),
         (("{store}", "--cost", "seconds=much"), "write a fraction"),
         (("{store}", "--threshold", "-1"), "--threshold"),
         (("{store}/none",), "is no fleet store"),

@@ -10,16 +10,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, FleetError
 from semantic_mapper.nodes.fleet.compare import (
     Estimate,
     GateOptions,
     compare_fleets,
     compare_results,
-    lower_is_better,
 )
+from semantic_mapper.nodes.fleet.metrics import Direction, direction_of
 from semantic_mapper.nodes.fleet.operations import changed_settings, read_settings
-from semantic_mapper.nodes.fleet.results import Failure, Findings, SegmentRow, TaskResult
+from semantic_mapper.nodes.fleet.results import ClassRow, Failure, Findings, SegmentRow, TaskResult
 from semantic_mapper.nodes.fleet.store import Store
 from tests.nodes.fleet.made_up import FINISHED_NS, VERSION, made_up, store_of
 
@@ -152,13 +152,61 @@ def test_a_variant_with_few_logs_is_noted(tmp_path: Path) -> None:
 def test_metrics_without_stretches_are_judged_over_logs_together() -> None:
     rng = np.random.default_rng(0)
     both = [
-        (a, with_findings(b, metrics={"ate_m": a.findings.metrics["ate_m"] + 0.01 + 0.002 * rng.random()}))  # type: ignore[operator]
+        (
+            with_findings(a, metrics={"depth_disagreement": 0.02}),
+            with_findings(b, metrics={"depth_disagreement": 0.03 + 0.002 * rng.random()}),
+        )
         for a, b in pairs(8)
     ]
-    found = compare_results(both, GateOptions(metric="ate_m"))
-    assert found.lower_is_better and found.worse and found.count("worse") == 0
-    assert not compare_results(both, GateOptions(metric="ate_m", lower_is_better=False)).worse
+    found = compare_results(both, GateOptions(metric="depth_disagreement"))
+    assert found.direction == "lower is better" and found.worse and found.count("worse") == 0
+    assert found.to_plain()["direction"] == "lower is better"
+    assert not compare_results(both, GateOptions(metric="depth_disagreement", lower_is_better=False)).worse
     assert any("judged together only" in note for note in found.notes)
+
+
+def test_a_metric_of_unknown_direction_is_not_judged_unless_the_user_says_so() -> None:
+    with pytest.raises(FleetError, match=r"ate_m: it is not known .*--lower-is-better.* depth_disagreement, "):
+        compare_results(pairs(4), GateOptions(metric="ate_m"))
+    sized = [
+        (with_findings(a, metrics={"blocks": 9.0}), with_findings(b, metrics={"blocks": 3.0})) for a, b in pairs(4)
+    ]
+    with pytest.raises(FleetError, match="blocks: neither more nor less of it is better"):
+        compare_results(sized, GateOptions(metric="blocks"))
+    assert compare_results(sized, GateOptions(metric="blocks", lower_is_better=False)).worse
+    assert not compare_results(sized, GateOptions(metric="blocks", lower_is_better=True)).worse
+
+
+def test_a_method_that_no_result_has_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"no result has the method 'sray'; there are: replay"):
+        compare_results(pairs(3), GateOptions(method="sray"))
+    with pytest.raises(ConfigError, match="frames_fused is no metric of a method"):
+        compare_results(pairs(3), GateOptions(method="replay", metric="frames_fused"))
+    assert compare_results(pairs(6, loss=0.1), GateOptions(method="replay")).count("worse") == 6
+
+
+def test_a_method_without_stretches_is_judged_by_its_own_figures() -> None:
+    def with_map(result: TaskResult, miou: float) -> TaskResult:
+        found = result.findings
+        classes = (*found.classes, ClassRow("points of the map", "lamp", miou))
+        return with_findings(result, classes=classes, metrics={**found.metrics, "miou points of the map": miou})
+
+    both = [(with_map(a, 0.5), with_map(b, 0.4)) for a, b in pairs(4)]
+    for metric in ("miou", "iou:lamp"):
+        found = compare_results(both, GateOptions(metric=metric, method="points of the map"))
+        assert (found.mean_a, found.mean_b) == (0.5, pytest.approx(0.4)) and found.worse
+    assert not compare_results(both, GateOptions()).worse
+
+
+def test_a_metric_without_values_is_not_among_those_that_there_are() -> None:
+    results = [with_findings(a, metrics={**a.findings.metrics, "depth_disagreement": None}) for a, _ in pairs(2)]
+    both = list(zip(results, results, strict=True))
+    with pytest.raises(
+        ConfigError, match="no result has a value of the metric 'depth_disagreement'; there are: "
+    ) as error:
+        compare_results(both, GateOptions(metric="depth_disagreement"))
+    there = str(error.value).split("there are: ")[1]
+    assert "depth_disagreement" not in there and "map_miou" in there
 
 
 def test_a_class_can_be_the_metric() -> None:
@@ -225,7 +273,7 @@ def test_what_cannot_be_compared_says_what_there_is(tmp_path: Path) -> None:
 
 def test_the_result_is_json_also_where_there_are_no_numbers() -> None:
     both = [(msgspec.structs.replace(a, findings=Findings({"score": 1.0})),) * 2 for a, _ in pairs(1)]
-    plain = compare_results(both, GateOptions(metric="score")).to_plain()
+    plain = compare_results(both, GateOptions(metric="score", lower_is_better=False)).to_plain()
     assert json.loads(json.dumps(plain, allow_nan=False))["overall"] is None
 
 
@@ -237,11 +285,23 @@ def test_intervals_and_p_values_are_students() -> None:
 
 
 @pytest.mark.parametrize(
-    ("metric", "lower"),
-    [("miou", False), ("frames_fused", False), ("ate_m", True), ("depth_error", True), ("frames_refused", True)],
+    ("metric", "direction"),
+    [
+        ("miou", Direction.HIGHER),
+        ("miou own image alone", Direction.HIGHER),
+        ("iou:error_m", Direction.HIGHER),
+        ("frames_fused", Direction.HIGHER),
+        ("ece", Direction.LOWER),
+        ("unknown", Direction.LOWER),
+        ("depth_disagreement", Direction.LOWER),
+        ("frames_left_out", Direction.LOWER),
+        ("frames_without_depth", Direction.LOWER),
+        ("frames_excluded_from_scores", Direction.LOWER),
+        ("steps", Direction.NEITHER),
+    ],
 )
-def test_names_say_whether_less_is_better(metric: str, lower: bool) -> None:
-    assert lower_is_better(metric) == lower
+def test_directions_of_metrics(metric: str, direction: Direction) -> None:
+    assert direction_of(metric) == direction
 
 
 def test_stores_of_many_versions_give_one_pair_a_log(tmp_path: Path) -> None:

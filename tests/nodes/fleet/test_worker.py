@@ -14,8 +14,9 @@ import pytest
 from semantic_mapper.errors import ConfigError, LogError, StoreError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet import operations, scratch, urls, worker
+from semantic_mapper.nodes.fleet.metrics import direction_of
 from semantic_mapper.nodes.fleet.operations import changed_settings, read_settings
-from semantic_mapper.nodes.fleet.results import Findings, without_costs
+from semantic_mapper.nodes.fleet.results import Findings, TaskResult, without_costs
 from semantic_mapper.nodes.fleet.scratch import DiskError
 from semantic_mapper.nodes.fleet.start import make_template
 from semantic_mapper.nodes.fleet.store import Store
@@ -37,6 +38,13 @@ def task_of(operation: str, store: Store, log: Path, weights: Path, config: Path
     return replace(make_template(operation, store, str(weights), sets, config), url=str(log))
 
 
+def expect_directions(found: TaskResult) -> None:
+    """A gate can judge each metric, or says why not."""
+    assert found.findings.metrics
+    for metric in found.findings.metrics:
+        direction_of(metric)
+
+
 def test_a_replay_of_the_fleet_is_that_of_the_verb(
     store: Store, log: Path, weights: Path, config: Path, replayed: Path
 ) -> None:
@@ -46,6 +54,7 @@ def test_a_replay_of_the_fleet_is_that_of_the_verb(
     assert set(found.files) >= {"map.npz", "summary.json", "report.html", "overview.png", "thumbnail.jpg"}
     assert store.read(f"{found.folder}/map.npz") == (replayed / "map.npz").read_bytes()
     summary = msgspec.json.decode((replayed / "summary.json").read_bytes())
+    expect_directions(found)
     assert found.findings.metrics["miou"] == summary["metrics"]["miou"]
     assert found.findings.metrics["frames_fused"] == summary["frames"]["fused"] == 6
     assert {row.name: row.iou for row in found.findings.classes} == summary["metrics"]["per_class"]
@@ -112,6 +121,7 @@ def test_eval_scores_every_method(store: Store, log: Path, weights: Path, config
     found = store.result(outcome.key)
     assert found is not None and found.settings["max_frames"] == 3
     assert {"eval.json", "eval.html"} <= set(found.files)
+    expect_directions(found)
     assert found.findings.metrics["miou"] == found.findings.metrics["miou sray"]
     assert {row.method for row in found.findings.segments} == {"sray", "sray, novel view", "own image alone"}
 
@@ -119,15 +129,18 @@ def test_eval_scores_every_method(store: Store, log: Path, weights: Path, config
 def test_autolabel_and_finetune_leave_their_files(store: Store, log: Path, weights: Path, config: Path) -> None:
     labelled = store.result(run_task(task_of("autolabel", store, log, weights, config, "max_frames=2")).key)
     assert labelled is not None and labelled.findings.metrics["frames"] == 2 and "labelled.mcap" in labelled.files
+    expect_directions(labelled)
     sets = ("keyframes=2", "steps=1", "seconds=0", "width=96")
     learned = store.result(run_task(task_of("finetune", store, log, weights, None, *sets)).key)
     assert learned is not None and "weights.safetensors" in learned.files and learned.findings.metrics["steps"] == 1
+    expect_directions(learned)
 
 
 def test_refine_takes_maps(store: Store, replayed: Path) -> None:
     template = make_template("refine", store, "smoothed", ["up=z"])
     found = store.result(run_task(replace(template, url=str(replayed / "map.npz"))).key)
     assert found is not None and store.local is not None
+    expect_directions(found)
     refined = VoxelMap.load(store.local / found.folder / "map.npz")
     assert len(refined.points().xyz) >= found.findings.metrics["surface"] > 0
     assert refined.block_count == VoxelMap.load(replayed / "map.npz").block_count
