@@ -35,8 +35,8 @@ from semantic_mapper.nodes.fleet.start import make_template
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.worker import Outcome, Task, run_task
 
-TINY_LOGS, TINY_FRAMES = 30, 2
-WORKER_LOGS, WORKER_FRAMES = 12, 40
+TINY_LOGS, TINY_FRAMES = 20, 2
+WORKER_LOGS, WORKER_FRAMES = 8, 40
 MANY = 10_000
 REPEATS = 2
 SETTINGS = ("quality=fast", "voxel_map.voxel_size_m=0.05")
@@ -56,20 +56,11 @@ def count_bytes(task: Task) -> Outcome:
 
 def overhead(out: Path) -> dict[str, object]:
     """Milliseconds that a fleet adds to each log."""
-    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, replay_log
-    from semantic_mapper.nodes.process import StopRequest
-
     logs = write_logs(out / "tiny", TINY_LOGS, TINY_FRAMES)
-    settings = operations.read_settings("replay", SETTINGS)
     seconds: dict[str, list[float]] = {"serial": [], "fleet": []}
     with connected(None, cpus=1) as cluster:
         for repeat in range(-1, REPEATS):  # the first one loads packages and is not counted
-            shutil.rmtree(out / "serial", ignore_errors=True)
-            began = time.monotonic()
-            for log in logs:
-                request = ReplayRequest(log, out / "serial" / log.stem, None, settings.mapper)  # pyright: ignore[reportAttributeAccessIssue]
-                replay_log(request, StopRequest(), lambda count: None, lambda count: None)
-            serial_s = time.monotonic() - began
+            serial_s = _processes(out, [logs])
             shutil.rmtree(out / "fleet", ignore_errors=True)
             store = Store(str(out / "fleet"), create=True)
             template = make_template("replay", store, None, SETTINGS)
@@ -184,7 +175,9 @@ def _processes(out: Path, parts: list[list[Path]]) -> float:
         for part in parts
     ]
     for process in started:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        assert process.stdout is not None
+        while (line := process.stdout.readline()) != "ready\n":  # after log lines
+            assert line, "a process ended before it was ready"
     began = time.monotonic()
     for process in started:
         process.communicate("\n")
