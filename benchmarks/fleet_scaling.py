@@ -144,9 +144,13 @@ def workers(out: Path) -> dict[str, object]:
 
 
 def _processes(out: Path, parts: list[list[Path]]) -> float:
-    """Seconds that processes of one thread take, one for each part, once all of them have loaded their packages."""
+    """Seconds that processes take, each on a core of its own for each part, once all have loaded their packages.
+
+    One thread each would not do: numba and OpenCV start as many as there are cores.
+    """
     program = (
-        "import sys, time\n"
+        "import os, sys, time\n"
+        "os.sched_setaffinity(0, {int(sys.argv[3])})\n"
         "from pathlib import Path\n"
         "from semantic_mapper.nodes.cli.run_replay import ReplayRequest, replay_log\n"
         "from semantic_mapper.nodes.fleet.operations import read_settings\n"
@@ -156,23 +160,23 @@ def _processes(out: Path, parts: list[list[Path]]) -> float:
         "    for path in map(Path, paths):\n"
         "        request = ReplayRequest(path, Path(sys.argv[1]) / path.stem, None, settings.mapper)\n"
         "        replay_log(request, StopRequest(), lambda count: None, lambda count: None)\n"
-        "work(sys.argv[3:4])\n"
+        "work(sys.argv[4:5])\n"
         "print('ready', flush=True)\n"
         "input()\n"
-        "work(sys.argv[3:])\n"
+        "work(sys.argv[4:])\n"
     )
     shutil.rmtree(out / "serial", ignore_errors=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", program, str(out / "serial"), " ".join(SETTINGS), *map(str, part)],
+            [sys.executable, "-c", program, str(out / "serial"), " ".join(SETTINGS), str(core), *map(str, part)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
             env=environment,
         )
-        for part in parts
+        for core, part in zip(sorted(os.sched_getaffinity(0)), parts, strict=False)
     ]
     for process in started:
         assert process.stdout is not None
