@@ -1,6 +1,6 @@
 """What a fleet costs beside a serial run, and how far one driver goes.
 
-    overhead     tiny logs, one after the other, in one process and by a fleet with one worker: milliseconds a log
+    overhead     tiny logs by a fleet with one worker: milliseconds a log in the operation, and beside it
     many         10,000 tiny files through scheduler and store with an operation that only counts bytes: rate, memory
     workers      replay by one process, by two independent processes, and by a fleet of two workers
 
@@ -19,13 +19,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import psutil
 
 from benchmarks.fleet_faults import write_logs
 from semantic_mapper.config import Config
-from semantic_mapper.nodes.fleet import operations
+from semantic_mapper.nodes.fleet import operations, worker
 from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.fleet.inputs import LogInput, find_inputs
 from semantic_mapper.nodes.fleet.operations import Job, Operation
@@ -40,6 +41,8 @@ WORKER_LOGS, WORKER_FRAMES = 8, 40
 MANY = 10_000
 REPEATS = 2
 SETTINGS = ("quality=fast", "voxel_map.voxel_size_m=0.05")
+TIMES = "FLEET_SCALING_TIMES"  # environment variable: folder of what ``timed_task`` measures
+_OPERATE = worker._operate  # pyright: ignore[reportPrivateUsage]
 SMALL = Resources(cpus=1.0, memory_bytes=500_000_000)
 
 
@@ -54,30 +57,48 @@ def count_bytes(task: Task) -> Outcome:
         return run_task(task)
 
 
+def timed_task(task: Task) -> Outcome:
+    """``run_task``, which adds the seconds of its operation alone to a file of this process."""
+
+    def operate(*arguments: Any) -> Findings:
+        began = time.monotonic()
+        found = _OPERATE(*arguments)
+        with Path(os.environ[TIMES], f"{os.getpid()}.txt").open("a") as file:
+            file.write(f"{time.monotonic() - began}\n")
+        return found
+
+    with patch.object(worker, "_operate", operate):
+        return run_task(task)
+
+
 def overhead(out: Path) -> dict[str, object]:
-    """Milliseconds that a fleet adds to each log."""
+    """Milliseconds of each log that one worker does not spend in its operation, from hand-out to commit.
+
+    Differences to a serial run of the same logs would say the same, but for how much the machine drifts between runs.
+    """
     logs = write_logs(out / "tiny", TINY_LOGS, TINY_FRAMES)
-    seconds: dict[str, list[float]] = {"serial": [], "fleet": []}
+    times = out / "times"
+    os.environ[TIMES] = str(times.absolute())
+    found: list[tuple[float, float]] = []
     with connected(None, cpus=1) as cluster:
-        for repeat in range(-1, REPEATS):  # the first one loads packages and is not counted
-            serial_s = _processes(out, [logs])
-            shutil.rmtree(out / "fleet", ignore_errors=True)
+        for _ in range(1 + REPEATS):  # the first one loads packages and is not counted
+            for folder in (out / "fleet", times):
+                shutil.rmtree(folder, ignore_errors=True)
+            times.mkdir()
             store = Store(str(out / "fleet"), create=True)
             template = make_template("replay", store, None, SETTINGS)
             inputs = find_inputs([str(log) for log in logs], ".mcap")
             began = time.monotonic()
-            status = FleetRun(store, template, inputs, SMALL, cluster).run(lambda: False, lambda now: None)
-            fleet_s = time.monotonic() - began
-            assert status.done == len(logs)
-            if repeat >= 0:
-                seconds["serial"].append(serial_s)
-                seconds["fleet"].append(fleet_s)
-    added = [1e3 * (f - s) / len(logs) for s, f in zip(seconds["serial"], seconds["fleet"], strict=True)]
+            run = FleetRun(store, template, inputs, SMALL, cluster, function=timed_task)
+            status = run.run(lambda: False, lambda now: None)
+            seconds = time.monotonic() - began
+            operations_s = [float(line) for file in times.iterdir() for line in file.read_text().split()]
+            assert status.done == len(operations_s) == len(logs)
+            found.append((1e3 * sum(operations_s) / len(logs), 1e3 * (seconds - sum(operations_s)) / len(logs)))
     return {
         "logs": len(logs),
-        "serial_ms_a_log": [round(1e3 * s / len(logs), 1) for s in seconds["serial"]],
-        "fleet_ms_a_log": [round(1e3 * s / len(logs), 1) for s in seconds["fleet"]],
-        "added_ms_a_log": round(statistics.median(added), 1),
+        "operation_ms_a_log": [round(operation, 1) for operation, _ in found[1:]],
+        "added_ms_a_log": [round(added, 1) for _, added in found[1:]],
     }
 
 
