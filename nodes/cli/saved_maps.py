@@ -22,7 +22,7 @@ def map_path(path: Path) -> Path:
     """The file of a map that is named itself, or by the folder it is in.
 
     Raises:
-        ConfigError: there is none, or it is a log.
+        ConfigError: no map is there, or it is a log.
     """
     if path.is_dir() and not (path / MAP_NAME).is_file():
         raise ConfigError(f"{path}: no {MAP_NAME} in this folder; {_instead_of_map(path)}")

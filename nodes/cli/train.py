@@ -124,7 +124,7 @@ def train(
 
 
 def _kind_of(config: Path) -> str:
-    """What a TOML file says; errors in it are told where it is read as settings."""
+    """What a TOML file says; its errors are reported where it is read as settings."""
     try:
         return str(tomllib.loads(config.read_text(encoding="utf-8")).get("kind", ""))
     except (OSError, ValueError):

@@ -21,7 +21,8 @@ def open_tiles(url: str) -> TiledMap:
         MapError: their manifest is damaged.
         StoreError: the store cannot be reached.
     """
-    url = url.removesuffix(TILES_NAME) or "."
+    if url.rsplit("/", 1)[-1] == TILES_NAME:
+        url = url.removesuffix(TILES_NAME) or "."
     if not is_url(url):
         return TiledMap.open(Path(url))
     url = url.rstrip("/")

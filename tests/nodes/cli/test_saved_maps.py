@@ -1,4 +1,4 @@
-"""Which map a path means, and what is said where there is none."""
+"""Which map a path means, and what is said where no map is."""
 
 from __future__ import annotations
 
