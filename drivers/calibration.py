@@ -1,7 +1,7 @@
 """Calibration files, and the one place where lens distortion is taken out of an image.
 
 A file is TOML or JSON: ``fx fy cx cy width height`` in pixels and ``distortion``, OpenCV's coefficients
-(k1 k2 p1 p2 k3 ...). Of a camera on a rig it also has ``T_rig_camera``, where the camera sits, row by row.
+(k1 k2 p1 p2 k3 ...); with ``fisheye = true`` those of its fisheye model (k1 k2 k3 k4). Of a camera on a rig it also has ``T_rig_camera``, where the camera sits, row by row.
 """
 
 from __future__ import annotations
@@ -10,20 +10,24 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import cv2
 import msgspec
 import numpy as np
 
 from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_json, read_toml
+from semantic_mapper.drivers.calibration_yaml import read_calibration_yaml
+from semantic_mapper.drivers.lens import rectify_maps
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.geometry import camera_matrix, check_pose
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.types import CameraIntrinsics, FisheyeIntrinsics, Float32, Float64, UInt8
 
+PlaneT = TypeVar("PlaneT", Float32, UInt8)
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]  # a pose, row by row
+_YAML = (".yaml", ".yml")
 GUESSED_VIEW_DEG = 60.0  # horizontal, of a camera that nobody has calibrated
 
 
@@ -37,25 +41,23 @@ class CalibrationFile(Config, frozen=True):
     width: AtLeastOne
     height: AtLeastOne
     distortion: tuple[float, ...] = ()
+    fisheye: bool = False  # the lens is OpenCV's fisheye model, also called equidistant
     T_rig_camera: Matrix | None = None  # of a camera on a rig
     about: dict[str, Any] = msgspec.field(default_factory=dict)  # when, how, how well: for people
 
 
 def load_calibration(path: Path) -> CameraIntrinsics:
-    """Read a calibration file, TOML or (with the suffix ``.json``) JSON.
+    """Read a calibration file: TOML, with the suffix ``.json`` JSON, with ``.yaml`` ROS's camera_info or Kalibr's.
 
     Raises:
         ConfigError: missing, of another form, or with impossible values.
     """
-    file = _load_file(path)
-    if not (0 < file.cx < file.width and 0 < file.cy < file.height):
+    k = read_calibration_yaml(path) if path.suffix.lower() in _YAML else _intrinsics(_load_file(path), path)
+    if not (0 < k.cx < k.width and 0 < k.cy < k.height):
         raise ConfigError(
-            f"{path}: the principal point ({file.cx:g}, {file.cy:g}) is outside of the {file.width}x{file.height} image"
+            f"{path}: the principal point ({k.cx:g}, {k.cy:g}) is outside of the {k.width}x{k.height} image"
         )
-    try:
-        return CameraIntrinsics(file.fx, file.fy, file.cx, file.cy, file.width, file.height, file.distortion)
-    except FrameError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    return k
 
 
 def load_mount(path: Path) -> Float64 | None:
@@ -64,7 +66,7 @@ def load_mount(path: Path) -> Float64 | None:
     Raises:
         ConfigError: see ``load_calibration``, or the matrix is no rigid transform.
     """
-    rows = _load_file(path).T_rig_camera
+    rows = None if path.suffix.lower() in _YAML else _load_file(path).T_rig_camera
     return None if rows is None else rigid_matrix(rows, f"{path}: T_rig_camera")
 
 
@@ -98,6 +100,8 @@ def save_calibration(
     """
     lines = [f"{name} = {getattr(measured, name)!r}" for name in ("fx", "fy", "cx", "cy", "width", "height")]
     lines.append(f"distortion = {list(measured.distortion)!r}")
+    if isinstance(measured, FisheyeIntrinsics):
+        lines.append("fisheye = true")
     if T_rig_camera is not None:
         lines += ["T_rig_camera = [", *(f"    {row!r}," for row in T_rig_camera.tolist()), "]"]
     lines += ["", "[about]", *(f"{name} = {_toml_value(value)}" for name, value in about.items())]
@@ -152,29 +156,17 @@ class Rectifier:
         self.intrinsics = measured
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
         self._exact: tuple[np.ndarray, np.ndarray] | None = None
-        if not any(measured.distortion):
-            return
-        K, distortion = camera_matrix(measured), np.array(measured.distortion, np.float64)
-        size = (measured.width, measured.height)
-        ideal, _ = cv2.getOptimalNewCameraMatrix(K, distortion, size, 0)
-        maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), ideal, size, cv2.CV_16SC2)
-        self._maps = (np.asarray(maps[0]), np.asarray(maps[1]))
-        exact = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), ideal, size, cv2.CV_32FC1)
-        self._exact = (np.asarray(exact[0]), np.asarray(exact[1]))
-        fx, fy, cx, cy = (float(v) for v in (ideal[0, 0], ideal[1, 1], ideal[0, 2], ideal[1, 2]))
-        try:
-            self.intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size)
-        except FrameError as error:
-            raise ConfigError(
-                f"the lens distortion {measured.distortion} leaves no usable image: {error}; calibrate the camera again"
-            ) from error
+        if measured.distorted:
+            self.intrinsics, *exact = rectify_maps(measured)
+            self._exact = (exact[0], exact[1])
+            self._maps = cv2.convertMaps(*self._exact, cv2.CV_16SC2)
 
-    def nearest(self, depth_m: Float32) -> Float32:
-        """Depth (H, W) in the pixels of the lens -> in those of the rectified image, each from the nearest pixel."""
+    def nearest(self, image: PlaneT) -> PlaneT:
+        """Depth or classes (H, W) in the pixels of the lens -> of the rectified image, each from the nearest pixel."""
         if self._exact is None:
-            return depth_m
+            return image
         # The maps of integers, which are quicker, round down here.
-        return np.asarray(cv2.remap(depth_m, *self._exact, cv2.INTER_NEAREST), np.float32)
+        return cast("PlaneT", cv2.remap(image, *self._exact, cv2.INTER_NEAREST))
 
     def __call__(self, bgr: UInt8) -> UInt8:
         """(H, W, 3) BGR as OpenCV captures it -> rectified RGB of the same size."""
@@ -187,6 +179,14 @@ def _toml_value(value: str | float) -> str:
     return json.dumps(value) if isinstance(value, str) else repr(value)  # a JSON string is a TOML one
 
 
+def _intrinsics(file: CalibrationFile, path: Path) -> CameraIntrinsics:
+    kind = FisheyeIntrinsics if file.fisheye else CameraIntrinsics
+    try:
+        return kind(file.fx, file.fy, file.cx, file.cy, file.width, file.height, file.distortion)
+    except FrameError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
 def _load_file(path: Path) -> CalibrationFile:
-    plain = read_json(path, dict) if path.suffix == ".json" else read_toml(path)
+    plain = read_json(path, dict) if path.suffix.lower() == ".json" else read_toml(path)
     return convert_config(plain, CalibrationFile, str(path))

@@ -50,11 +50,10 @@ def read_corrections(path: Path) -> Trajectory:
     Raises:
         ImportSourceError: missing, empty, or with an invalid line.
     """
-    notices: list[str] = []
-    stamps_ns, rows = read_trajectory(path, notices)
-    if notices:  # a recording can do without a frame; who corrects poses wants all of them
-        raise ImportSourceError(f"{notices[0]} ({len(notices)} lines); mend or remove them")
-    return Trajectory(path, stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in rows]))
+    found = read_trajectory(path)
+    if found.left_out:  # a recording can do without a frame; who corrects poses wants all of them
+        raise ImportSourceError(f"{found.left_out[0]} ({len(found.left_out)} lines); mend or remove them")
+    return Trajectory(path, found.stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in found.rows]))
 
 
 def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, cast, get_
 import msgspec
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.files import read_regular
+from semantic_mapper.files import decode_text, read_regular
 from semantic_mapper.log_events import get_logger
 
 MAX_FILE_BYTES = 1 << 20  # of a file of settings
@@ -464,7 +464,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         ConfigError: file missing, no regular file, larger than ``MAX_FILE_BYTES``, or not TOML.
     """
     try:
-        return tomllib.loads(_read(path).decode("utf-8"))
+        return tomllib.loads(decode_text(_read(path)))
     except (ValueError, RecursionError) as error:  # of TOML, UTF-8, and whole numbers of thousands of digits
         if isinstance(error, ConfigError):
             raise
@@ -482,7 +482,7 @@ def read_json(path: Path, kind: type[JsonT], limit: int = MAX_FILE_BYTES) -> Jso
             a number that nothing has.
     """
     try:
-        data = msgspec.json.decode(_read(path, limit), type=kind)
+        data = msgspec.json.decode(decode_text(_read(path, limit)), type=kind)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: {_reason(error)}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

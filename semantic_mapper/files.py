@@ -7,6 +7,7 @@ written, so that what a killed process has left can be distinguished from what a
 
 from __future__ import annotations
 
+import codecs
 import fcntl
 import os
 import re
@@ -61,6 +62,16 @@ def read_regular(path: Path, limit: int) -> bytes:
     if len(data) > limit:
         raise ConfigError(f"{path}: is larger than the limit of {limit:,} bytes; is it the right file?")
     return data
+
+
+def decode_text(data: bytes) -> str:
+    """Text of a file: UTF-8, with or without the mark that Windows' programs begin it with, or UTF-16 with its mark.
+
+    Raises:
+        UnicodeDecodeError: neither.
+    """
+    utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if utf16 else "utf-8-sig")
 
 
 @contextmanager

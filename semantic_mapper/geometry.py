@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2  # SciPy has slerp, too, but a machine that only trains and renders lacks it
 import numpy as np
 import torch
@@ -150,14 +152,14 @@ def camera_matrix(intrinsics: CameraIntrinsics) -> Float64:
 def scale_intrinsics(intrinsics: CameraIntrinsics, width: int, height: int) -> CameraIntrinsics:
     """Intrinsics of the same view resized to ``width`` x ``height``; pixel centres stay integers."""
     sx, sy = width / intrinsics.width, height / intrinsics.height
-    return CameraIntrinsics(
+    return replace(  # of its lens model
+        intrinsics,
         fx=intrinsics.fx * sx,
         fy=intrinsics.fy * sy,
         cx=(intrinsics.cx + 0.5) * sx - 0.5,
         cy=(intrinsics.cy + 0.5) * sy - 0.5,
         width=width,
         height=height,
-        distortion=intrinsics.distortion,
     )
 
 

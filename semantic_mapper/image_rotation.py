@@ -16,7 +16,7 @@ def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntr
     Raises:
         FrameError: an image that is not rectified.
     """
-    if intrinsics.distortion:
+    if intrinsics.distorted:
         raise FrameError("an image with lens distortion cannot be turned by itself; rectify it first")
     k = intrinsics
     for _ in range(quarters % 4):

@@ -56,6 +56,11 @@ class CameraIntrinsics:
     height: int
     distortion: tuple[float, ...] = ()
 
+    @property
+    def distorted(self) -> bool:
+        """Whether an image of this camera has to be rectified."""
+        return any(self.distortion)
+
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(np.isfinite(v) for v in values):
@@ -80,6 +85,27 @@ class CameraIntrinsics:
             raise FrameError(
                 f"distortion {self.distortion} has a coefficient beyond {MAX_DISTORTION:g}: calibrate again"
             )
+
+
+@dataclass(frozen=True, slots=True)
+class FisheyeIntrinsics(CameraIntrinsics):
+    """A lens of OpenCV's fisheye model (equidistant, Kannala-Brandt): ``distortion`` holds its k1 k2 k3 k4.
+
+    A ``Rectifier`` makes a pinhole camera of it; frames have none.
+
+    Raises:
+        FrameError: not four coefficients, and as ``CameraIntrinsics``.
+    """
+
+    @property
+    def distorted(self) -> bool:
+        """Always: a fisheye of no coefficients is no pinhole camera, either."""
+        return True
+
+    def __post_init__(self) -> None:
+        CameraIntrinsics.__post_init__(self)  # super() without arguments fails in slotted dataclasses
+        if len(self.distortion) != 4:
+            raise FrameError(f"a fisheye lens has 4 coefficients (k1 k2 k3 k4), not {len(self.distortion)}")
 
 
 def _check_lens(k: CameraIntrinsics) -> None:
@@ -150,6 +176,8 @@ class PosedFrame:
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
+        if isinstance(self.intrinsics, FisheyeIntrinsics):
+            raise FrameError(f"frame seq={self.seq} of camera '{self.camera_id}': its fisheye lens has to be rectified")
         _expect_range(self, "stamp_ns", self.stamp_ns, MAX_STAMP_NS)
         _expect_range(self, "seq", self.seq, (1 << 63) - 1)
         _expect_range(self, "world", self.world, (1 << 63) - 1)

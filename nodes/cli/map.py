@@ -17,7 +17,15 @@ from semantic_mapper.nodes.cli.film import (
     ScaleOption,
     SquareOption,
 )
-from semantic_mapper.nodes.cli.replay import ConfigOption, OutOption, QualityOption, VoxelSizeOption, WeightsOption
+from semantic_mapper.nodes.cli.replay import (
+    AcceptOption,
+    ConfigOption,
+    OutOption,
+    QualityOption,
+    VoxelSizeOption,
+    WeightsOption,
+    map_exit_code,
+)
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
 
@@ -42,6 +50,7 @@ def map_(
     voxel_size: VoxelSizeOption = None,
     config: ConfigOption = None,
     quality: QualityOption = None,
+    accept_contradictions: AcceptOption = False,
 ) -> int:
     """Make a map of a film: finds where the camera was (`import`), then maps the frames (`replay`).
 
@@ -49,6 +58,7 @@ def map_(
     sideways, in good light; a camera that turns on the spot shows no depth. A film tells no metres: give one of
     --scale, --distance, --square-mm, --camera-height. Where no frame has depth, the weights are those that have
     learned from computed depth (rooms-computed-depth). The last line is the path of the report.
+    Where poses and depth contradict each other, the exit code is 3.
 
     Example: semantic-mapper map film.mp4 --out runs/film
     Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
@@ -93,4 +103,4 @@ def map_(
             output.print(line)
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
-        return stop.exit_code
+        return map_exit_code(summary, stop, accept_contradictions)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import EXIT_UNTRUSTED, verb
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.summary import dig
 
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")]
 WeightsOption = Annotated[
@@ -37,6 +39,18 @@ DepthOption = Annotated[
     ),
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings of the mapper.")]
+AcceptOption = Annotated[
+    bool,
+    typer.Option(
+        "--accept-contradictions", help="Exit code 0 although poses and depth contradict each other (else 3)."
+    ),
+]
+
+
+def map_exit_code(summary: Mapping[str, Any], stop: StopRequest, accept_contradictions: bool) -> int:
+    """Of a verb that has made a map: that of the signal that stopped it, or 3 where the map cannot be trusted."""
+    untrusted = dig(summary, "pose_check.warning") and not accept_contradictions
+    return stop.exit_code or (EXIT_UNTRUSTED if untrusted else 0)
 
 
 @verb
@@ -65,11 +79,13 @@ def replay(
         Path | None,
         typer.Option(help="Corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end."),
     ] = None,
+    accept_contradictions: AcceptOption = False,
 ) -> int:
     """Map a recorded log: writes report.html, summary.json, map.ply, map.npz and overview.png.
 
     Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
     with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
+    Where poses and depth contradict each other, the map is written and the exit code is 3.
 
     Example: semantic-mapper replay kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
     """
@@ -92,4 +108,4 @@ def replay(
                 output.print(line)
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
-        return stop.exit_code
+        return map_exit_code(summary, stop, accept_contradictions)

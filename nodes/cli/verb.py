@@ -25,6 +25,7 @@ from semantic_mapper.nodes.process import prepare_process
 from semantic_mapper.plain_text import visible
 
 EXIT_FAILED = 1
+EXIT_UNTRUSTED = 3  # poses and depth of a recording contradict each other, so that its map cannot be trusted
 EXIT_INTERRUPTED = 130
 STDOUT = "-"
 MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days

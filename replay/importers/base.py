@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import io
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Any, Literal, Protocol, TypeVar, cast
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.config import Config
+from semantic_mapper.config import Config, read_json
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, ImportSourceError, LabelError
-from semantic_mapper.files import read_regular
+from semantic_mapper.files import decode_text, read_regular
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.plain_text import counted
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.compression import depth_from_uint16
 from semantic_mapper.transport.images import decode_image_file
@@ -36,7 +41,8 @@ class ImportOptions:
         max_frames: Stop after this many frames; None = all.
         quarters: Turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side.
         match_s: TUM and ROS bags: largest time between a colour image, its depth image and its pose.
-        topics: ROS bags: topics by role ("image", "depth", "info", "pose"), where several fit; depth "none" = without.
+        topics: ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), where several fit. Depth "none",
+            of every format: without.
         world: ROS bags: frame of tf in which poses are; empty = map, world or odom.
         body: ROS bags: frame whose pose the topic of poses tells; empty = as its messages say.
         scale: Metres per unit of poses whose unit is their own (transforms, colmap, opensfm); None = not known.
@@ -53,7 +59,13 @@ class ImportOptions:
     body: str = ""
     scale: float | None = None
 
+    @property
+    def without_depth(self) -> bool:
+        """Whether depth images are left out."""
+        return self.topics.get("depth") == "none"
 
+
+PICTURES = (".jpg", ".jpeg", ".png")
 MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses
 
 
@@ -88,11 +100,13 @@ class DepthScale:
         units_per_m: Units per metre.
         given_in: The file that gives it; None: assumed, since the recording does not say.
         convention: Whose convention was assumed, for people.
+        float_units_per_m: Units per metre of numbers that are not whole (NumPy's files).
     """
 
     units_per_m: float
     given_in: Path | None = None
     convention: str = ""
+    float_units_per_m: float = 1.0
 
     def __str__(self) -> str:
         """For people."""
@@ -203,19 +217,45 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
     return rgb, EncodedImage(encoding, data)
 
 
-def read_depth(file: Path, scale: DepthScale, size: tuple[int, int]) -> Float32:
+def read_depth(file: Path, scale: DepthScale, size: tuple[int, int] | None) -> Float32:
     """Depth image (H, W) in metres.
 
     Args:
-        file: 16-bit PNG.
+        file: 16-bit PNG, or NumPy's file.
         scale: Of its numbers.
-        size: (height, width) that it must have.
+        size: (height, width) that it must have; None = any.
 
     Raises:
         BadFrameError: missing, damaged, not 16-bit, or of another size.
     """
-    units = read_plane(file, "uint16", size, "depth").astype(np.uint16, copy=False)
-    return depth_from_uint16(units, scale.units_per_m)
+    if file.suffix.lower() != ".npy":
+        return depth_from_uint16(read_plane(file, "uint16", size, "depth").astype(np.uint16), scale.units_per_m)
+    values = _read_npy(file)
+    if size is not None and values.shape != size:
+        raise _wrong_size(file, "depth", (values.shape[0], values.shape[1]), size)
+    whole = values.dtype.kind in "iu"
+    return metres(values.astype(np.float64) / (scale.units_per_m if whole else scale.float_units_per_m))
+
+
+def metres(values: NDArray[np.generic]) -> Float32:
+    """Depth (H, W) in metres, float32: 0 for what is no measurement (NaN, infinity, negative)."""
+    depth_m = values.astype(np.float32)
+    depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0
+    return depth_m
+
+
+def _read_npy(file: Path) -> NDArray[np.generic]:
+    try:
+        values = np.asarray(np.load(io.BytesIO(read_bytes(file)), allow_pickle=False))
+    except OSError as error:
+        raise BadFrameError(file, f"the depth image cannot be read ({error.strerror or error})") from error
+    except (ValueError, EOFError) as error:
+        raise BadFrameError(file, f"is no file of NumPy that holds numbers: {error}; save it again") from error
+    if values.ndim == 3 and 1 in (values.shape[0], values.shape[2]):
+        values = values.squeeze(0 if values.shape[0] == 1 else 2)
+    if values.ndim != 2 or values.dtype.kind not in "iuf":
+        raise BadFrameError(file, f"a depth image is a matrix of numbers, this is {values.dtype} {values.shape}")
+    return values
 
 
 def read_depth_if_there(file: Path | None, scale: DepthScale, size: tuple[int, int]) -> Float32 | None:
@@ -259,12 +299,22 @@ def read_plane(
             f"a {what} image has one {wanted} channel, this one has {channels} of {image.dtype.name}; export it so",
         )
     if size is not None and image.shape != size:
-        raise BadFrameError(
-            file,
-            f"the {what} image is {image.shape[1]}x{image.shape[0]}, the colour image {size[1]}x{size[0]}; "
-            "register it to the colour image",
-        )
+        raise _wrong_size(file, what, (image.shape[0], image.shape[1]), size)
     return cast("NDArray[np.uint8] | NDArray[np.uint16]", image)
+
+
+def _wrong_size(file: Path, what: str, size: tuple[int, int], wanted: tuple[int, int]) -> BadFrameError:
+    way_out = "register it to the colour image, or import without it (--topic depth=none)"
+    return BadFrameError(
+        file,
+        f"the {what} image is {size[1]}x{size[0]}, the colour image {wanted[1]}x{wanted[0]}; "
+        + (way_out if what == "depth" else "export it in that size"),
+    )
+
+
+def same_view(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether images of two sizes have one form, so that one can be the other made smaller; their sides are rounded."""
+    return abs(a[0] * b[1] - a[1] * b[0]) <= max(*a, *b)
 
 
 def read_label(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt8:
@@ -301,9 +351,7 @@ def read_matrix(file: Path) -> Float64:
         ImportSourceError: missing, or not such a matrix.
     """
     try:
-        numbers = [float(word) for word in read_bytes(file).decode().split()]
-    except OSError as error:
-        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+        numbers = [number for _, line in read_lines(file) for number in read_numbers(line)]
     except ValueError as error:
         raise ImportSourceError(f"{file}: holds something that is no number: {error}") from error
     if len(numbers) not in (9, 16):
@@ -314,15 +362,52 @@ def read_matrix(file: Path) -> Float64:
     return matrix
 
 
-def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Files named by a number ("000017.jpg", "17.png", "frame-000017.color.jpg") by that number, in its order."""
+def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) -> dict[int, Path]:
+    """Files named by a number ("000017.jpg", "17.png", "frame-000017.color.jpg") by that number, in its order.
+
+    Args:
+        folder: Of the files; none are found where it is missing.
+        suffixes: What their names end with, in small letters.
+        notices: Gets a sentence on files that are left out.
+    """
     found: dict[int, Path] = {}
-    if folder.is_dir():
-        for file in folder.iterdir():
-            number = re.search(r"\d+", file.name)
-            if number is not None and file.suffix.lower() in suffixes:
-                found[int(number[0])] = file
+    left_out: list[str] = []
+    files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes) if folder.is_dir() else ()
+    for file in sorted(files):
+        number = re.search(r"\d{1,18}", file.name)
+        if number is None or int(number[0]) in found:
+            left_out.append(file.name)
+        else:
+            found[int(number[0])] = file
+    if left_out:
+        notices.append(
+            f"{folder}: {counted(len(left_out), 'file')} without a number, or with that of another file, left out; the "
+            f"first: {left_out[0]}"
+        )
     return dict(sorted(found.items()))
+
+
+def split_row(text: str) -> list[str]:
+    """Words of a row: between spaces, tabs, commas or semicolons. A comma may be a decimal one where semicolons, or
+    spaces, part the words."""
+    if ";" in text:
+        return [word.strip().replace(",", ".") for word in text.strip().strip(";").split(";")]
+    words = text.split()
+    if len(words) > 1 and any("," in word for word in words) and all(re.fullmatch(_DECIMAL_COMMA, w) for w in words):
+        return [word.replace(",", ".") for word in words]
+    return re.split(r"\s*,\s*|\s+", text.strip().strip(","))
+
+
+_DECIMAL_COMMA = r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?"
+
+
+def read_numbers(text: str) -> list[float]:
+    """Numbers of a row.
+
+    Raises:
+        ValueError: a word is no number.
+    """
+    return [float(word) for word in split_row(text)]
 
 
 def read_lines(file: Path) -> list[tuple[int, str]]:
@@ -332,7 +417,7 @@ def read_lines(file: Path) -> list[tuple[int, str]]:
         ImportSourceError: missing, or not text.
     """
     try:
-        lines = read_bytes(file).decode("utf-8-sig").splitlines()  # Windows editors begin a file with a mark
+        lines = decode_text(read_bytes(file)).splitlines()
     except OSError as error:
         raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
@@ -355,16 +440,116 @@ def image_size_must_be(rgb: UInt8, intrinsics: CameraIntrinsics, file: Path) -> 
 
 
 def seconds_to_ns(text: str) -> int:
-    """Seconds as decimal text -> nanoseconds, exactly (a float would lose them).
+    """Seconds as text -> nanoseconds, exactly (a float would lose them), in any form of a number.
 
     Raises:
         ValueError: no number, or too large for a stamp.
     """
-    match = re.fullmatch(r"\s*(\d{1,20})(?:\.(\d*))?\s*", text)
-    if match is None:
+    try:
+        seconds = Decimal(text.strip()) if len(text) <= _NUMBER_LENGTH else None
+    except InvalidOperation:
+        seconds = None
+    if seconds is None or not seconds.is_finite() or seconds < 0:
         raise ValueError(f"'{text[:40]}' is not a time in seconds")
-    if int(match[1]) >= MAX_STAMP_NS // 1_000_000_000:
+    if seconds >= MAX_STAMP_NS // 1_000_000_000:
         raise ValueError(
             f"'{text[:40]}' is not a time in seconds (0 to {MAX_STAMP_NS // 1_000_000_000}); divide nanoseconds by 1e9"
         )
-    return int(match[1]) * 1_000_000_000 + int((match[2] or "0")[:9].ljust(9, "0"))
+    return int(seconds.scaleb(9))
+
+
+_NUMBER_LENGTH = 100  # letters
+
+
+def inside(folder: Path, name: str) -> Path:
+    """A file that a recording names. Links of the user's own are followed.
+
+    Raises:
+        ImportSourceError: the name leads out of the folder.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+        raise ImportSourceError(
+            f"{folder}: names '{name[:80]}', which lies outside of it; move the file into the folder, or link it there"
+        )
+    return folder / name
+
+
+StructT = TypeVar("StructT", bound=msgspec.Struct)
+# Words and short names of keys that say what numbers mean: lens, axes, units, time.
+_TELLING = re.compile(
+    r"fish|lens|distort|camera_?(model|type)|projection|^[kpsbdc]_?\d+$|ftheta|focal|fov|skew|aspect|crop|roi|binning|shutter"
+    r"|ax[ei]s|convention|coordinate|handed|orient|rotat|flip|mirror|^up$|from_|unit|scale|metric|millimet|inch|feet|depth"
+    r"|time|stamp|clock|fps|offset|delay|latency",
+    re.IGNORECASE,
+)
+_NEUTRAL_WORDS = ("", "none", "identity", "opencv", "pinhole", "perspective", "m", "meter", "meters", "metre", "metres")
+
+
+def read_plain_json(file: Path, limit: int, kind: type[Any] = dict) -> Any:
+    """JSON of another program, as plain data: a ``dict`` or ``list``.
+
+    Raises:
+        ImportSourceError: missing, no JSON, or larger than ``limit`` bytes.
+    """
+    try:
+        return read_json(file, kind, limit)
+    except ConfigError as error:
+        raise ImportSourceError(str(error)) from error
+
+
+def convert_known(plain: Mapping[str, Any], kind: type[StructT], where: str) -> StructT:
+    """Plain data -> struct; keys that the struct does not have are left out.
+
+    Raises:
+        ImportSourceError: a key is missing or of another type.
+    """
+    try:
+        return msgspec.convert(plain, kind)
+    except msgspec.ValidationError as error:
+        raise ImportSourceError(f"{where}: {error}") from error
+
+
+def unknown_keys(
+    tables: Iterable[Mapping[str, Any]], kind: type[msgspec.Struct], known: Sequence[str] = ()
+) -> list[str]:
+    """Keys that nothing here reads although, by their names and values, they change what other numbers mean.
+
+    Args:
+        tables: Of one kind, such as the frames of a recording.
+        kind: What is read of them.
+        known: Further keys that are known to change nothing.
+    """
+    read = {*(item.encode_name for item in msgspec.structs.fields(kind)), *known}
+    found: dict[str, None] = {}
+    for table in tables:
+        for key in table.keys() - read:
+            if key not in found and _TELLING.search(key) and not _is_neutral(key, table[key]):
+                found[key] = None
+    return sorted(found)
+
+
+def unknown_notice(file: Path, keys: Sequence[str]) -> list[str]:
+    """A sentence on keys that are not read; none where there are none."""
+    if not keys:
+        return []
+    names = ", ".join(f"'{key[:40]}'" for key in keys[:8])
+    return [
+        f"{file}: {names} {'is' if len(keys) == 1 else 'are'} not read; what it says of lens, axes, unit or time is lost"
+    ]
+
+
+def _is_neutral(key: str, value: Any) -> bool:
+    if value is None or value is False:
+        return True
+    if isinstance(value, str):
+        return value.strip().lower() in _NEUTRAL_WORDS
+    if isinstance(value, Mapping):
+        return all(_is_neutral(key, item) for item in cast("Mapping[str, Any]", value).values())
+    if isinstance(value, list):
+        rows = cast("list[Any]", value)
+        square = [len(row) == len(rows) for row in rows if isinstance(row, list)]
+        if rows and len(square) == len(rows) and all(square):
+            return all(rows[i][j] == (i == j) for i in range(len(rows)) for j in range(len(rows)))
+        return all(_is_neutral(key, item) for item in rows)
+    is_factor = re.search("scale|aspect|unit", key, re.IGNORECASE) is not None
+    return value == (1 if is_factor else 0) or (isinstance(value, float) and math.isnan(value))

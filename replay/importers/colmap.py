@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.importers.base import ImportOptions
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers.base import PICTURES, ImportOptions, inside
 from semantic_mapper.replay.importers.placed import place_model
-from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, inside
-from semantic_mapper.replay.sfm.colmap_model import ColmapModel, find_model, read_model
+from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
+from semantic_mapper.replay.sfm.colmap_model import ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
 
 
@@ -24,23 +25,58 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     Raises:
         ImportSourceError: no model, one that cannot be read, or no folder of pictures.
     """
-    place = find_model(folder)
-    if place is None:
-        raise ImportSourceError(f"{folder}: no COLMAP model (cameras, images and points3D, .bin or .txt) in it")
-    model = read_model(place)
-    if not model.images:
-        raise ImportSourceError(f"{place}: the model has no registered image")
-    roots = (folder / "images", *(parent / "images" for parent in place.parents[:3]), folder)
-    first = model.images[0].name
-    root = next((root for root in roots if inside(root, first).is_file()), None)
-    if root is None:
-        raise ImportSourceError(f"{folder}: the pictures of the model are missing; '{first}' is not in {roots[0]}")
+    notices: list[str] = []
+    place, model = _largest(folder, notices)
+    roots = list(dict.fromkeys((folder / "images", *(parent / "images" for parent in place.parents[:3]), folder)))
+    found = {root: [inside(root, image.name).is_file() for image in model.images] for root in roots}
+    root = max(roots, key=lambda root: sum(found[root]))
+    if not any(found[root]):
+        name = model.images[0].name
+        raise ImportSourceError(f"{folder}: the pictures of the model are missing; '{name}' is not in {roots[0]}")
+    names = {inside(root, image.name) for image in model.images}
+    unposed = [path for path in sorted(root.rglob("*")) if path.suffix.lower() in PICTURES and path not in names]
+    if root != folder and unposed:
+        notices.append(
+            f"{counted(len(unposed), 'picture')} in {root} without a pose in this model; the first: {unposed[0].name}"
+        )
     poses = np.stack([image.T_world_camera for image in model.images])
     pictures = [
         PosedPicture(inside(root, image.name), model.cameras[image.camera_id], image.T_world_camera)
         for image in model.images
     ]
-    return place_model(poses, pictures, options, lambda: _depth(model)).pictures("colmap", folder, pictures, options)
+    placed = place_model(poses, pictures, options, lambda: _depth(model))
+    opened = placed.pictures("colmap", folder, pictures, options)
+    opened.notices += notices
+    return opened
+
+
+def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:
+    """The model of most images; the others are named.
+
+    Raises:
+        ImportSourceError: none that can be read and has an image.
+    """
+    places = find_models(folder)
+    if not places:
+        raise ImportSourceError(f"{folder}: no COLMAP model (cameras, images and points3D, .bin or .txt) in it")
+    models: dict[Path, ColmapModel] = {}
+    for place in places:
+        try:
+            models[place] = read_model(place)
+        except ImportSourceError as error:
+            if len(places) == 1:
+                raise
+            notices.append(f"a model is left out: {error}")
+    chosen = max(models, key=lambda place: len(models[place].images), default=None)
+    if chosen is None or not models[chosen].images:
+        raise ImportSourceError(f"{places[0]}: the model has no registered image" + "".join(f"; {n}" for n in notices))
+    if len(models) > 1:
+        others = ", ".join(f"{p.name} of {len(m.images)}" for p, m in models.items() if p != chosen)
+        notices.append(
+            f"the largest of {len(models)} models is imported, {chosen.name} of {len(models[chosen].images)} pictures; "
+            f"left out: {others}. To import another one, name its folder"
+        )
+    return chosen, models[chosen]
 
 
 def _depth(model: ColmapModel) -> float:

@@ -1,8 +1,9 @@
 """The sequence-folder layout.
 
 ``color/NNNNNN.jpg|png``, ``depth/NNNNNN.png`` (uint16), ``label/NNNNNN.png`` (uint8) with ``labels.json``,
-``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx cy
-and, unless depth is in millimetres, depth_scale: units per metre;
+``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx cy;
+of images that are not rectified, distortion: OpenCV's coefficients, with ``"fisheye": true`` those of its fisheye model;
+unless depth is in millimetres, depth_scale: units per metre;
 ``"scale": "unknown"`` where poses are not in metres), and, if there is one, ``timestamps.txt`` (a row a
 frame: int nanoseconds, or seconds with a point). A frame without a depth image comes without depth.
 
@@ -21,22 +22,31 @@ import numpy as np
 from msgspec import Meta
 
 from semantic_mapper.config import read_json
+from semantic_mapper.drivers.calibration import Rectifier
+from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
 from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
+    PICTURES,
     BadFrameError,
     DepthScale,
     ImportOptions,
     LoadedFrame,
     Skipped,
     check_frame_pose,
+    convert_known,
     image_size_must_be,
     numbered_files,
     read_depth_if_there,
     read_label,
     read_lines,
+    read_numbers,
+    read_plain_json,
     read_rgb,
     seconds_to_ns,
+    unknown_keys,
+    unknown_notice,
 )
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64, PosedFrame
@@ -45,7 +55,6 @@ PSEUDO_LABEL, COMPUTED_DEPTH, DEPTH_SIGMA = "pseudo_label", "computed_depth", "d
 LEAST_PERIOD_NS = 100_000  # no camera is quicker: then stamps are in another unit
 DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
 DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs into intrinsics.json as depth_scale")
-_COLOR = (".jpg", ".jpeg", ".png")
 
 
 class _Intrinsics(msgspec.Struct):
@@ -55,6 +64,8 @@ class _Intrinsics(msgspec.Struct):
     fy: float
     cx: float
     cy: float
+    distortion: tuple[float, ...] = ()  # OpenCV's coefficients
+    fisheye: bool = False  # of its fisheye model
     depth_scale: Annotated[float, Meta(gt=0, le=1e6)] | None = None  # units per metre; None = the format's convention
     scale: str = ""  # "unknown" where poses are not in metres
 
@@ -82,9 +93,11 @@ class FolderRecording:
         self.notices: list[str] = []
         self._folder = folder
         self._camera_id = options.camera_id
-        self._intrinsics, given, scale_known = read_intrinsics(folder / "intrinsics.json")
+        given_k, given, scale_known = read_intrinsics(folder / "intrinsics.json", self.notices)
+        self._measured, self._rectify = given_k, rectifier(given_k, folder / "intrinsics.json")
+        self._intrinsics = self._rectify.intrinsics
         self.depth_scale = given or DEPTH_SCALE
-        self._color = numbered_files(folder / "color", _COLOR)
+        self._color = numbered_files(folder / "color", PICTURES, self.notices)
         self._rows = read_lines(folder / "poses.txt")
         if not self._color:
             raise ImportSourceError(f"{folder / 'color'}: no images named by number (000000.jpg or .png)")
@@ -92,26 +105,36 @@ class FolderRecording:
             raise ImportSourceError(f"{folder / 'poses.txt'}: holds no pose")
         hz = options.frame_hz or DEFAULT_HZ
         self._stamps = self._read_stamps(hz)
-        self._count = max(len(self._rows), max(self._color) + 1)
+        self._numbers = sorted(self._color)
+        poses_only = len(self._rows) - sum(number < len(self._rows) for number in self._numbers)
+        if poses_only:
+            missing = next(number for number in range(len(self._rows)) if number not in self._color)
+            self.notices.append(
+                f"{counted(poses_only, 'row')} of poses.txt without an image in {folder / 'color'}, the first for image "
+                f"{missing}"
+            )
         if max(self._color) >= len(self._rows) + len(self._color):
             raise ImportSourceError(
                 f"{folder}: images are numbered up to {max(self._color)}, poses.txt has {len(self._rows)} rows; row i "
                 "belongs to image i, counted from 0"
             )
-        self._has_depth = (folder / "depth").is_dir()
+        self._depth = numbered_files(folder / "depth", (".png", ".npy"), self.notices)
+        if options.without_depth:
+            self._depth = {}
+        self._computed_depth = not options.without_depth
         labels = self._read_label_set()
         self._has_label = labels is not None and any((folder / name).is_dir() for name in ("label", PSEUDO_LABEL))
         self.info = StreamInfo(
             source=f"folder {folder.resolve().name}",
             cameras={options.camera_id: self._intrinsics},
             label_set=labels,
-            frame_count=self._count,
+            frame_count=len(self._numbers),
             frame_hz=hz,
             metadata={} if scale_known else {SCALE_KEY: SCALE_UNKNOWN},
         )
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._numbers)
 
     def load(self, number: int) -> LoadedFrame:
         """Read one frame.
@@ -119,14 +142,14 @@ class FolderRecording:
         Raises:
             BadFrameError: it cannot be used.
         """
-        file = self._color.get(number, self._folder / "color" / f"{number:06d}.jpg")
+        number = self._numbers[number]
+        file = self._color[number]
         pose = self._pose(number)
         rgb, encoded = read_rgb(file)
-        image_size_must_be(rgb, self._intrinsics, file)
-        size = (self._intrinsics.height, self._intrinsics.width)
-        depth_file = self._beside(file, "depth") if self._has_depth else None
-        depth, sigma = read_depth_if_there(depth_file, self.depth_scale, size), None
-        if depth is None and self._beside(file, COMPUTED_DEPTH).exists():
+        image_size_must_be(rgb, self._measured, file)
+        size = (self._measured.height, self._measured.width)
+        depth, sigma = read_depth_if_there(self._depth.get(number), self.depth_scale, size), None
+        if depth is None and self._computed_depth and self._beside(file, COMPUTED_DEPTH).exists():
             depth = read_depth_if_there(self._beside(file, COMPUTED_DEPTH), self.depth_scale, size)
             sigma = read_depth_if_there(self._beside(file, DEPTH_SIGMA), self.depth_scale, size)
             if sigma is None:
@@ -140,19 +163,20 @@ class FolderRecording:
                 label = read_label(label_file, self.info.label_set, size)
             except BadFrameError as error:
                 label_error = Skipped(error.file, error.reason, number, label_only=True)
+        nearest, bent = self._rectify.nearest, self._measured.distorted
         frame = PosedFrame(
             stamp_ns=self._stamps[number],
             seq=number,
             camera_id=self._camera_id,
-            rgb=rgb,
-            depth_m=depth,
-            label=label,
+            rgb=self._rectify(np.ascontiguousarray(rgb[..., ::-1])) if bent else rgb,
+            depth_m=None if depth is None else nearest(depth),
+            label=None if label is None else nearest(label),
             intrinsics=self._intrinsics,
             T_world_camera=pose,
-            depth_sigma_m=sigma,
+            depth_sigma_m=None if sigma is None else nearest(sigma),
             label_is_pseudo=pseudo and label is not None,
         )
-        return LoadedFrame(frame, encoded, label_error)
+        return LoadedFrame(frame, None if bent else encoded, label_error)
 
     def _beside(self, color: Path, kind: str) -> Path:
         return self._folder / kind / f"{color.stem}.png"
@@ -163,7 +187,7 @@ class FolderRecording:
             raise BadFrameError(file, f"has {len(self._rows)} rows and so no pose for image {number}")
         line, text = self._rows[number]
         try:
-            values = np.array([float(word) for word in text.split()], np.float64)
+            values = np.array(read_numbers(text), np.float64)
         except ValueError as error:
             raise BadFrameError(file, f"line {line}: {error}") from error
         if values.size != 16:
@@ -172,18 +196,26 @@ class FolderRecording:
 
     def _read_stamps(self, frame_hz: float) -> list[int]:
         file = self._folder / "timestamps.txt"
-        count = max(len(self._rows), max(self._color) + 1)
+        count = max(self._color) + 1
         if not file.exists():
             self.notices.append(f"no timestamps.txt: stamps are made up at {frame_hz:g} frames a second")
             return [round(i * 1e9 / frame_hz) for i in range(count)]
         try:
-            stamps = [seconds_to_ns(t) if "." in t else int(t) for _, t in read_lines(file)]
+            stamps = [
+                int(t) if t.strip().isdigit() else seconds_to_ns(t.replace(",", ".")) for _, t in read_lines(file)
+            ]
         except ValueError as error:
             raise ImportSourceError(f"{file}: {error}") from error
         if any(not 0 <= stamp <= MAX_STAMP_NS for stamp in stamps):
             raise ImportSourceError(f"{file}: a stamp is not from 0 to {MAX_STAMP_NS} ns; write capture times")
-        if len(stamps) < count or any(b <= a for a, b in pairwise(stamps)):
-            raise ImportSourceError(f"{file}: needs a rising stamp for each of {count} frames, has {len(stamps)} rows")
+        if len(stamps) < count:
+            raise ImportSourceError(f"{file}: needs a stamp for each of {count} frames, has {len(stamps)} rows")
+        back = next((n for n, (a, b) in enumerate(pairwise(stamps[:count]), 2) if b <= a), 0)
+        if back:
+            raise ImportSourceError(
+                f"{file}: row {back} is not later than the row before it; frames need rising stamps: sort the images, or "
+                "mend the stamps"
+            )
         if count > 1 and (stamps[count - 1] - stamps[0]) / (count - 1) < LEAST_PERIOD_NS:
             raise ImportSourceError(
                 f"{file}: frames are {(stamps[count - 1] - stamps[0]) / (count - 1):g} ns apart; whole numbers are "
@@ -234,19 +266,37 @@ def _ignore_notices(labels: _Labels, label_set: LabelSet, file: Path) -> list[st
     return []
 
 
-def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
+def rectifier(measured: CameraIntrinsics, file: Path) -> Rectifier:
+    """What undoes a lens that a file tells.
+
+    Raises:
+        ImportSourceError: it leaves no image.
+    """
+    try:
+        return Rectifier(measured)
+    except ConfigError as error:
+        raise ImportSourceError(f"{file}: {error}") from error
+
+
+def read_intrinsics(file: Path, notices: list[str]) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
     """``intrinsics.json`` -> intrinsics, the scale of depth images where given, and whether poses are in metres.
+
+    Args:
+        file: To read.
+        notices: Gets a sentence on keys that are not read.
 
     Raises:
         ImportSourceError: missing, or a value that cannot be.
     """
     try:
-        i = read_json(file, _Intrinsics)
+        plain = read_plain_json(file, 1 << 20)
+        i = convert_known(plain, _Intrinsics, str(file))
+        notices += unknown_notice(file, unknown_keys([plain], _Intrinsics))
         scale = DepthScale(i.depth_scale, file) if i.depth_scale is not None else None
-        return CameraIntrinsics(i.fx, i.fy, i.cx, i.cy, i.width, i.height), scale, i.scale != SCALE_UNKNOWN
-    except ConfigError as error:
-        raise ImportSourceError(str(error)) from error
-    except FrameError as error:
+        model = "fisheye" if i.fisheye else "opencv"
+        lens = lens_intrinsics(model, i.distortion, (i.fx, i.fy, i.cx, i.cy), (i.width, i.height))
+        return lens, scale, i.scale != SCALE_UNKNOWN
+    except (ConfigError, FrameError) as error:
         raise ImportSourceError(f"{file}: {error}") from error
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
 from semantic_mapper.geometry import check_pose, invert_pose, transform
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
@@ -39,6 +40,7 @@ from semantic_mapper.replay.importers.base import (
     read_lines,
     read_plane,
     read_rgb,
+    split_row,
 )
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
@@ -80,10 +82,13 @@ class Kitti360Recording:
     """
 
     def __init__(self, folder: Path, options: ImportOptions) -> None:
+        self.notices: list[str] = []
         root, drive = find_drive(folder)
         self._drive_folder = root / "data_2d_raw" / drive
         self._semantics = root / "data_2d_semantics" / "train" / drive
-        self._files = {name: numbered_files(self._drive_folder / name / "data_rect", (".png",)) for name in CAMERAS}
+        self._files = {
+            name: numbered_files(self._drive_folder / name / "data_rect", (".png",), self.notices) for name in CAMERAS
+        }
         self._cameras = [name for name in CAMERAS if self._files[name]]
         if not self._cameras:
             where = self._drive_folder / CAMERAS[0] / "data_rect"
@@ -96,9 +101,9 @@ class Kitti360Recording:
             self._intrinsics[name], self._T_cam0_camera[name] = rectified_camera(values, name[-2:], calibration)
         self._scans = root / "data_3d_raw" / drive / "velodyne_points" / "data"
         self._T_cam0_scanner = _scanner_pose(root / "calibration", values) if self._scans.is_dir() else None
-        self.notices: list[str] = []
-        if self._T_cam0_scanner is None:
-            self.notices.append(f"no laser scans: {self._scans} is missing; frames come without depth")
+        if self._T_cam0_scanner is None or options.without_depth:
+            self._T_cam0_scanner = None
+            self.notices.append(f"no laser scans of {self._scans}: frames come without depth")
         self.depth_scale = DepthScale(1000.0, convention="depth comes from laser scans, in metres")
         self._poses_file = root / "data_poses" / drive / "cam0_to_world.txt"
         self._poses = self._read_poses()
@@ -175,18 +180,27 @@ class Kitti360Recording:
 
     def _read_poses(self) -> dict[int, tuple[int, Float64]]:
         poses: dict[int, tuple[int, Float64]] = {}
+        bad: list[str] = []
         for line, text in read_lines(self._poses_file):
             try:
-                index, *numbers = text.split()
+                index, *numbers = split_row(text)
                 T_world_cam0 = np.array([float(n) for n in numbers], np.float64).reshape(4, 4)
-                poses[int(index)] = line, T_world_cam0
-            except ValueError as error:
-                raise ImportSourceError(
-                    f"{self._poses_file}, line {line}: expected a frame number and the 16 numbers of a 4x4 matrix "
-                    f"({error}); poses.txt, with 12, is another file"
-                ) from error
+                number = int(float(index))
+            except (ValueError, OverflowError) as error:
+                bad.append(f"line {line} ({error})")
+                continue
+            if number in poses:
+                self.notices.append(
+                    f"{self._poses_file}, line {line}: a second pose of image {number}; the first counts"
+                )
+            poses.setdefault(number, (line, T_world_cam0))
         if not poses:
-            raise ImportSourceError(f"{self._poses_file}: holds no pose")
+            raise ImportSourceError(
+                f"{self._poses_file}: holds no row of a frame number and the 16 numbers of a 4x4 matrix"
+                f"{': ' + bad[0] if bad else ''}; poses.txt, with 12, is another file"
+            )
+        if bad:
+            self.notices.append(f"{self._poses_file}: {counted(len(bad), 'row')} left out, no pose: {bad[0]}")
         return poses
 
     def _read_stamps(self, frame_hz: float | None) -> dict[str, list[int]]:

@@ -16,19 +16,29 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.config import read_json
+from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.files import numeric_order
 from semantic_mapper.geometry import invert_pose
-from semantic_mapper.replay.importers.base import ImportOptions
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers.base import (
+    PICTURES,
+    ImportOptions,
+    inside,
+    read_plain_json,
+    unknown_keys,
+    unknown_notice,
+)
 from semantic_mapper.replay.importers.placed import PlacedModel, place_model
-from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, inside
+from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 FILE, REFERENCE = "reconstruction.json", "reference_lla.json"
 MAX_BYTES = 1 << 31
-MODELS = ("perspective", "simple_radial", "radial", "brown")  # of lenses that OpenCV's pinhole model has
+PINHOLE = ("perspective", "simple_radial", "radial", "brown")  # of lenses that OpenCV's pinhole model has
+FISHEYE = ("fisheye", "fisheye_opencv")  # and its fisheye model
 _LOOKED_AT, _POINTS = 20, 5000  # cameras and points whose depth is looked at
 
 ReadT = TypeVar("ReadT")
@@ -49,6 +59,7 @@ class _Camera(msgspec.Struct):
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
 
 
 class _Shot(msgspec.Struct):
@@ -97,7 +108,7 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         raise ImportSourceError(f"{file}: holds no posed picture")
     model = models[number]
     names = sorted(model.shots, key=numeric_order)
-    root = _root(folder, file, names[0])
+    root = _root(folder, file, names)
     used = {shot.camera for shot in model.shots.values()}
     cameras = {n: _intrinsics(c, f"{file}, camera '{n}'") for n, c in model.cameras.items() if n in used}
     pictures = [_picture(root, name, model.shots[name], cameras, file) for name in names]
@@ -112,6 +123,15 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         said = ["scale, up and north are those that OpenSfM found by GPS"]
         placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin)})
     opened = placed.pictures("opensfm", folder, pictures, options)
+    plain = read_plain_json(file, MAX_BYTES, list)[number]["cameras"].values()
+    opened.notices += unknown_notice(file, unknown_keys(plain, _Camera))
+    unposed = [
+        path for path in sorted(root.iterdir()) if path.suffix.lower() in PICTURES and path.name not in model.shots
+    ]
+    if unposed:
+        opened.notices.append(
+            f"{counted(len(unposed), 'picture')} in {root} without a pose; the first: {unposed[0].name}"
+        )
     if len(models) > 1:
         others = ", ".join(str(len(m.shots)) for n, m in enumerate(models) if n != number)
         opened.notices.append(
@@ -134,12 +154,12 @@ def _reference_beside(file: Path) -> _Reference | None:
     return _read(beside, _Reference) if beside.is_file() else None
 
 
-def _root(folder: Path, file: Path, first: str) -> Path:
+def _root(folder: Path, file: Path, names: list[str]) -> Path:
     roots = (file.parent / "images", folder / "images", file.parent.parent / "images", file.parent)
     for root in roots:
-        if inside(root, first).is_file():
+        if any(inside(root, name).is_file() for name in names):
             return root
-    raise ImportSourceError(f"{folder}: the pictures are missing; '{first}' is not in {roots[0]}")
+    raise ImportSourceError(f"{folder}: the pictures are missing; '{names[0]}' is not in {roots[0]}")
 
 
 def _picture(root: Path, name: str, shot: _Shot, cameras: dict[str, CameraIntrinsics], file: Path) -> PosedPicture:
@@ -152,10 +172,11 @@ def _picture(root: Path, name: str, shot: _Shot, cameras: dict[str, CameraIntrin
 
 
 def _intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
-    if camera.projection_type not in MODELS:
+    fisheye = camera.projection_type in FISHEYE
+    if not fisheye and (camera.projection_type not in PINHOLE or camera.k4):
         raise ImportSourceError(
-            f"{where}: the lens model '{camera.projection_type}' is not read, but {', '.join(MODELS)}; run `opensfm "
-            "undistort` and import the folder undistorted"
+            f"{where}: the lens model '{camera.projection_type}'{' with k4' if camera.k4 else ''} is not read, but "
+            f"{', '.join((*PINHOLE, *FISHEYE))}; run `opensfm undistort` and import the folder undistorted"
         )
     fx = camera.focal if camera.focal_x is None else camera.focal_x
     fy = fx if camera.focal_y is None else camera.focal_y
@@ -164,9 +185,12 @@ def _intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
     size = max(camera.width, camera.height)
     cx, cy = camera.c_x * size + camera.width / 2 - 0.5, camera.c_y * size + camera.height / 2 - 0.5
     lens = (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3)
+    if fisheye:
+        lens = (camera.k1, camera.k2, camera.k3, camera.k4)
     try:
-        return CameraIntrinsics(fx * size, fy * size, cx, cy, camera.width, camera.height, lens if any(lens) else ())
-    except FrameError as error:
+        sides = (camera.width, camera.height)
+        return lens_intrinsics("fisheye" if fisheye else "opencv", lens, (fx * size, fy * size, cx, cy), sides)
+    except (ConfigError, FrameError) as error:
         raise ImportSourceError(f"{where}: {error}") from error
 
 

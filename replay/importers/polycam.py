@@ -9,16 +9,28 @@ capture in microseconds. ``t_ij`` is camera to world, in OpenGL's camera axes an
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import read_json
-from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
-from semantic_mapper.replay.importers.base import DepthScale, ImportOptions, numbered_files
+from semantic_mapper.errors import FrameError, ImportSourceError
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers.base import (
+    PICTURES,
+    DepthScale,
+    ImportOptions,
+    convert_known,
+    numbered_files,
+    read_plain_json,
+    read_rgb,
+    unknown_keys,
+    unknown_notice,
+)
 from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
-from semantic_mapper.types import CameraIntrinsics
+from semantic_mapper.types import CameraIntrinsics, Float64
 
+_KNOWN = ("timestamp", "center_depth")  # the time is that of the files' names
 DEPTH_SCALE = DepthScale(1000.0, convention="Polycam's millimetres")
 
 
@@ -27,8 +39,6 @@ class _Camera(msgspec.Struct):
     fy: float
     cx: float
     cy: float
-    width: int
-    height: int
     t_00: float
     t_01: float
     t_02: float
@@ -41,6 +51,8 @@ class _Camera(msgspec.Struct):
     t_21: float
     t_22: float
     t_23: float
+    width: int | None = None  # not in corrected_cameras since 2025
+    height: int | None = None
 
 
 def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -52,42 +64,47 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
     keyframes = folder / "keyframes"
     corrected = (keyframes / "corrected_cameras").is_dir() and (keyframes / "corrected_images").is_dir()
     kind = "corrected_" if corrected else ""
-    images = numbered_files(keyframes / f"{kind}images", (".jpg", ".jpeg", ".png"))
+    notices: list[str] = []
+    images = numbered_files(keyframes / f"{kind}images", PICTURES, notices)
     if not images:
         raise ImportSourceError(f"{keyframes / 'images'}: no pictures; export 'raw data' (developer mode)")
     first = min(images)
     pictures: list[PosedPicture] = []
-    missing = 0
+    left_out: list[str] = []
+    unknown: set[str] = set()
     for time_us, file in images.items():
         camera = keyframes / f"{kind}cameras" / f"{file.stem}.json"
-        if not camera.exists():
-            missing += 1
+        try:
+            plain = read_plain_json(camera, 1 << 20)
+            unknown.update(unknown_keys([plain], _Camera, _KNOWN))
+            intrinsics, T_world_camera = _camera(plain, camera, file)
+        except ImportSourceError as error:
+            left_out.append(str(error))
             continue
-        pictures.append(
-            PosedPicture(
-                file,
-                *_read_camera(camera),
-                depth_file=keyframes / "depth" / f"{file.stem}.png",
-                stamp_ns=1000 * (time_us - first),
-                confidence_file=keyframes / "confidence" / f"{file.stem}.png",
-            )
-        )
+        depth, confidence = (keyframes / name / f"{file.stem}.png" for name in ("depth", "confidence"))
+        stamp_ns = 1000 * (time_us - first)
+        pictures.append(PosedPicture(file, intrinsics, T_world_camera, depth, stamp_ns, confidence))
+    if not pictures:
+        raise ImportSourceError(f"{keyframes}: no picture has a camera that can be used: {left_out[0]}")
     opened = PosedPictures("polycam", folder, pictures, options, depth_scale=DEPTH_SCALE, metric=True)
     if not corrected:
         opened.notices.append("no corrected_images: poses are ARKit's own, and the lens distortion is not undone")
-    if missing:
-        opened.notices.append(f"{missing} pictures without a file of their camera are left out")
+    if left_out:
+        opened.notices.append(f"{counted(len(left_out), 'picture')} left out, without a camera: {left_out[0]}")
+    opened.notices += [*notices, *unknown_notice(keyframes / f"{kind}cameras", sorted(unknown))]
     return opened
 
 
-def _read_camera(file: Path) -> tuple[CameraIntrinsics, np.ndarray]:
+def _camera(plain: dict[str, Any], file: Path, picture: Path) -> tuple[CameraIntrinsics, Float64]:
+    c = convert_known(plain, _Camera, str(file))
+    width, height = c.width, c.height
+    if width is None or height is None:
+        rgb, _ = read_rgb(picture)
+        height, width = rgb.shape[:2]
+    rows = [[getattr(c, f"t_{i}{j}") for j in range(4)] for i in range(3)]
+    T_world_gl = np.array([*rows, [0.0, 0.0, 0.0, 1.0]], np.float64)
     try:
-        c = read_json(file, _Camera)
-        rows = [[getattr(c, f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        T_world_gl = np.array([*rows, [0.0, 0.0, 0.0, 1.0]], np.float64)
-        intrinsics = CameraIntrinsics(c.fx, c.fy, c.cx - 0.5, c.cy - 0.5, c.width, c.height)
-    except ConfigError as error:
-        raise ImportSourceError(str(error)) from error
+        intrinsics = CameraIntrinsics(c.fx, c.fy, c.cx - 0.5, c.cy - 0.5, width, height)
     except FrameError as error:
         raise ImportSourceError(f"{file}: {error}") from error
     return intrinsics, T_Z_UP_Y_UP @ T_world_gl @ GL_AXES

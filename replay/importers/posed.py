@@ -18,10 +18,11 @@ from semantic_mapper.replay.importers.base import (
     ImportOptions,
     LoadedFrame,
     check_frame_pose,
+    read_depth,
     read_plane,
     read_rgb,
+    same_view,
 )
-from semantic_mapper.transport.compression import depth_from_uint16
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
@@ -38,7 +39,7 @@ class PosedPicture:
         file: The picture.
         intrinsics: With distortion, as the collection gives them.
         T_world_camera: (4, 4), OpenCV's axes.
-        depth_file: 16-bit PNG, of any size with the same view; None = no depth.
+        depth_file: 16-bit PNG or NumPy's file, of any size with the same view; None = no depth.
         stamp_ns: None = not known.
         confidence_file: 8-bit PNG of the depth image's size, whose 0 means that the depth is not to be trusted.
     """
@@ -77,27 +78,27 @@ class PosedPictures:
     ) -> None:
         if not pictures:
             raise ImportSourceError(f"{folder}: holds no posed picture")
-        self._pictures = pictures
+        self.notices: list[str] = []
+        self._pictures = _once_each(pictures, self.notices)
         self._options = options
         self._hz = options.frame_hz or DEFAULT_HZ
         self._factor = options.scale or 1.0
         self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
         self.depth_scale = depth_scale
-        self.notices: list[str] = []
         metric = metric or options.scale is not None
         if not metric:
             self.notices.append(
                 "the scale is unknown: lengths of the log are not metres; give --scale, metres per unit of the poses"
             )
-        named = [picture.depth_file for picture in pictures if picture.depth_file is not None]
-        missing = [file for file in named if not file.exists()]
+        named = [picture.depth_file for picture in self._pictures if picture.depth_file is not None]
+        missing = [] if options.without_depth else [file for file in named if not file.exists()]
         if missing:
             self.notices.append(f"{len(missing)} of {len(named)} depth images are missing; the first: {missing[0]}")
-        first = self._rectifier(pictures[0].intrinsics, pictures[0].file)
+        first = self._rectifier(self._pictures[0].intrinsics, self._pictures[0].file)
         self.info = StreamInfo(
             source=f"{source} {folder.resolve().name}",
             cameras={options.camera_id: first.intrinsics},
-            frame_count=len(pictures),
+            frame_count=len(self._pictures),
             frame_hz=self._hz,
             metadata={} if metric else {SCALE_KEY: SCALE_UNKNOWN},
         )
@@ -116,14 +117,13 @@ class PosedPictures:
         height, width = rgb.shape[:2]
         given = picture.intrinsics
         if (given.width, given.height) != (width, height):
-            # The sides of resized pictures are rounded; anything else is another view.
-            if abs(given.width * height - given.height * width) > max(given.width, given.height, width, height):
+            if not same_view((given.width, given.height), (width, height)):
                 raise BadFrameError(
                     picture.file, f"the picture is {width}x{height}, its camera {given.width}x{given.height}"
                 )
             given = scale_intrinsics(given, width, height)
         rectifier = self._rectifier(given, picture.file)
-        changed = bool(given.distortion)
+        changed = given.distorted
         pose = picture.T_world_camera.copy()
         pose[:3, 3] *= self._factor
         frame = PosedFrame(
@@ -140,15 +140,21 @@ class PosedPictures:
 
     def _depth(self, picture: PosedPicture, rectifier: Rectifier, size: tuple[int, int]) -> Float32 | None:
         """Depth image (H, W) in metres, of the size and the lens of the picture; None where there is none."""
-        if picture.depth_file is None or not picture.depth_file.exists():
+        if picture.depth_file is None or self._options.without_depth or not picture.depth_file.exists():
             return None
-        units = read_plane(picture.depth_file, "uint16", None, "depth").astype(np.uint16, copy=False)
+        depth_m = read_depth(picture.depth_file, self.depth_scale, None)
         if picture.confidence_file is not None and picture.confidence_file.exists():
-            confidence = read_plane(picture.confidence_file, "uint8", (units.shape[0], units.shape[1]), "confidence")
-            units = np.where(confidence > 0, units, 0).astype(np.uint16)
-        if units.shape != size:
-            units = np.asarray(cv2.resize(units, size[::-1], interpolation=cv2.INTER_NEAREST), np.uint16)
-        return rectifier.nearest(depth_from_uint16(units, self.depth_scale.units_per_m))
+            of = (depth_m.shape[0], depth_m.shape[1])
+            depth_m[read_plane(picture.confidence_file, "uint8", of, "confidence") == 0] = 0
+        if not same_view((depth_m.shape[1], depth_m.shape[0]), size[::-1]):
+            raise BadFrameError(
+                picture.depth_file,
+                f"the depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, its picture {size[1]}x{size[0]}, which is "
+                "another form: register depth to the picture, or import without it (--topic depth=none)",
+            )
+        if depth_m.shape != size:
+            depth_m = np.asarray(cv2.resize(depth_m, size[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+        return rectifier.nearest(depth_m)
 
     def _rectifier(self, intrinsics: CameraIntrinsics, file: Path) -> Rectifier:
         if intrinsics not in self._rectifiers:
@@ -159,13 +165,13 @@ class PosedPictures:
         return self._rectifiers[intrinsics]
 
 
-def inside(folder: Path, name: str) -> Path:
-    """A file that a collection names.
-
-    Raises:
-        ImportSourceError: it lies outside of the folder.
-    """
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise ImportSourceError(f"{folder}: names '{name}', which lies outside of it")
-    return path
+def _once_each(pictures: Sequence[PosedPicture], notices: list[str]) -> list[PosedPicture]:
+    """The pictures without those that are there before, and a sentence on what is odd about their order."""
+    first = {picture.file: picture for picture in reversed(pictures)}
+    kept = [picture for picture in pictures if first[picture.file] is picture]
+    if len(kept) < len(pictures):
+        again = next(picture.file for picture in pictures if first[picture.file] is not picture)
+        notices.append(
+            f"{len(pictures) - len(kept)} pictures are there twice; of each the first pose counts; the first: {again}"
+        )
+    return kept

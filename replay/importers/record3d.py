@@ -2,6 +2,8 @@
 
 ``metadata.json`` has ``K`` (9 numbers, column by column) for pictures of ``w`` x ``h``, ``fps``, and ``poses``, one for
 each picture: qx qy qz qw tx ty tz, camera to world in metres, in OpenGL's camera axes and ARKit's world, where y is up.
+Newer versions add ``perFrameIntrinsicCoeffs`` (fx fy cx cy of each picture, as the lens focuses and is stabilised) and
+``frameTimestamps`` (seconds), which come first.
 The depth of this export is OpenEXR, which is not read: frames come without depth.
 """
 
@@ -14,22 +16,34 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from semantic_mapper.config import read_json
-from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
+from semantic_mapper.errors import FrameError, ImportSourceError
 from semantic_mapper.geometry import pose_matrix
-from semantic_mapper.replay.importers.base import DepthScale, ImportOptions, numbered_files
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers.base import (
+    DepthScale,
+    ImportOptions,
+    convert_known,
+    numbered_files,
+    read_plain_json,
+    unknown_keys,
+    unknown_notice,
+)
 from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
 from semantic_mapper.types import CameraIntrinsics
 
 FILE = "metadata.json"
+MAX_BYTES = 1 << 29  # hours of frames at 60 Hz
+_KNOWN = ("dw", "dh", "initPose", "cameraType")  # of the depth images, and of what is known from the poses
 MAX_NORM_ERROR = 0.1  # of a unit quaternion
 
 
 class _Metadata(msgspec.Struct):
     w: Annotated[int, Meta(ge=1, le=1 << 14)]
     h: Annotated[int, Meta(ge=1, le=1 << 14)]
-    K: Annotated[list[float], Meta(min_length=9, max_length=9)]
-    poses: list[Annotated[list[float], Meta(min_length=7, max_length=7)]]
+    poses: list[list[float] | None]
+    K: Annotated[list[float], Meta(min_length=9, max_length=9)] | None = None
+    perFrameIntrinsicCoeffs: list[list[float]] | None = None
+    frameTimestamps: list[float] | None = None
     fps: Annotated[float, Meta(gt=0, le=1000)] = 60.0
 
 
@@ -40,28 +54,57 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
         ImportSourceError: metadata or pictures are missing or cannot be understood.
     """
     file = folder / FILE
-    try:
-        found = read_json(file, _Metadata)
-        fx, fy, cx, cy = found.K[0], found.K[4], found.K[6], found.K[7]
-        intrinsics = CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, found.w, found.h)
-    except ConfigError as error:
-        raise ImportSourceError(str(error)) from error
-    except FrameError as error:
-        raise ImportSourceError(f"{file}: K: {error}") from error
-    images = numbered_files(folder / "rgb", (".jpg", ".jpeg", ".png"))
+    plain = read_plain_json(file, MAX_BYTES)
+    found = convert_known(plain, _Metadata, str(file))
+    notices = unknown_notice(file, unknown_keys([plain], _Metadata, _KNOWN))
+    images = numbered_files(folder / "rgb", (".jpg", ".jpeg", ".png"), notices)
     if not images:
         raise ImportSourceError(f"{folder / 'rgb'}: no pictures; export as 'EXR + RGB'")
-    if max(images) >= len(found.poses):
-        raise ImportSourceError(f"{file}: has {len(found.poses)} poses, and pictures are numbered up to {max(images)}")
+    for name, series in (
+        ("perFrameIntrinsicCoeffs", found.perFrameIntrinsicCoeffs),
+        ("frameTimestamps", found.frameTimestamps),
+    ):
+        if series and len(series) != len(found.poses):
+            raise ImportSourceError(
+                f"{file}: {name} has {len(series)} entries, poses has {len(found.poses)}; export again"
+            )
     pictures: list[PosedPicture] = []
+    left_out: list[str] = []
     for number, image in images.items():
-        row = np.array(found.poses[number], np.float64)
-        if not np.isfinite(row).all() or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
-            raise ImportSourceError(f"{file}: pose {number} is no unit quaternion qx qy qz qw and position")
-        T = T_Z_UP_Y_UP @ pose_matrix(row[4:], row[:4]) @ GL_AXES
-        pictures.append(PosedPicture(image, intrinsics, T, stamp_ns=round(number * 1e9 / found.fps)))
+        try:
+            pictures.append(_picture(found, number, image))
+        except ValueError as error:
+            left_out.append(f"{image}: {error}")
+        except FrameError as error:
+            raise ImportSourceError(f"{file}: intrinsics of picture {number}: {error}") from error
+    if left_out:
+        notices.append(f"{counted(len(left_out), 'picture')} left out; the first: {left_out[0]}")
+    if not pictures:
+        raise ImportSourceError(f"{file}: tells the pose of none of the pictures: {left_out[0]}")
+    missing = len(found.poses) - len(images)
+    if missing > 0:
+        notices.append(f"{counted(missing, 'pose')} without a picture in {folder / 'rgb'}")
     scale = DepthScale(1000.0, convention="no depth image is read")
     opened = PosedPictures("record3d", folder, pictures, options, depth_scale=scale, metric=True)
+    opened.notices += notices
     if (folder / "depth").is_dir():
         opened.notices.append("the depth images (OpenEXR) are not read; frames come without depth")
     return opened
+
+
+def _picture(found: _Metadata, number: int, image: Path) -> PosedPicture:
+    """Raises: ValueError: the picture has no pose, or intrinsics."""
+    row = np.array(found.poses[number] if number < len(found.poses) else None, np.float64)
+    if row.shape != (7,) or not np.isfinite(row).all() or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
+        raise ValueError("its pose is missing, or no unit quaternion qx qy qz qw and position")
+    T = T_Z_UP_Y_UP @ pose_matrix(row[4:], row[:4]) @ GL_AXES
+    k = found.perFrameIntrinsicCoeffs[number][:4] if found.perFrameIntrinsicCoeffs else None
+    if k is None and found.K is not None:
+        k = [found.K[0], found.K[4], found.K[6], found.K[7]]
+    if k is None or len(k) != 4:
+        raise ValueError("it has no intrinsics: neither K nor 4 numbers of perFrameIntrinsicCoeffs")
+    fx, fy, cx, cy = k
+    seconds = found.frameTimestamps[number] - found.frameTimestamps[0] if found.frameTimestamps else number / found.fps
+    return PosedPicture(
+        image, CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, found.w, found.h), T, stamp_ns=round(seconds * 1e9)
+    )

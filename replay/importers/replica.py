@@ -33,6 +33,7 @@ from semantic_mapper.replay.importers.base import (
     read_depth_if_there,
     read_label,
     read_lines,
+    read_numbers,
     read_rgb,
 )
 from semantic_mapper.transport.messages import StreamInfo
@@ -74,9 +75,10 @@ class ReplicaRecording:
         self._folder = folder
         self._camera_id = options.camera_id
         self._hz = options.frame_hz or RENDER_HZ
-        self._color = list(numbered_files(folder / "rgb", (".png",)).items())
-        self._depth = numbered_files(folder / "depth", (".png",))
-        self._labels = numbered_files(folder / "semantic_class", (".png",))
+        self._color = list(numbered_files(folder / "rgb", (".png",), self.notices).items())
+        self._depth = numbered_files(folder / "depth", (".png", ".npy"), self.notices)
+        self._labels = numbered_files(folder / "semantic_class", (".png",), self.notices)
+        self._without_depth = options.without_depth
         self._rows = read_lines(folder / _TRAJECTORY)
         self._check_counts()
         self._intrinsics = self._find_intrinsics()
@@ -102,7 +104,8 @@ class ReplicaRecording:
         rgb, encoded = read_rgb(file)
         image_size_must_be(rgb, self._intrinsics, file)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth = read_depth_if_there(self._depth.get(name), DEPTH_SCALE, size)
+        depth_file = None if self._without_depth else self._depth.get(name)
+        depth = read_depth_if_there(depth_file, DEPTH_SCALE, size)
         label, label_error = None, None
         if self.info.label_set is not None:
             label_file = self._labels.get(name, self._folder / "semantic_class" / f"semantic_class_{name}.png")
@@ -151,7 +154,7 @@ class ReplicaRecording:
         file = self._folder / _TRAJECTORY
         line, text = self._rows[name]
         try:
-            values = np.array([float(word) for word in text.split()], np.float64)
+            values = np.array(read_numbers(text), np.float64)
         except ValueError as error:
             raise BadFrameError(file, f"line {line}: {error}") from error
         if values.size != 16:

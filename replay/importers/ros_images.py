@@ -14,7 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.errors import CodecError, FrameError, ImportSourceError
+from semantic_mapper.drivers.lens import lens_intrinsics
+from semantic_mapper.errors import CodecError, ConfigError, FrameError, ImportSourceError
+from semantic_mapper.replay.importers.base import metres
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.compression import depth_from_uint16
 from semantic_mapper.transport.images import decode_image_file
@@ -43,7 +45,6 @@ GREY_ENCODINGS: dict[str, tuple[int, int | None]] = {
     "8UC1": (1, cv2.COLOR_GRAY2RGB),
 }
 DEPTH_ENCODINGS = {"16UC1": np.dtype("<u2"), "mono16": np.dtype("<u2"), "32FC1": np.dtype("<f4")}
-_LENSES = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "": (0,)}  # coefficients of each model that OpenCV shares
 _MAX_SIDE = 1 << 14  # pixels
 _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")  # format, and A and B of the quantised inverse depth
 
@@ -56,7 +57,8 @@ def is_depth(topic: str, encoding: str) -> bool:
         encoding: Of an image, or the format of a compressed one.
     """
     pixels = re.split("[; ]", encoding.strip())[0]
-    return "compressedDepth" in encoding or pixels in ("16UC1", "32FC1") or (pixels == "mono16" and "depth" in topic)
+    named = "depth" in topic.lower()
+    return "compressedDepth" in encoding or pixels in ("16UC1", "32FC1") or (pixels == "mono16" and named)
 
 
 def is_grey(encoding: str) -> bool:
@@ -151,30 +153,25 @@ def intrinsics(info: Any, K: NDArray[np.float64], D: NDArray[np.float64], *, rec
         rectified: The image is: its lens distortion has been removed already.
 
     Raises:
-        ImportSourceError: not calibrated, a lens model that is not OpenCV's, binning or a region of interest.
+        ImportSourceError: not calibrated, a lens model that is not OpenCV's, skew, binning or a region of interest.
     """
     where = "its camera_info"
     if info.binning_x > 1 or info.binning_y > 1 or info.roi.x_offset or info.roi.y_offset:
         raise ImportSourceError(f"{where} tells of binning or a region of interest, which is not read: record it whole")
     fx, cx, fy, cy = (float(K[i]) for i in ((0, 2, 5, 6) if rectified else (0, 2, 4, 5)))
+    if K[1] or (not rectified and K[3]):
+        raise ImportSourceError(f"{where} has skew, which is not undone: calibrate without it, and record again")
     if not fx or not fy:
         matrix = "P" if rectified else "K"
         raise ImportSourceError(f"{where} is not calibrated ({matrix} is zero): calibrate the camera, and record again")
-    lens: tuple[float, ...] = ()
-    if not rectified and D.any():
-        if len(D) not in _LENSES.get(info.distortion_model, ()):
-            raise ImportSourceError(
-                f"{where} has distortion model '{info.distortion_model}' with {len(D)} coefficients; only plumb_bob "
-                "and rational_polynomial are undone: rectify the images (image_proc), and name that topic"
-            )
-        lens = tuple(float(d) for d in D)
-    elif not rectified and info.distortion_model not in _LENSES:
-        raise ImportSourceError(
-            f"{where} has distortion model '{info.distortion_model}', a fisheye's: rectify the images (image_proc), "
-            "and name that topic"
-        )
     try:
-        return CameraIntrinsics(fx, fy, cx, cy, info.width, info.height, lens)
+        if rectified:
+            return CameraIntrinsics(fx, fy, cx, cy, info.width, info.height)
+        return lens_intrinsics(info.distortion_model, D.tolist(), (fx, fy, cx, cy), (info.width, info.height))
+    except ConfigError as error:
+        raise ImportSourceError(
+            f"{where} cannot be used: {error}; or rectify the images (image_proc), and name that topic"
+        ) from error
     except FrameError as error:
         raise ImportSourceError(f"{where} cannot be used: {error}") from error
 
@@ -193,6 +190,4 @@ def _rows(message: Any, bytes_a_pixel: int) -> UInt8:
 def _metres(values: NDArray[np.generic]) -> Float32:
     if values.dtype.kind == "u":
         return depth_from_uint16(values.astype(np.uint16), UNITS_PER_M)
-    metres = values.astype(np.float32)
-    metres[~(np.isfinite(metres) & (metres > 0))] = 0
-    return metres
+    return metres(values)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import interpolate_pose, invert_pose, pose_matrix
+from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
 
 WORLDS = ("map", "world", "odom")  # names of a world by REP 105 and habit, the preferred first
@@ -26,12 +28,31 @@ class Track:
     Args:
         stamps_ns: In any order; of one stamp the last pose counts.
         rows: tx ty tz qx qy qz qw of each.
+
+    Attributes:
+        doubled: How many poses have the stamp of another one, and are different.
+        back: How often stamps go back.
     """
 
     def __init__(self, stamps_ns: list[int], rows: list[tuple[float, ...]]) -> None:
-        by_stamp = dict(sorted(zip(stamps_ns, rows, strict=True), key=lambda pair: pair[0]))
+        self.back = sum(b < a for a, b in pairwise(stamps_ns))
+        last: dict[int, tuple[float, ...]] = {}
+        self.doubled = 0
+        for stamp_ns, row in zip(stamps_ns, rows, strict=True):
+            self.doubled += last.setdefault(stamp_ns, row) != row
+            last[stamp_ns] = row
+        by_stamp = dict(sorted(last.items()))
         self.stamps_ns: NDArray[np.int64] = np.array(list(by_stamp), np.int64)
         self._rows = np.array(list(by_stamp.values()), np.float64).reshape(-1, 7)
+
+    def oddities(self, name: str) -> list[str]:
+        """Sentences on what is odd about the poses, for people."""
+        found: list[str] = []
+        if self.doubled:
+            found.append(f"{name}: {counted(self.doubled, 'pose')} with the stamp of another one; the last counts")
+        if self.back:
+            found.append(f"{name}: stamps go back {counted(self.back, 'time')}; poses are sorted by them")
+        return found
 
     def at(self, stamp_ns: int, within_ns: int) -> Float64 | None:
         """Pose (4, 4) at a time; None where there are no poses round it.
@@ -89,10 +110,17 @@ class TransformTree:
                 stamps.append(stamp_of(stamped.header))
                 rows.append(row)
 
-    def close(self) -> None:
-        """Sort what was taken in."""
+    def close(self) -> list[str]:
+        """Sort what was taken in; sentences on what is odd about it."""
         self._tracks = {child: Track(*found) for child, found in self._moving.items()}
         self._moving.clear()
+        return [said for child, track in self._tracks.items() for said in track.oddities(f"tf of '{child}'")]
+
+    def moving_above(self, frame: str, world: str) -> list[tuple[str, Track]]:
+        """The transforms between a frame and a world that change over time, as 'parent to child'."""
+        way = self.way_up(frame)
+        way = way[: way.index(world) + 1] if world in way else way
+        return [(f"'{up}' to '{down}'", self._tracks[down]) for down, up in pairwise(way) if down in self._tracks]
 
     def way_up(self, frame: str) -> list[str]:
         """The frame, the one it sits on, and so on to the root.

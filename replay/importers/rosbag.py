@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import CodecError, ConfigError, DependencyError, ImportSourceError, SemanticMapperError
-from semantic_mapper.geometry import transform, unproject
-from semantic_mapper.plain_text import visible
+from semantic_mapper.geometry import invert_pose, scale_intrinsics, transform, unproject
+from semantic_mapper.plain_text import counted, visible
 from semantic_mapper.replay.importers import ros_images
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
@@ -31,7 +32,9 @@ from semantic_mapper.replay.importers.base import (
     LoadedFrame,
     check_frame_pose,
     image_size_must_be,
+    same_view,
 )
+from semantic_mapper.replay.importers.ros_files import readable_bag
 from semantic_mapper.replay.importers.ros_transforms import (
     WORLDS,
     Track,
@@ -45,8 +48,7 @@ from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
-ROLES = ("image", "depth", "info", "pose")
-STORAGE = (".mcap", ".db3")  # of ROS 2
+ROLES = ("image", "depth", "info", "depth_info", "pose")
 DEPTH_SCALE = DepthScale(ros_images.UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
 LISTED = 12  # topics that an error names
 
@@ -57,7 +59,15 @@ _TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _NAMED_POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped")
 _POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _SAME_PLACE = 1e-6  # of a transform's entries; cameras that are closer are one
+_SAME_LENS = (
+    0.005  # fraction of the focal length, and of the width, that two calibrations of one lens differ by at most
+)
+_REALSENSE_VIEWER = "/device_"  # begins the topics of its recordings
 _TRANSPORTS = ("/compressedDepth", "/compressed")
+_VIEWER = (
+    ". Recordings of the RealSense Viewer have none: record with ROS and an odometry, or live with `semantic-mapper up` of "
+    "launch/realsense.toml, which finds poses"
+)
 _MEND = (
     "`ros2 bag reindex`, `mcap recover` or `rosbag reindex` mends a bag whose recorder was killed; one that was copied "
     "in part has to be copied again"
@@ -77,6 +87,11 @@ class _Topic:
     raw: bool
     encoding: str
     frame: str
+
+    @property
+    def rectified(self) -> bool:
+        """Whether its images have no lens distortion any more."""
+        return "rect" in self.base.rsplit("/", 1)[-1]
 
     @property
     def base(self) -> str:
@@ -112,24 +127,32 @@ class RosbagRecording:
         self._bag = _Bag(src)
         color, depth = self._find_images()
         infos = {color.name: self._info_topic(color, options.topics.get("info", ""))}
-        if depth is not None and self._has_info(depth):
-            infos[depth.name] = self._info_topic(depth, "")
+        depth_info = options.topics.get("depth_info", "")
+        if depth is not None and (depth_info or self._has_info(depth)):
+            infos[depth.name] = self._info_topic(depth, depth_info)
         self._tree = TransformTree()
         self._stamps: dict[str, list[tuple[int, int]]] = {t.name: [] for t in (color, depth) if t is not None}
-        calibrations, poses = self._read_all(set(infos.values()))
+        calibrations, poses = self._read_all({*infos.values(), *self._bag.topics(_INFO)})
         self._color, self._color_topic = self._stamps[color.name], color
-        self._measured = self._intrinsics(color, calibrations[infos[color.name]])
+        self._measured = self._intrinsics(color, calibrations[infos[color.name]], infos[color.name])
+        self._T_frame_image = self._image_pose(color, calibrations[infos[color.name]])
+        if "info" not in options.topics:
+            self._refuse_contradictions(color, infos[color.name], calibrations)
         self._rectify = _rectifier(src, self._measured)
-        depth_info = None if depth is None or depth.name not in infos else calibrations[infos[depth.name]]
         self._depth_topic = depth
         self._depth = self._stamps[depth.name] if depth is not None else []
         self._T_color_depth: Float64 | None = None
         self._depth_intrinsics = self._measured
         if depth is not None:
-            self._link_depth(depth, None if depth_info is None else self._intrinsics(depth, depth_info))
+            name = infos.get(depth.name, "")
+            own = self._intrinsics(depth, calibrations[name], name) if name else None
+            if own is not None and not depth_info:
+                self._refuse_two_lenses(depth, own, infos[color.name], name)
+            self._link_depth(depth, own)
         pose_topic = self._pose_topic()
         self._pose_at, told = self._pose_source(pose_topic, poses.get(pose_topic, []))
         self.notices.append(told)
+        self._check_times(pose_topic)
         if self._tree.refused:
             self.notices.append(f"{self._tree.refused} transforms of tf are left out: they hold NaN or no rotation")
         within_ns = round(options.match_s * 1e9)
@@ -146,6 +169,9 @@ class RosbagRecording:
             frame_count=len(self._color),
             frame_hz=_rate(stamps),
         )
+        back = int((np.diff(stamps) < 0).sum())
+        if back:
+            self.notices.append(f"{color.name}: stamps go back {counted(back, 'time')}; images are sorted by them")
 
     def __len__(self) -> int:
         return len(self._color)
@@ -165,7 +191,7 @@ class RosbagRecording:
             raise BadFrameError(where, f"a second image of {stamp_ns / 1e9:.6f} s")
         pose = self._pose_at(stamp_ns)
         if pose is None:
-            raise BadFrameError(where, f"there is no pose round its time {stamp_ns / 1e9:.6f} s")
+            raise BadFrameError(where, f"there is no pose round its time {stamp_ns / 1e9:.6f} s{self._gap(stamp_ns)}")
         try:
             rgb, encoded = self._rgb(index)
         except CodecError as error:
@@ -192,7 +218,7 @@ class RosbagRecording:
         else:
             rgb, encoded = ros_images.compressed_color_image(message)
         image_size_must_be(rgb, self._measured, Path(self._color_topic.name))
-        if any(self._measured.distortion):
+        if self._measured.distorted:
             return self._rectify(np.ascontiguousarray(rgb[..., ::-1])), None
         return rgb, encoded
 
@@ -209,9 +235,18 @@ class RosbagRecording:
             raise BadFrameError(where, str(error)) from error
         k = self._depth_intrinsics
         if depth_m.shape != (k.height, k.width):
+            height, width = depth_m.shape
+            if (
+                self._T_color_depth is None
+                and not self._measured.distorted
+                and same_view((k.width, k.height), (width, height))
+            ):
+                k = scale_intrinsics(k, width, height)  # registered, and made smaller
+                return register_depth(depth_m, k, np.eye(4), self._rectify.intrinsics)
             raise BadFrameError(
                 where,
-                f"the depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, its calibration says {k.width}x{k.height}",
+                f"the depth image is {width}x{height}, its calibration says {k.width}x{k.height}; name the one that it "
+                "has (--topic depth_info=NAME), or import without depth (--topic depth=none)",
             )
         if self._T_color_depth is not None:
             return register_depth(depth_m, k, self._T_color_depth, self._rectify.intrinsics)
@@ -266,13 +301,15 @@ class RosbagRecording:
         )
 
     def _has_info(self, topic: _Topic) -> bool:
-        return _info_name(topic) in self._bag.topics(_INFO)
+        return any(name in self._bag.topics(_INFO) for name in _info_names(topic))
 
     def _info_topic(self, topic: _Topic, wanted: str) -> str:
         infos = self._bag.topics(_INFO)
-        name = wanted or _info_name(topic)
-        if name in infos:
-            return name
+        names = [wanted] if wanted else _info_names(topic)
+        name = names[0]
+        for known in names:
+            if known in infos:
+                return known
         if not wanted and len(infos) == 1:
             self.notices.append(f"the calibration of {topic.name} is that of {infos[0]}, the only one")
             return infos[0]
@@ -305,6 +342,7 @@ class RosbagRecording:
             raise ImportSourceError(
                 f"{self._bag.src}: has no poses: neither tf nor a topic of "
                 f"{', '.join(t.replace('/msg/', '/') for t in (*_NAMED_POSES, *_POSES))}; it has {self._bag.listing()}"
+                + (_VIEWER if self._color_topic.name.startswith(_REALSENSE_VIEWER) else "")
             )
         return found[0] if found else ""
 
@@ -325,19 +363,22 @@ class RosbagRecording:
                 self._tree.add(message.transforms, fixed=name.endswith("tf_static"))
             else:
                 poses[name].append(message)
-        self._tree.close()
+        self.notices += self._tree.close()
         if unstamped:
             self.notices.append(f"{unstamped} images have no stamp: the time at which they were recorded stands for it")
-        for name, messages in calibrations.items():
-            if not messages:
-                raise ImportSourceError(f"{self._bag.src}: {name} has no message")
         return calibrations, poses
 
-    def _intrinsics(self, topic: _Topic, infos: list[Any]) -> CameraIntrinsics:
+    def _intrinsics(self, topic: _Topic, infos: list[Any], name: str) -> CameraIntrinsics:
         """Raises: ImportSourceError: they change, or cannot be used."""
-        rectified = "rect" in topic.base.rsplit("/", 1)[-1]
+        if not infos:
+            raise ImportSourceError(f"{self._bag.src}: {name} has no message")
+        good = [info for info in infos if self._bag.is_calibrated(info)]
+        if good and len(good) < len(infos):
+            self.notices.append(
+                f"{name}: {counted(len(infos) - len(good), 'message')} without a calibration passed over"
+            )
         try:
-            found = [self._bag.intrinsics(info, rectified=rectified) for info in infos]
+            found = [self._bag.intrinsics(info, rectified=topic.rectified) for info in good or infos[:1]]
         except ImportSourceError as error:
             raise ImportSourceError(f"{self._bag.src}: {topic.name}: {error}") from error
         if len(set(found)) > 1:
@@ -354,6 +395,7 @@ class RosbagRecording:
             ImportSourceError: it is of another camera, and nobody says where that one sits.
         """
         color = self._color_topic
+        own = own if own is None or own.distorted or not self._is_scaled(own) else self._measured
         linked = depth.frame != color.frame and self._tree.reaches(color.frame, depth.frame)
         T = self._tree.lookup(color.frame, depth.frame, self._color[0][0], MAX_STAMP_NS) if linked else np.eye(4)
         if own is None:
@@ -361,7 +403,7 @@ class RosbagRecording:
             return
         if own == self._measured and (T is None or np.allclose(T, np.eye(4), atol=_SAME_PLACE)):
             return
-        if any(own.distortion):
+        if own.distorted:
             raise ImportSourceError(
                 f"{self._bag.src}: {depth.name} has lens distortion of its own; record depth that is registered to "
                 "colour, or import without it: --topic depth=none"
@@ -372,7 +414,7 @@ class RosbagRecording:
                 ", and tf does not link the two; record tf_static or registered depth, or import without it: "
                 "--topic depth=none"
             )
-        self._T_color_depth, self._depth_intrinsics = T, own
+        self._T_color_depth, self._depth_intrinsics = invert_pose(self._T_frame_image) @ T, own
         self.notices.append(f"{depth.name} is registered to {color.name} here, by tf and the intrinsics of both")
 
     def _pose_source(self, topic: str, messages: list[Any]) -> tuple[Callable[[int], Float64 | None], str]:
@@ -385,10 +427,13 @@ class RosbagRecording:
         camera, tree = self._color_topic.frame, self._tree
         if not topic:
             world = self._world(camera)
-            return (
-                lambda stamp_ns: tree.lookup(world, camera, stamp_ns, within_ns),
-                f"poses are those of {camera} in {world}, from tf",
-            )
+            self._moving = tree.moving_above(camera, world)
+
+            def from_tf(stamp_ns: int) -> Float64 | None:
+                T_world_camera = tree.lookup(world, camera, stamp_ns, within_ns)
+                return None if T_world_camera is None else T_world_camera @ self._T_frame_image
+
+            return from_tf, f"poses are those of {camera} in {world}, from tf"
         body, track = self._track(topic, messages)
         if body != camera and not tree.reaches(body, camera):
             raise ImportSourceError(
@@ -396,12 +441,93 @@ class RosbagRecording:
                 f"sits on it; record tf_static, or say with --body {camera} that the poses are the camera's"
             )
 
+        self._moving = [(topic, track)]
+        self.notices += track.oddities(topic)
+
         def pose_at(stamp_ns: int) -> Float64 | None:
             T_world_body = track.at(stamp_ns, within_ns)
             T_body_camera = tree.lookup(body, camera, stamp_ns, within_ns)
-            return None if T_world_body is None or T_body_camera is None else T_world_body @ T_body_camera
+            if T_world_body is None or T_body_camera is None:
+                return None
+            return T_world_body @ T_body_camera @ self._T_frame_image
 
         return pose_at, f"poses are those of {camera}, from {topic} of {body}"
+
+    def _image_pose(self, color: _Topic, infos: list[Any]) -> Float64:
+        """``T_frame_image`` (4, 4): how a stereo camera's rectification turned, and moved, the image within its frame."""
+        T = np.eye(4)
+        info = next((info for info in infos if self._bag.is_calibrated(info)), None)
+        if not color.rectified or info is None:
+            return T
+        R, P = self._bag.rectification(info)
+        if R.any() and not np.allclose(R, np.eye(3), atol=1e-6):
+            T[:3, :3] = R.T
+            self.notices.append(
+                f"{color.name}: rectification has turned the image (R of its camera_info); poses turn with it"
+            )
+        if P[3]:
+            self.notices.append(
+                f"{color.name}: is the right image of a stereo camera (P of its camera_info); '{color.frame}' is taken as "
+                "the frame of this camera, not of the left one"
+            )
+        return T
+
+    def _refuse_contradictions(self, color: _Topic, name: str, calibrations: Mapping[str, list[Any]]) -> None:
+        """Raises: ImportSourceError: another topic gives the same camera frame another calibration."""
+        own = next((info for info in calibrations[name] if self._bag.is_calibrated(info)), None)
+        for other, infos in calibrations.items():
+            info = next((info for info in infos if self._bag.is_calibrated(info)), None)
+            if own is None or info is None or frame_name(info.header.frame_id) != frame_name(own.header.frame_id):
+                continue
+            try:
+                a, b = (self._bag.intrinsics(i, rectified=False) for i in (own, info))
+            except ImportSourceError:  # of a lens that is not undone: another camera's
+                continue
+            if "depth" not in other.lower() and (a.width, a.height) == (b.width, b.height) and not _one_lens(a, b):
+                raise ImportSourceError(
+                    f"{self._bag.src}: {name} and {other} give the camera frame '{color.frame}' two calibrations ({a}, "
+                    f"{b}); name the true one: --topic info={name} or --topic info={other}"
+                )
+
+    def _refuse_two_lenses(self, depth: _Topic, own: CameraIntrinsics, name: str, depth_name: str) -> None:
+        """Raises: ImportSourceError: depth has the frame of colour, and another lens."""
+        if depth.frame == self._color_topic.frame and not own.distorted and not _one_lens(self._measured, own):
+            raise ImportSourceError(
+                f"{self._bag.src}: {depth.name} has the frame of {self._color_topic.name}, '{depth.frame}', but its "
+                f"calibration has other intrinsics ({own}, colour {self._measured}). Where depth is registered to colour: "
+                f"--topic depth_info={name}; where it has a lens of its own: --topic depth_info={depth_name}; without it: "
+                "--topic depth=none"
+            )
+
+    def _is_scaled(self, own: CameraIntrinsics) -> bool:
+        """Whether depth is colour's view at its size, for rounding of the calibration."""
+        k = self._measured
+        return (own.width, own.height) == (k.width, k.height) and _one_lens(k, own) and self._topics_share_frame()
+
+    def _topics_share_frame(self) -> bool:
+        return self._depth_topic is not None and self._depth_topic.frame == self._color_topic.frame
+
+    def _check_times(self, topic: str) -> None:
+        """Raises: ImportSourceError: no image was taken while poses were."""
+        stamps = np.array([stamp for stamp, _ in self._color], np.int64)
+        margin = round(self._options.match_s * 1e9)
+        for name, track in self._moving:
+            if len(stamps) and len(track.stamps_ns):
+                first, last = int(track.stamps_ns[0]) - margin, int(track.stamps_ns[-1]) + margin
+                if stamps.max() < first or stamps.min() > last:
+                    what = f"poses of {topic}" if topic else f"transforms of tf from {name}"
+                    raise ImportSourceError(
+                        f"{self._bag.src}: images of {self._color_topic.name} are from {_span(stamps)}, {what} from "
+                        f"{_span(track.stamps_ns)}: their clocks differ; record both with one clock (use_sim_time)"
+                    )
+
+    def _gap(self, stamp_ns: int) -> str:
+        """Which transform is missing at a time."""
+        within_ns = round(self._options.match_s * 1e9)
+        for name, track in self._moving:
+            if track.at(stamp_ns, within_ns) is None:
+                return f"; {name} is there from {_span(track.stamps_ns)}, and not near it"
+        return ""
 
     def _track(self, topic: str, messages: list[Any]) -> tuple[str, Track]:
         """Whose poses a topic tells, and the poses."""
@@ -413,13 +539,13 @@ class RosbagRecording:
                 f"--body {self._color_topic.frame} where they are the camera's"
             )
         read = self._bag.pose_reader(topic)
-        rows = {stamp_of(message.header): pose_row(*read(message)) for message in messages}
-        good = {stamp: row for stamp, row in rows.items() if row is not None}
+        rows = [(stamp_of(message.header), pose_row(*read(message))) for message in messages]
+        good = [(stamp, row) for stamp, row in rows if row is not None]
         if not good:
             raise ImportSourceError(f"{self._bag.src}: {topic} holds no pose")
         if len(good) < len(rows):
             self.notices.append(f"{len(rows) - len(good)} poses of {topic} are left out: they hold NaN or no rotation")
-        return body, Track(list(good), list(good.values()))
+        return body, Track([stamp for stamp, _ in good], [row for _, row in good])
 
     def _world(self, camera: str) -> str:
         """The frame of tf in which poses are."""
@@ -464,24 +590,6 @@ def register_depth(depth_m: Float32, own: CameraIntrinsics, T_color_depth: Float
     return nearest.reshape(color.height, color.width)
 
 
-def is_ros_mcap(path: Path) -> bool:
-    """Whether an MCAP file says of itself that it is a bag of ROS 2."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(29)  # magic, op code, length of the record, length of the profile, profile
-    except OSError:
-        return False
-    return head[:9] == b"\x89MCAP0\r\n\x01" and head[17:25] == b"\x04\x00\x00\x00ros2"
-
-
-def is_bag_folder(folder: Path) -> bool:
-    """Whether a folder is a bag of ROS 2, complete or without its metadata."""
-    files = _storage_files(folder)
-    return bool(files) and (
-        (folder / "metadata.yaml").exists() or all(f.suffix == ".db3" or is_ros_mcap(f) for f in files)
-    )
-
-
 class _Bag:
     """A bag that is open, by the names of its topics.
 
@@ -493,7 +601,7 @@ class _Bag:
     def __init__(self, src: Path) -> None:
         self.src = src
         highlevel, typesys = _load_rosbags()
-        paths = [src] if src.is_file() or (src / "metadata.yaml").exists() else _storage_files(src)
+        paths, self._unpacked = readable_bag(src)  # what was made for it is there as long as this is
         with self._explained():
             # Bags of ROS 2 before Iron hold no definitions of their messages; those read here have not changed since.
             self._reader = highlevel.AnyReader(
@@ -560,8 +668,22 @@ class _Bag:
 
     def intrinsics(self, info: Any, *, rectified: bool) -> CameraIntrinsics:
         """See ``ros_images.intrinsics``."""
-        K, D, P = (info.k, info.d, info.p) if self._is_ros2 else (info.K, info.D, info.P)
-        return ros_images.intrinsics(info, P if rectified else K, D, rectified=rectified)
+        K, D, P = self._matrices(info)
+        rectified = rectified and (np.any(P) or np.any(D))  # a pinhole camera's driver may leave P empty
+        return ros_images.intrinsics(info, P if rectified else K, D, rectified=bool(rectified))
+
+    def is_calibrated(self, info: Any) -> bool:
+        """Whether a ``sensor_msgs/CameraInfo`` says anything: cameras send some before they know."""
+        K, _, P = self._matrices(info)
+        return bool(np.any(K) or np.any(P))
+
+    def rectification(self, info: Any) -> tuple[Float64, Float64]:
+        """R (3, 3) and P (12,) of a ``sensor_msgs/CameraInfo``."""
+        R = info.r if self._is_ros2 else info.R
+        return np.asarray(R, np.float64).reshape(3, 3), self._matrices(info)[2]
+
+    def _matrices(self, info: Any) -> tuple[Float64, Float64, Float64]:
+        return (info.k, info.d, info.p) if self._is_ros2 else (info.K, info.D, info.P)
 
     def pose_reader(self, topic: str) -> Callable[[Any], tuple[Any, Any]]:
         """What takes position and rotation out of a message of a topic of poses."""
@@ -598,18 +720,28 @@ def _load_rosbags() -> tuple[Any, Any]:
         ) from error
 
 
-def _storage_files(folder: Path) -> list[Path]:
-    return sorted(f for f in folder.iterdir() if f.suffix in STORAGE) if folder.is_dir() else []
-
-
 def _without_doubles(topics: list[_Topic]) -> list[_Topic]:
     """Of each camera one transport: raw images where there are some."""
     by_base = {t.base: t for t in sorted(topics, key=lambda t: t.raw)}
     return [t for t in topics if t in by_base.values()]
 
 
-def _info_name(topic: _Topic) -> str:
-    return f"{topic.base.rsplit('/', 1)[0]}/camera_info"
+def _info_names(topic: _Topic) -> list[str]:
+    """Where the calibration of images is; the second place is that of the RealSense Viewer."""
+    return [f"{topic.base.rsplit('/', 1)[0]}/camera_info", f"{topic.base.rsplit('/', 2)[0]}/info/camera_info"]
+
+
+def _span(stamps_ns: NDArray[np.int64]) -> str:
+    return f"{stamps_ns.min() / 1e9:.3f} to {stamps_ns.max() / 1e9:.3f} s"
+
+
+def _one_lens(a: CameraIntrinsics, b: CameraIntrinsics) -> bool:
+    """Whether two calibrations are of one lens, at any size of its image."""
+    if not same_view((a.width, a.height), (b.width, b.height)):
+        return False
+    b = scale_intrinsics(b, a.width, a.height)
+    focal = max(abs(a.fx - b.fx) / a.fx, abs(a.fy - b.fy) / a.fy)
+    return focal < _SAME_LENS and max(abs(a.cx - b.cx), abs(a.cy - b.cy)) < _SAME_LENS * a.width
 
 
 def _on(way: list[str]) -> str:

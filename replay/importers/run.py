@@ -30,8 +30,8 @@ from semantic_mapper.replay.importers.opensfm import find_opensfm, open_opensfm
 from semantic_mapper.replay.importers.polycam import open_polycam
 from semantic_mapper.replay.importers.record3d import open_record3d
 from semantic_mapper.replay.importers.replica import ReplicaRecording
-from semantic_mapper.replay.importers.rosbag import STORAGE as BAG_STORAGE
-from semantic_mapper.replay.importers.rosbag import RosbagRecording, is_bag_folder, is_ros_mcap
+from semantic_mapper.replay.importers.ros_files import is_bag
+from semantic_mapper.replay.importers.rosbag import RosbagRecording
 from semantic_mapper.replay.importers.scannet import ScanNetRecording
 from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import TumRecording
@@ -39,7 +39,7 @@ from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
-from semantic_mapper.replay.sfm.colmap_model import find_model
+from semantic_mapper.replay.sfm.colmap_model import find_models
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
@@ -68,7 +68,11 @@ _MARKS = {
     "polycam": ("keyframes/images", "keyframes/cameras"),
     "record3d": ("rgb", "metadata.json"),
     "transforms": ("transforms.json",),
+    "colmap": ("sparse", "images"),
+    "opensfm": ("reconstruction.json", "images"),
+    "rosbag": ("metadata.yaml",),
 }
+_NOT_ENOUGH = ("colmap", "opensfm", "rosbag")  # formats that are known by what is in their files
 
 SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
 LISTED = 5  # recordings that an error names
@@ -77,6 +81,7 @@ _VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),
+    ".r3d": "is Record3D's own file; export it on the phone as 'EXR + RGB', and name the folder that comes out",
     **dict.fromkeys((".zip", ".tgz", ".gz", ".tar", ".7z"), _PACKED),
 }
 
@@ -91,14 +96,14 @@ def detect_format(src: Path) -> str:
     """
     if not src.exists():
         raise ImportSourceError(f"{src}: no such file or folder")
-    if _is_bag(src):
+    if is_bag(src):
         return "rosbag"
     if src.is_file():
         raise ImportSourceError(f"{src}: {_what_file(src)}")
     for name in _MARKS:
-        if not _lacks(src, name):
+        if name not in _NOT_ENOUGH and not _lacks(src, name):
             return name
-    if find_model(src) is not None:
+    if find_models(src):
         return "colmap"
     if find_opensfm(src) is not None:
         return "opensfm"
@@ -107,19 +112,13 @@ def detect_format(src: Path) -> str:
     raise ImportSourceError(f"{src}: {_what_folder(src)}")
 
 
-def _is_bag(src: Path) -> bool:
-    """Whether it is a bag of ROS: a file or, of ROS 2, a folder."""
-    if src.is_dir():
-        return is_bag_folder(src)
-    return src.suffix in (".bag", ".db3") or (src.suffix in BAG_STORAGE and is_ros_mcap(src))
-
-
 def is_recording(src: Path) -> bool:
     """Whether a folder is, or holds, a recording of one of the formats."""
     try:
         detect_format(src)
     except ImportSourceError:
-        return any(not _lacks(folder, n) for folder in src.iterdir() if folder.is_dir() for n in _MARKS)
+        marks = [n for n in _MARKS if n not in _NOT_ENOUGH]
+        return any(not _lacks(folder, n) for folder in src.iterdir() if folder.is_dir() for n in marks)
     return True
 
 
@@ -130,13 +129,19 @@ def _lacks(src: Path, name: str) -> list[str]:
 
 def _what_folder(src: Path) -> str:
     """Why a folder is not imported."""
+    if (src / "traj.txt").exists() and (src / "results").is_dir():
+        return (
+            "is a room of Replica as NICE-SLAM renders it (results/frame*.jpg, traj.txt); only Replica of Semantic-NeRF is "
+            "read (rgb/, depth/, traj_w_c.txt). Rewrite it as a sequence folder: color/NNNNNN.jpg, depth/NNNNNN.png, "
+            "poses.txt (the rows of traj.txt), intrinsics.json (of cam_params.json, depth_scale is its scale)"
+        )
     sequences = sorted(path.parent for path in src.glob("*/traj_w_c.txt"))
     if sequences:
         return f"is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}"
     below = [
         path
         for path in sorted(src.iterdir())
-        if _is_bag(path) or (path.is_dir() and any(not _lacks(path, n) for n in _MARKS))
+        if is_bag(path) or (path.is_dir() and any(not _lacks(path, n) for n in _MARKS))
     ]
     if below:
         return f"holds recordings; name one of them: {', '.join(map(str, below[:LISTED]))}"
@@ -149,6 +154,8 @@ def _what_folder(src: Path) -> str:
 
 def _what_file(src: Path) -> str:
     """Why a file is not imported."""
+    if src.suffix.lower() == ".bag":
+        return "is no bag of ROS 1, or one that is cut off at its beginning; copy it again"
     if src.suffix.lower() in _FILES:
         return _FILES[src.suffix.lower()]
     if src.suffix != LOG_SUFFIX:
@@ -157,8 +164,9 @@ def _what_file(src: Path) -> str:
         LogReader(src, allow_empty=True).close()
     except LogError:
         return (
-            "is neither the folder of a recording nor a log of semantic-mapper; MCAP files of other programs, and "
-            "those that `export` has written for Foxglove, cannot be imported: use the log that they were made of"
+            "is neither a bag of ROS 2 (none of its schemas is ros2msg or ros2idl) nor a log of semantic-mapper; other MCAP "
+            "files, such as those that `export` has written for Foxglove, cannot be imported: use the log that they were "
+            "made of, or convert bags of ROS 1 in MCAP with rosbags-convert"
         )
     return "is a log already; replay it as it is"
 

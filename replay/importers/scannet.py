@@ -24,6 +24,7 @@ from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import NYU40
 from semantic_mapper.replay.importers.base import (
+    PICTURES,
     BadFrameError,
     DepthScale,
     ImportOptions,
@@ -31,6 +32,7 @@ from semantic_mapper.replay.importers.base import (
     Skipped,
     check_frame_pose,
     numbered_files,
+    read_depth,
     read_depth_if_there,
     read_matrix,
     read_plane,
@@ -63,11 +65,12 @@ class ScanNetRecording:
         self._folder = folder
         self._camera_id = options.camera_id
         self._hz = options.frame_hz or SENSOR_HZ
-        self._color = list(numbered_files(folder / "color", (".jpg", ".jpeg", ".png")).items())
-        self._depth = numbered_files(folder / "depth", (".png",))
-        self._poses = numbered_files(folder / "pose", (".txt",))
+        self._color = list(numbered_files(folder / "color", PICTURES, self.notices).items())
+        self._depth = numbered_files(folder / "depth", (".png", ".npy"), self.notices)
+        self._without_depth = options.without_depth
+        self._poses = numbered_files(folder / "pose", (".txt",), self.notices)
         names = [name for name in ("label-filt", "label") if (folder / name).is_dir()]
-        self._labels = numbered_files(folder / names[0], (".png",)) if names else {}
+        self._labels = numbered_files(folder / names[0], (".png",), self.notices) if names else {}
         self._has_label = bool(self._labels)
         self._nyu40_of_raw = self._read_table()
         self._color_intrinsics = self._read_intrinsics("color", [file for _, file in self._color])
@@ -93,7 +96,8 @@ class ScanNetRecording:
         name, color_file = self._color[number]
         pose = self._pose(name)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth = read_depth_if_there(self._depth.get(name), self.depth_scale, size)
+        depth_file = None if self._without_depth else self._depth.get(name)
+        depth = read_depth_if_there(depth_file, self.depth_scale, size)
         rgb, encoded = self._rgb(color_file)
         label, label_error = None, None
         if self._has_label:
@@ -185,9 +189,16 @@ class ScanNetRecording:
         candidates = [self._folder / "intrinsic" / f"intrinsic_{which}.txt", self._folder / f"intrinsics_{which}.txt"]
         file = next((candidate for candidate in candidates if candidate.exists()), candidates[0])
         K = read_matrix(file)
+        if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]) or np.any(np.abs(K[[1, 2, 2], [0, 0, 1]]) > 1e-9):
+            raise ImportSourceError(f"{file}: is no matrix of a camera without skew, which is the one that is read")
         for image in images:
             try:
                 height, width = read_rgb(image)[0].shape[:2] if which == "color" else read_depth_size(image)
+                if not (0.25 * width < K[0, 2] < 0.75 * width and 0.25 * height < K[1, 2] < 0.75 * height):
+                    raise ImportSourceError(
+                        f"{file}: its principal point ({K[0, 2]:g}, {K[1, 2]:g}) is far from the middle of images of "
+                        f"{width}x{height}: they were resized, or cut; scale the matrix with them"
+                    )
                 return CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height)
             except BadFrameError:  # reported when its turn comes
                 continue
@@ -210,7 +221,7 @@ def read_depth_size(file: Path) -> tuple[int, int]:
     Raises:
         BadFrameError: it cannot be read.
     """
-    height, width = read_plane(file, "uint16", None, "depth").shape
+    height, width = read_depth(file, DEPTH_SCALE, None).shape
     return height, width
 
 

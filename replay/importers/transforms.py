@@ -1,39 +1,62 @@
 """``transforms.json`` of nerfstudio and instant-ngp: pictures with poses, in OpenGL's camera axes.
 
 The layout is that of https://docs.nerf.studio/quickstart/data_conventions.html: ``fl_x fl_y cx cy w h`` and lens ``k1
-k2 k3 p1 p2`` (or ``camera_angle_x``) for all frames or in a frame, and ``frames`` with ``file_path`` and
-``transform_matrix`` (camera to world). The first pixel's centre is at 0.5. With ``depth_file_path`` (16-bit PNG,
-millimetres unless ``depth_unit_scale_factor`` says otherwise) poses are in metres, otherwise in a unit of their own.
-A given scale makes metres of the poses alone: depth images have a unit that the file tells, and poses of structure from
-motion with the depth of a sensor are the case in which both differ.
+k2 k3 p1 p2`` (or ``camera_angle_x``, ``camera_angle_y``) for all frames or in a frame, and ``frames`` with ``file_path``
+and ``transform_matrix`` (camera to world). The first pixel's centre is at 0.5. ``camera_model`` OPENCV_FISHEYE, or
+instant-ngp's ``is_fisheye``, means OpenCV's fisheye lens, ``k1 k2 k3 k4``.
+
+With ``depth_file_path`` (16-bit PNG, millimetres unless ``depth_unit_scale_factor`` says otherwise) poses are in metres,
+otherwise in a unit of their own. A given scale makes metres of the poses alone: such depth images have a unit that the
+file tells, and poses of structure from motion with the depth of a sensor are the case in which both differ. The depth
+of instant-ngp, ``depth_path``, is in the unit of the poses, times ``integer_depth_scale``, and is scaled with them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import read_json
+from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.files import numeric_order
-from semantic_mapper.replay.importers.base import DepthScale, ImportOptions, read_rgb
-from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures, inside
-from semantic_mapper.types import CameraIntrinsics
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers.base import (
+    BadFrameError,
+    DepthScale,
+    ImportOptions,
+    convert_known,
+    inside,
+    read_depth,
+    read_plain_json,
+    read_rgb,
+    unknown_keys,
+    unknown_notice,
+)
+from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures
+from semantic_mapper.types import CameraIntrinsics, Float64
 
 FILE = "transforms.json"
-PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+MAX_BYTES = 1 << 29  # hours of frames at 60 Hz
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # Blender's data sets leave them out
+_NEUTRAL = (  # they turn or fit the world, or are of training
+    "applied_transform", "aabb_scale", "orientation_override", "auto_scale_poses_override", "enable_depth_loading",
+)  # fmt: skip
+_OTHER_AXES = ("from_mitsuba", "from_na")  # instant-ngp's flags for poses of another convention
+_MILLIMETRES = 100.0  # depth as numbers with a point and this median is no longer in metres
 
 
 class _Lens(msgspec.Struct, kw_only=True):
     """Of a frame, or of all of them."""
 
     camera_model: str | None = None
+    is_fisheye: bool | None = None
     camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
     fl_x: float | None = None
     fl_y: float | None = None
     cx: float | None = None
@@ -43,91 +66,195 @@ class _Lens(msgspec.Struct, kw_only=True):
     k1: float | None = None
     k2: float | None = None
     k3: float | None = None
+    k4: float | None = None
+    k5: float | None = None
+    k6: float | None = None
     p1: float | None = None
     p2: float | None = None
 
 
 class _Frame(_Lens, kw_only=True):
     file_path: str
-    transform_matrix: list[list[float]]
+    transform_matrix: list[list[float]] | None = None
     depth_file_path: str | None = None
+    depth_path: str | None = None
 
 
 class _Transforms(_Lens, kw_only=True):
-    frames: list[_Frame]
-    depth_unit_scale_factor: float = 0.001
+    frames: list[dict[str, Any]]
+    depth_unit_scale_factor: float | None = None
+    integer_depth_scale: float | None = None
+    from_mitsuba: bool | None = None
+    from_na: bool | None = None
 
 
 def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     """A data set of nerfstudio or instant-ngp, opened.
 
     Raises:
-        ImportSourceError: the file is missing or of another form, or a lens that is no pinhole camera's.
+        ImportSourceError: the file is missing or of another form, or a lens that cannot be undone.
     """
     file = folder / FILE
-    try:
-        found = read_json(file, _Transforms)
-    except ConfigError as error:
-        raise ImportSourceError(str(error)) from error
-    if not 0 < found.depth_unit_scale_factor < 1e3:
-        raise ImportSourceError(f"{file}: depth_unit_scale_factor {found.depth_unit_scale_factor:g} cannot be")
-    pictures = [_picture(folder, found, frame, number) for number, frame in enumerate(found.frames)]
+    plain = cast("dict[str, Any]", read_plain_json(file, MAX_BYTES))
+    found = convert_known(plain, _Transforms, str(file))
+    for name in _OTHER_AXES:
+        if getattr(found, name):
+            raise ImportSourceError(f"{file}: '{name}' means poses in other axes than OpenGL's, which are not read")
+    frames = [convert_known(frame, _Frame, f"{file}, frame {n}") for n, frame in enumerate(found.frames)]
+    notices = unknown_notice(file, [*unknown_keys([plain], _Transforms, _NEUTRAL), *unknown_keys(found.frames, _Frame)])
+    size = _common_size(folder, found, frames)
+    pictures: list[PosedPicture] = []
+    left_out: list[str] = []
+    for number, frame in enumerate(frames):
+        try:
+            pictures.append(_picture(folder, found, frame, size, f"{file}, frame {number} ('{frame.file_path[:80]}')"))
+        except BadFrameError as error:
+            left_out.append(str(error))
+    if left_out:
+        notices.append(f"{counted(len(left_out), 'frame')} of {len(frames)} left out; the first: {left_out[0]}")
+    if not pictures and left_out:
+        raise ImportSourceError(f"{folder}: holds no posed picture: {left_out[0]}")
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
-    scale = DepthScale(1 / found.depth_unit_scale_factor, file)
-    measured = any(picture.depth_file is not None and picture.depth_file.is_file() for picture in pictures)
+    scale, measured, said = _depth_scale(file, found, frames, pictures, options)
     opened = PosedPictures("transforms", folder, pictures, options, depth_scale=scale, metric=measured)
-    if measured and options.scale is not None:
-        opened.notices.append(
-            f"--scale {options.scale:g} is of the poses; the depth images keep their own unit: {scale}; if depth has "
-            f"the unit of the poses, multiply depth_unit_scale_factor by {options.scale:g}, too"
-        )
+    opened.notices += [*notices, *said]
     return opened
 
 
-def _picture(folder: Path, all_frames: _Transforms, frame: _Frame, number: int) -> PosedPicture:
-    where = f"{folder / FILE}, frame {number} ('{frame.file_path[:80]}')"
-    named = inside(folder, frame.file_path)
-    image = next((p for s in _SUFFIXES if (p := named.with_name(named.name + s)).is_file()), named)
-    try:
-        T_world_gl = np.array(frame.transform_matrix, np.float64)
-        if T_world_gl.shape == (3, 4):
-            T_world_gl = np.vstack((T_world_gl, (0, 0, 0, 1)))
-        if T_world_gl.shape != (4, 4):
-            raise ValueError(f"it is {'x'.join(map(str, T_world_gl.shape))}")
-    except ValueError as error:
-        raise ImportSourceError(f"{where}: transform_matrix has to be 4x4 numbers: {error}") from error
-    depth = None if frame.depth_file_path is None else inside(folder, frame.depth_file_path)
-    return PosedPicture(image, _intrinsics(all_frames, frame, image, where), T_world_gl @ GL_AXES, depth)
-
-
-def _intrinsics(all_frames: _Lens, frame: _Lens, image: Path, where: str) -> CameraIntrinsics:
-    def value(name: str) -> Any:
-        own = getattr(frame, name)
-        return getattr(all_frames, name) if own is None else own
-
-    model = value("camera_model") or "OPENCV"
-    if model.upper() not in PINHOLE_MODELS:
-        raise ImportSourceError(f"{where}: camera_model '{model}' is no pinhole camera; undistort the images first")
-    width, height = value("w"), value("h")
-    if width is None or height is None:
-        rgb, _ = read_rgb(image)
-        height, width = rgb.shape[:2]
-    fx, fy = value("fl_x"), value("fl_y")
-    if fx is None and value("camera_angle_x") is not None and 0 < value("camera_angle_x") < math.pi:
-        fx = width / 2 / math.tan(value("camera_angle_x") / 2)
-    if fx is None:
-        raise ImportSourceError(f"{where}: has no focal length: fl_x, or camera_angle_x")
-    cx, cy = value("cx"), value("cy")
-    lens = tuple(float(value(name) or 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
-    try:
-        return CameraIntrinsics(
-            float(fx),
-            float(fx if fy is None else fy),
-            (width / 2 if cx is None else cx) - 0.5,
-            (height / 2 if cy is None else cy) - 0.5,
-            int(width),
-            int(height),
-            lens if any(lens) else (),
+def _depth_scale(
+    file: Path, found: _Transforms, frames: Sequence[_Frame], pictures: Sequence[PosedPicture], options: ImportOptions
+) -> tuple[DepthScale, bool, list[str]]:
+    """Of the depth images, whether there is one that makes the poses metres, and what is to be said of them."""
+    there = [
+        picture.depth_file for picture in pictures if picture.depth_file is not None and picture.depth_file.is_file()
+    ]
+    if any(frame.depth_path and not frame.depth_file_path for frame in frames):
+        if any(frame.depth_file_path for frame in frames):
+            raise ImportSourceError(f"{file}: has depth_file_path and depth_path, of two units; keep one of them")
+        factor = found.integer_depth_scale or 0.0
+        if not 0 < factor < 1e3:
+            if options.without_depth:
+                return DepthScale(1000.0, convention="not read"), False, []
+            raise ImportSourceError(
+                f"{file}: depth_path needs integer_depth_scale, the unit of the poses per number of the depth images; "
+                "write it, or import without depth (--topic depth=none)"
+            )
+        units = 1 / (factor * (options.scale or 1.0))
+        return DepthScale(units, file, float_units_per_m=units), False, []
+    factor = 0.001 if found.depth_unit_scale_factor is None else found.depth_unit_scale_factor
+    if not 0 < factor < 1e3:
+        raise ImportSourceError(f"{file}: depth_unit_scale_factor {factor:g} cannot be")
+    said: list[str] = []
+    scale = DepthScale(1 / factor, file, float_units_per_m=1 / factor)
+    if found.depth_unit_scale_factor is None:
+        scale = DepthScale(
+            1000.0, convention="nerfstudio's millimetres; another unit belongs into depth_unit_scale_factor"
         )
-    except FrameError as error:
+        numpy = next((depth for depth in there if depth.suffix == ".npy"), None)
+        if numpy is not None and not options.without_depth:
+            scale, sentence = _numpy_scale(numpy, scale)
+            said.append(sentence)
+    measured = bool(there) and not options.without_depth
+    if measured and options.scale is not None:
+        said.append(
+            f"--scale {options.scale:g} is of the poses; the depth images keep their own unit: {scale}; if depth has "
+            f"the unit of the poses, multiply depth_unit_scale_factor by {options.scale:g}, too"
+        )
+    return scale, measured, said
+
+
+def _numpy_scale(file: Path, scale: DepthScale) -> tuple[DepthScale, str]:
+    """The unit of depth as NumPy's numbers with a point, which the file does not tell: metres or millimetres."""
+    try:
+        depth = read_depth(file, scale, None)
+    except BadFrameError:  # reported when its turn comes
+        depth = np.zeros((1, 1), np.float32)
+    median = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+    units, name = (1000.0, "millimetres") if median > _MILLIMETRES else (1.0, "metres")
+    sentence = f"depth of NumPy's files is taken as {name} (half of the first is below {median:.4g}); "
+    return (
+        DepthScale(scale.units_per_m, convention=scale.convention, float_units_per_m=units),
+        sentence + "depth_unit_scale_factor says otherwise",
+    )
+
+
+def _common_size(folder: Path, found: _Transforms, frames: Sequence[_Frame]) -> tuple[int, int] | None:
+    """(width, height) of the first picture that can be read, for files that do not tell it; None = none."""
+    if found.w is not None and found.h is not None:
+        return None
+    for frame in frames:
+        try:
+            rgb, _ = read_rgb(_image(folder, frame))
+            return rgb.shape[1], rgb.shape[0]
+        except (BadFrameError, ImportSourceError):  # reported when its turn comes
+            continue
+    return None
+
+
+def _image(folder: Path, frame: _Frame) -> Path:
+    named = inside(folder, frame.file_path)
+    return next((p for s in _SUFFIXES if (p := named.with_name(named.name + s)).is_file()), named)
+
+
+def _picture(
+    folder: Path, all_frames: _Transforms, frame: _Frame, size: tuple[int, int] | None, where: str
+) -> PosedPicture:
+    image = _image(folder, frame)
+    T_world_gl = _matrix(frame.transform_matrix, image)
+    depth = frame.depth_file_path or frame.depth_path
+    lens = _intrinsics(all_frames, frame, size, where)
+    return PosedPicture(image, lens, T_world_gl @ GL_AXES, None if not depth else inside(folder, depth))
+
+
+def _matrix(rows: list[list[float]] | None, image: Path) -> Float64:
+    if rows is None:
+        raise BadFrameError(image, "has no transform_matrix")
+    try:
+        T = np.array(rows, np.float64)
+    except ValueError as error:
+        raise BadFrameError(image, f"transform_matrix has to be 4x4 numbers: {error}") from error
+    if T.shape == (3, 4):
+        T = np.vstack((T, (0, 0, 0, 1)))
+    if T.shape != (4, 4):
+        raise BadFrameError(image, f"transform_matrix has to be 4x4 numbers: it is {'x'.join(map(str, T.shape))}")
+    return T
+
+
+def _intrinsics(all_frames: _Lens, frame: _Lens, size: tuple[int, int] | None, where: str) -> CameraIntrinsics:
+    values = {name: own if own is not None else getattr(all_frames, name) for name, own in _fields(frame).items()}
+    width, height = values["w"], values["h"]
+    if width is None or height is None:
+        if size is None:
+            raise ImportSourceError(f"{where}: has no w and h, and no picture that tells them")
+        width, height = size
+    fx = values["fl_x"] or _focal(values["camera_angle_x"], width)
+    fy = values["fl_y"] or _focal(values["camera_angle_y"], height)
+    fx, fy = fx or fy, fy or fx
+    if fx is None or fy is None:
+        raise ImportSourceError(f"{where}: has no focal length: fl_x, or camera_angle_x")
+    cx = width / 2 if values["cx"] is None else values["cx"]
+    cy = height / 2 if values["cy"] is None else values["cy"]
+    k1, k2, k3, k4, p1, p2 = (values[name] or 0.0 for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = values["camera_model"] or "OPENCV"
+    if values["is_fisheye"] or model.upper() == "OPENCV_FISHEYE":
+        model, lens, left = "OPENCV_FISHEYE", (k1, k2, k3, k4), {"p1": p1, "p2": p2}
+    else:
+        lens, left = (k1, k2, p1, p2, k3), {"k4": k4}
+    left |= {name: values[name] or 0.0 for name in ("k5", "k6")}
+    strange = [name for name, value in left.items() if value]
+    if strange:
+        raise ImportSourceError(
+            f"{where}: camera_model '{model}' has no {', '.join(strange)} that programs agree on; undistort the images first"
+        )
+    try:
+        return lens_intrinsics(model, lens, (fx, fy, cx - 0.5, cy - 0.5), (int(width), int(height)))
+    except (ConfigError, FrameError) as error:
         raise ImportSourceError(f"{where}: {error}") from error
+
+
+def _fields(lens: _Lens) -> Mapping[str, Any]:
+    return {name: getattr(lens, name) for name in _Lens.__struct_fields__}
+
+
+def _focal(angle: float | None, side: float) -> float | None:
+    return side / 2 / math.tan(angle / 2) if angle is not None and 0 < angle < math.pi else None

@@ -3,12 +3,15 @@
 Each colour image gets the depth image nearest in time (each depth image once) and the pose interpolated between its two
 neighbours. A frame without a depth image within 20 ms comes without depth, and one without a pose is left out. Depth is
 registered to colour, with 5000 units per metre where ``intrinsics.json`` does not give another ``depth_scale``.
+The lens distortion of the calibration is undone in both.
 Intrinsics come from ``intrinsics.json`` where the folder has one (same layout as in a sequence folder), else from the
 calibration published for freiburg1, 2 or 3, by the folder's name, else the default of the sensor's ROS driver.
 """
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import interpolate_pose, pose_matrix
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
@@ -23,12 +27,14 @@ from semantic_mapper.replay.importers.base import (
     LoadedFrame,
     check_frame_pose,
     image_size_must_be,
+    inside,
     read_depth,
     read_lines,
     read_rgb,
     seconds_to_ns,
+    split_row,
 )
-from semantic_mapper.replay.importers.folder import read_intrinsics
+from semantic_mapper.replay.importers.folder import read_intrinsics, rectifier
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
@@ -37,9 +43,9 @@ MAX_NORM_ERROR = 0.1  # of a unit quaternion: files have few digits, and are nor
 _POSE_GAP_NS = 200_000_000  # poses come at 100 Hz; over a longer gap nothing is interpolated
 
 _CALIBRATIONS = {
-    "freiburg1": CameraIntrinsics(517.3, 516.5, 318.6, 255.3, 640, 480),
-    "freiburg2": CameraIntrinsics(520.9, 521.0, 325.1, 249.7, 640, 480),
-    "freiburg3": CameraIntrinsics(535.4, 539.2, 320.1, 247.6, 640, 480),
+    "freiburg1": CameraIntrinsics(517.3, 516.5, 318.6, 255.3, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": CameraIntrinsics(520.9, 521.0, 325.1, 249.7, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": CameraIntrinsics(535.4, 539.2, 320.1, 247.6, 640, 480),  # its images are rectified
 }
 _DEFAULT = CameraIntrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 
@@ -60,14 +66,18 @@ class TumRecording:
         self.depth_scale = DEPTH_SCALE
         self._folder = folder
         self._options = options
-        self._intrinsics = self._read_intrinsics()
+        self._measured = self._read_intrinsics()
+        self._rectify = rectifier(self._measured, folder / "intrinsics.json")
+        self._intrinsics = self._rectify.intrinsics
         self._color = self._read_list(folder / "rgb.txt")
         if not self._color:
             raise ImportSourceError(
                 "; ".join((f"{folder / 'rgb.txt'}: holds no line 'stamp file'", *self.notices[-1:]))
             )
-        depth = self._read_depth_list()
-        self._pose_stamps, self._poses = read_trajectory(folder / "groundtruth.txt", self.notices)
+        depth = [] if options.without_depth else self._read_depth_list()
+        trajectory = read_trajectory(folder / "groundtruth.txt")
+        self._pose_stamps, self._poses = trajectory.stamps_ns, trajectory.rows
+        self.notices += [*trajectory.left_out, *trajectory.remarks]
         self._depth_of = match_nearest(
             np.array([stamp for stamp, _ in self._color], np.int64),
             np.array([stamp for stamp, _ in depth], np.int64),
@@ -95,35 +105,32 @@ class TumRecording:
         if pose is None:
             raise BadFrameError(file, f"groundtruth.txt has no pose near its time {stamp / 1e9:.6f}")
         rgb, encoded = read_rgb(file)
-        image_size_must_be(rgb, self._intrinsics, file)
-        size = (self._intrinsics.height, self._intrinsics.width)
+        image_size_must_be(rgb, self._measured, file)
+        size = (self._measured.height, self._measured.width)
+        bent = self._measured.distorted
         match = self._depth_of[number]
         depth = read_depth(self._depth_files[match], self.depth_scale, size) if match >= 0 else None
         frame = PosedFrame(
             stamp_ns=stamp,
             seq=number,
             camera_id=self._options.camera_id,
-            rgb=rgb,
-            depth_m=depth,
+            rgb=self._rectify(np.ascontiguousarray(rgb[..., ::-1])) if bent else rgb,
+            depth_m=None if depth is None else self._rectify.nearest(depth),
             label=None,
             intrinsics=self._intrinsics,
             T_world_camera=check_frame_pose(pose, self._folder / "groundtruth.txt"),
         )
-        return LoadedFrame(frame, encoded)
+        return LoadedFrame(frame, None if bent else encoded)
 
     def _read_intrinsics(self) -> CameraIntrinsics:
         file = self._folder / "intrinsics.json"
         if file.exists():
-            intrinsics, given, _ = read_intrinsics(file)
+            intrinsics, given, _ = read_intrinsics(file, self.notices)
             self.depth_scale = given or DEPTH_SCALE
             return intrinsics
         name = self._folder.resolve().name
         for key, calibration in _CALIBRATIONS.items():
             if key in name:
-                if key != "freiburg3":
-                    self.notices.append(
-                        f"the lens distortion of {key} is not undone; rectify the images for best results"
-                    )
                 return calibration
         self.notices.append("no intrinsics.json and no freiburg1, 2 or 3 in the name: the ROS default f = 525 is used")
         return _DEFAULT
@@ -137,54 +144,75 @@ class TumRecording:
 
     def _read_list(self, file: Path) -> list[tuple[int, Path]]:
         entries: list[tuple[int, Path]] = []
+        seen: set[int | Path] = set()
+        back = 0
         for line, text in read_lines(file):
-            words = text.split(maxsplit=1)
+            words = re.split(r"[,;\s]+", text.strip(), maxsplit=1)
             try:
-                entries.append((seconds_to_ns(words[0]), self._inside(words[1].strip())))
-            except (ValueError, IndexError) as error:
+                stamp_ns, picture = seconds_to_ns(words[0]), inside(self._folder, words[1].strip())
+                if stamp_ns in seen or picture in seen:
+                    raise ValueError("its stamp or file is there already")
+            except (ValueError, IndexError, ImportSourceError) as error:
                 self.notices.append(f"{file}, line {line} is passed over: expected 'stamp file' ({error})")
+                continue
+            back += bool(entries) and stamp_ns < entries[-1][0]
+            seen |= {stamp_ns, picture}
+            entries.append((stamp_ns, picture))
+        if back:
+            self.notices.append(f"{file}: stamps go back {counted(back, 'time')}; frames are sorted by them")
         return sorted(entries, key=lambda entry: entry[0])
 
-    def _inside(self, name: str) -> Path:
-        path = self._folder / name
-        if not path.resolve().is_relative_to(self._folder.resolve()):
-            raise ValueError(f"'{name}' lies outside the recording")
-        return path
 
-
-def read_trajectory(file: Path, notices: list[str]) -> tuple[NDArray[np.int64], Float64]:
-    """Poses of a trajectory file, in order of time: stamps (N,) in nanoseconds, rows (N, 7) tx ty tz qx qy qz qw.
+@dataclass(frozen=True, slots=True, eq=False)
+class TrajectoryFile:
+    """What a trajectory file holds.
 
     Args:
-        file: Lines ``stamp tx ty tz qx qy qz qw``, stamps in seconds.
-        notices: Gets a sentence for every line that is passed over.
+        stamps_ns: (N,) rising.
+        rows: (N, 7) tx ty tz qx qy qz qw.
+        left_out: A sentence on every line that is passed over.
+        remarks: Sentences on what is odd about the others.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    rows: Float64
+    left_out: list[str]
+    remarks: list[str]
+
+
+def read_trajectory(file: Path) -> TrajectoryFile:
+    """Read lines ``stamp tx ty tz qx qy qz qw``, stamps in seconds.
 
     Raises:
         ImportSourceError: the file is missing or holds no pose.
     """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    first = ""
+    found: dict[int, list[float]] = {}
+    left_out: list[str] = []
+    remarks: list[str] = []
+    back, last_ns = 0, -1
     for line, text in read_lines(file):
-        words = text.split()
+        words = split_row(text)
         try:
-            stamp, row = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
+            stamp_ns, row = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
             if len(row) != 7 or not np.isfinite(row).all():
                 raise ValueError("not 3 numbers of a position and 4 of a unit quaternion")
             if abs(np.linalg.norm(row[3:]) - 1) > MAX_NORM_ERROR:
                 raise ValueError(
                     f"its quaternion has length {np.linalg.norm(row[3:]):.3g}, not 1; the order is qx qy qz qw"
                 )
+            if found.get(stamp_ns, row) != row:
+                raise ValueError("a second pose of this stamp; the first counts")
         except (ValueError, IndexError) as error:
-            notices.append(f"{file}, line {line} is passed over: {error}")
-            first = first or f"; line {line}: {error}"
+            left_out.append(f"{file}, line {line} is passed over: {error}")
             continue
-        stamps.append(stamp)
-        rows.append(row)
-    if not rows:
-        raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'{first}")
-    order = np.argsort(stamps, kind="stable")
-    return np.array(stamps, np.int64)[order], np.array(rows, np.float64)[order]
+        back += stamp_ns < last_ns
+        found[stamp_ns], last_ns = row, stamp_ns
+    if not found:
+        raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'{'; '.join(['', *left_out[:1]])}")
+    if back:
+        remarks.append(f"{file}: stamps go back {counted(back, 'time')}; poses are sorted by them")
+    order = sorted(found)
+    return TrajectoryFile(np.array(order, np.int64), np.array([found[s] for s in order], np.float64), left_out, remarks)
 
 
 def match_nearest(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], within_ns: int) -> list[int]:

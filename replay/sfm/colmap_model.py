@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from semantic_mapper.errors import FrameError, ImportSourceError
+from semantic_mapper.drivers.lens import lens_intrinsics
+from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.files import numeric_order, read_regular
 from semantic_mapper.geometry import invert_pose, pose_matrix
 from semantic_mapper.types import CameraIntrinsics, Float64, Int64
@@ -73,12 +74,20 @@ class ColmapModel:
     errors_px: dict[int, float]
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder of a model: this one, or ``sparse/0``, ``sparse`` or ``colmap/sparse/0`` below it; None = none."""
-    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
-        if any(all((place / f"{name}.{kind}").exists() for name in _NAMES[:2]) for kind in ("bin", "txt")):
-            return place
-    return None
+def find_models(folder: Path) -> list[Path]:
+    """Folders of models: this one, or else those in ``sparse`` or ``colmap/sparse`` below it, by their numbers."""
+    for place in (folder, folder / "sparse", folder / "colmap" / "sparse"):
+        below = sorted(place.iterdir(), key=lambda path: numeric_order(path.name)) if place.is_dir() else []
+        found = (
+            [path for path in (place, *below) if _is_model(path)] if place != folder else [folder] * _is_model(folder)
+        )
+        if found:
+            return found
+    return []
+
+
+def _is_model(place: Path) -> bool:
+    return any(all((place / f"{name}.{kind}").is_file() for name in _NAMES[:2]) for kind in ("bin", "txt"))
 
 
 def read_model(folder: Path) -> ColmapModel:
@@ -112,27 +121,22 @@ def intrinsics_of(model: str, width: int, height: int, params: list[float], wher
     """A camera of COLMAP's as OpenCV's model.
 
     Raises:
-        ImportSourceError: a fisheye or another lens that OpenCV's pinhole model does not have, or impossible values.
+        ImportSourceError: a lens that neither OpenCV's pinhole nor its fisheye model has, or impossible values.
     """
     wanted = dict(MODELS.values()).get(model)
     if wanted is None or wanted != len(params):
         raise ImportSourceError(f"{where}: camera model '{model}' with {len(params)} parameters is not known")
-    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        fx, fy, cx, cy, *lens = (params[0], *params)
-    else:
-        fx, fy, cx, cy, *lens = params
-    if model in ("SIMPLE_RADIAL", "RADIAL"):
-        lens = [*lens, *[0.0] * (4 - len(lens))]
-    elif model == "FULL_OPENCV":
-        lens = [*lens]  # k1 k2 p1 p2 k3 k4 k5 k6, as OpenCV orders them
-    elif model not in ("SIMPLE_PINHOLE", "PINHOLE", "OPENCV"):
+    one_focal = model.startswith(("SIMPLE", "RADIAL"))
+    fx, fy, cx, cy, *lens = (params[0], *params) if one_focal else params
+    fisheye = model in ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+    if not fisheye and model not in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"):
         raise ImportSourceError(
             f"{where}: the lens model '{model}' is not read; undistort the images (`colmap image_undistorter`) and "
             "import the model that comes out"
         )
     try:
-        return CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, width, height, tuple(lens) if any(lens) else ())
-    except FrameError as error:
+        return lens_intrinsics("fisheye" if fisheye else "opencv", lens, (fx, fy, cx - 0.5, cy - 0.5), (width, height))
+    except (ConfigError, FrameError) as error:
         raise ImportSourceError(f"{where}: {error}") from error
 
 

@@ -49,11 +49,14 @@ NEIGHBOURS_M, NEIGHBOURS_DEG = 2.0, 40.0  # what counts as its neighbourhood
 FAR = 2  # times the range of the map; depth beyond may be noise
 STEP = 3  # every n rows and columns of a keyframe's small depth image
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_REP_103 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # T_body_camera
+ALIKE = 0.8  # of the overlap that keyframes have as they are; a cause that leaves less has but moved them apart
 
 # What is often wrong with a recording, as the change that would mend it.
 _CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
     ("poses inverted (they are T_camera_world; T_world_camera is needed)", invert_pose, 1.0),
     ("camera axes turned from OpenGL's (y up, z backward) to OpenCV's", lambda T: T @ _OPENGL, 1.0),
+    ("camera axes turned from a robot's (REP 103: x forward, y left, z up) to OpenCV's", lambda T: T @ _REP_103, 1.0),
     ("translations divided by 1000 (they are millimetres)", lambda T: _scaled(T, 0.001), 1.0),
     ("depth divided by 5 (scale 5000, not 1000)", lambda T: T, 0.2),
     ("depth multiplied by 5 (scale 1000, not 5000)", lambda T: T, 5.0),
@@ -156,6 +159,8 @@ class PoseCheck:
             f"{what}, found at frame seq={own[-1].seq}: the map cannot be trusted. Check the poses (T_world_camera, "
             "OpenCV axes, metres, stamps), the depth scale and the intrinsics"
         )
+        needed = ALIKE * _overlap(own, self._limit_m)
+        best, least = "", min(MAX_DISAGREEMENT, recent) / 2
         for cause, change, depth_factor in _CAUSES:
             changed = [
                 replace(k, T_world_camera=change(k.T_world_camera), depth_m=k.depth_m * np.float32(depth_factor))
@@ -163,12 +168,12 @@ class PoseCheck:
             ]
             pairs = [disagreement([pair], self._limit_m) for pair in pairwise(changed)]
             singles = [d for d in pairs if d is not None]
-            if len(singles) < MIN_KEYFRAMES - 1:
+            if len(singles) < MIN_KEYFRAMES - 1 or _overlap(changed, self._limit_m) < needed:
                 continue
             then = float(np.median(singles))
-            if then < min(MAX_DISAGREEMENT, recent) / 2:
-                return f"{text}. With {cause} they disagree by {100 * then:.1f} %"
-        return text
+            if then < least:
+                best, least = f". With {cause} they disagree by {100 * then:.1f} %", then
+        return text + best
 
 
 def disagreement(pairs: Sequence[tuple[Keyframe, Keyframe]], limit_m: float) -> float | None:
@@ -185,6 +190,12 @@ def disagreement(pairs: Sequence[tuple[Keyframe, Keyframe]], limit_m: float) -> 
     if sum(map(len, parts)) < MIN_PIXELS:
         return None
     return float(np.percentile(np.abs(np.concatenate(parts)), QUARTILE))
+
+
+def _overlap(keyframes: Sequence[Keyframe], limit_m: float) -> float:
+    """Fraction of the pixels of each keyframe that fall on depth of the next one, mean."""
+    found = [_differences(a, b, limit_m) for a, b in pairwise(keyframes)]
+    return float(np.mean([len(differences) / max(of, 1) for differences, of in found])) if found else 0.0
 
 
 def fraction_seen_through(a: Keyframe, b: Keyframe, limit_m: float) -> float | None:

@@ -198,7 +198,7 @@ class VoxelMap:
         """
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
-        if any(frame.intrinsics.distortion):
+        if frame.intrinsics.distorted:
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
         given = check_depth(depth_m, frame.intrinsics, where)
         depth, weights = trusted_depth(given, trust, where)

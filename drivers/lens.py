@@ -1,0 +1,119 @@
+"""Lens models by the names that ROS, Kalibr, COLMAP, OpenSfM and nerfstudio give them, as OpenCV's two.
+
+A lens is judged by its values: zeros at the end of the coefficients say nothing, and missing ones are zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float64
+
+# Coefficients in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty.
+_PINHOLE = (
+    "", "none", "pinhole", "perspective", "opencv", "full_opencv", "plumb_bob", "radtan", "radial_tangential", "brown",
+    "rational_polynomial", "thin_prism", "radial", "simple_radial", "simple_pinhole", "standard",
+)  # fmt: skip
+_FISHEYE = ("equidistant", "equi", "fisheye", "opencv_fisheye", "fisheye_opencv", "kannala_brandt", "kannala_brandt4")
+# Other models of a pinhole camera, of which nothing is left where all coefficients are zero.
+_ZERO_IS_PINHOLE = ("brown_conrady", "inverse_brown_conrady", "modified_brown_conrady", "division")
+
+MAX_HALF_VIEW = np.radians(65.0)  # to each side of what a fisheye's image is cut to: a pinhole stretches what is beyond
+_THETAS = np.linspace(0.0, np.pi, 4096)
+
+
+def lens_intrinsics(
+    model: str, coefficients: Sequence[float], k: tuple[float, float, float, float], size: tuple[int, int]
+) -> CameraIntrinsics:
+    """Intrinsics of a camera whose lens has a model by name.
+
+    Args:
+        model: Name of the model, however it is written.
+        coefficients: In OpenCV's order, any number of them.
+        k: fx fy cx cy; pixel centres are integers.
+        size: (width, height).
+
+    Raises:
+        ConfigError: a model that is neither OpenCV's pinhole nor its fisheye, or more coefficients than it has.
+        FrameError: see ``CameraIntrinsics``.
+    """
+    name = model.strip().lower().replace("-", "_")
+    values = [float(value) for value in coefficients]
+    while values and values[-1] == 0:
+        values.pop()
+    if name in _ZERO_IS_PINHOLE and not values:
+        return CameraIntrinsics(*k, *size)
+    if name in _PINHOLE and len(values) <= COEFFICIENTS[-1]:
+        count = next(count for count in COEFFICIENTS if count >= len(values))
+        return CameraIntrinsics(*k, *size, _padded(values, count))
+    if name in _FISHEYE and len(values) <= 4:
+        return FisheyeIntrinsics(*k, *size, _padded(values, 4))
+    if name in _PINHOLE or name in _FISHEYE:
+        raise ConfigError(f"lens model '{model}' with {len(values)} coefficients; it has fewer: calibrate again")
+    raise ConfigError(
+        f"lens model '{model}' is not undone, only OpenCV's pinhole (plumb_bob, radtan, rational_polynomial) and fisheye "
+        "(equidistant): undistort the images first, or calibrate with one of these"
+    )
+
+
+def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
+    """The pinhole camera of the same size whose image a fisheye's fills: square pixels, no wider than the lens sees.
+
+    Raises:
+        ConfigError: the coefficients leave no such image.
+    """
+    distance = _THETAS * (1 + np.polynomial.polynomial.polyval(_THETAS**2, (0.0, *lens.distortion)))
+    rising = int(np.argmax(np.diff(distance, append=-1.0) <= 0)) + 1  # beyond its fold a polynomial means nothing
+
+    def reach(pixels: float, focal: float) -> float:
+        """How far to one side the lens sees, as a slope."""
+        theta = np.interp(max(pixels, 0.0) / focal, distance[:rising], _THETAS[:rising])
+        return float(np.tan(min(theta, MAX_HALF_VIEW)))
+
+    left, right = reach(lens.cx, lens.fx), reach(lens.width - 1 - lens.cx, lens.fx)
+    up, down = reach(lens.cy, lens.fy), reach(lens.height - 1 - lens.cy, lens.fy)
+    try:
+        focal = max((lens.width - 1) / (left + right), (lens.height - 1) / (up + down))
+        cx = (lens.width - 1) / 2 + focal * (left - right) / 2
+        cy = (lens.height - 1) / 2 + focal * (up - down) / 2
+        return CameraIntrinsics(focal, focal, cx, cy, lens.width, lens.height)
+    except (FrameError, ZeroDivisionError) as error:
+        raise ConfigError(
+            f"the fisheye lens {lens.distortion} leaves no usable image ({error}); calibrate the camera again"
+        ) from error
+
+
+def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float64, Float64]:
+    """The ideal pinhole camera of a lens, and where each of its pixels lies in the image of the lens: (H, W) x and y.
+
+    Raises:
+        ConfigError: the lens leaves no image that a pinhole camera could have made.
+    """
+    K, lens, size = (
+        camera_matrix(measured),
+        np.array(measured.distortion, np.float64),
+        (measured.width, measured.height),
+    )
+    if isinstance(measured, FisheyeIntrinsics):
+        ideal = ideal_fisheye_view(measured)
+        x, y = cv2.fisheye.initUndistortRectifyMap(K, lens, np.eye(3), camera_matrix(ideal), size, cv2.CV_32FC1)
+        return ideal, np.asarray(x), np.asarray(y)
+    new, _ = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
+    fx, fy, cx, cy = (float(v) for v in (new[0, 0], new[1, 1], new[0, 2], new[1, 2]))
+    try:
+        ideal = CameraIntrinsics(fx, fy, cx, cy, *size)
+    except FrameError as error:
+        raise ConfigError(
+            f"the lens distortion {measured.distortion} leaves no usable image: {error}; calibrate the camera again"
+        ) from error
+    x, y = cv2.initUndistortRectifyMap(K, lens, np.eye(3), new, size, cv2.CV_32FC1)
+    return ideal, np.asarray(x), np.asarray(y)
+
+
+def _padded(values: Sequence[float], count: int) -> tuple[float, ...]:
+    return (*values, *(0.0 for _ in range(count - len(values))))
