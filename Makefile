@@ -7,9 +7,9 @@ SHELL := /bin/bash
 PYTHON ?= python3
 READY := .venv/.ready
 # Modules whose classes and functions the reference describes; what they import is left out.
-API := semantic_mapper semantic_mapper.types semantic_mapper.geometry semantic_mapper.labels semantic_mapper.config \
-	semantic_mapper.errors semantic_mapper.testing semantic_mapper.mapping.map_types semantic_mapper.fields.base \
-	semantic_mapper.evaluation.metrics
+API := semantic_mapper semantic_mapper.types semantic_mapper.geometry semantic_mapper.rays semantic_mapper.labels \
+	semantic_mapper.config semantic_mapper.errors semantic_mapper.testing semantic_mapper.mapping.map_types \
+	semantic_mapper.fields.base semantic_mapper.evaluation.metrics
 KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 
 # One thread of computation for each of two test processes. A worker that crashes ends the run with an error.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -17,7 +16,7 @@ from semantic_mapper.config import with_old_names
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.overview import ViewStrip, draw_overview
 from semantic_mapper.evaluation.upright import camera_up
-from semantic_mapper.files import write_bytes
+from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
@@ -179,12 +178,6 @@ def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
     if len(items) <= count:
         return list(items)
     return [items[int(i)] for i in np.linspace(0, len(items) - 1, count).round()]
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write JSON atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
 
 
 def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:

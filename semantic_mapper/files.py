@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import codecs
 import fcntl
+import json
 import os
 import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 
@@ -133,6 +134,12 @@ def write_bytes(
     """``Path.write_bytes`` by ``atomic_write``."""
     with atomic_write(path, sync=sync, raises=raises) as file:
         file.write(data)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write JSON atomically; makes the folder where it is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
 
 
 def open_unlinked(path: str | Path, flags: int) -> int:

@@ -1,16 +1,22 @@
-"""Cameras, poses and rays: pure functions. ``p_a = T_a_b @ p_b``; pixel centres are integers; depth is z."""
+"""Cameras and poses: pure functions of numpy arrays. ``p_a = T_a_b @ p_b``; pixel centres are integers; depth is z.
+
+What computes in torch is in ``rays``: most who need geometry need no torch, which takes seconds to load.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import cv2  # SciPy has slerp, too, but a machine that only trains and renders lacks it
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import PoseError, ShapeError
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, RayBatch
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64
+
+if TYPE_CHECKING:
+    import torch
 
 ROTATION_TOLERANCE = 1e-3  # |R^T R - I|: logs store 6 to 9 digits; a real mistake (scale, mirror) is far larger
 # Metres along each axis. Views are rendered in float32, whose steps are 8 mm there: less than half a voxel of 2 cm.
@@ -119,13 +125,6 @@ def invert_pose(T_a_b: Float64) -> Float64:
     return T_b_a
 
 
-def invert_pose_torch(T_a_b: torch.Tensor) -> torch.Tensor:
-    """Return ``T_b_a`` of a rigid transform (..., 4, 4), differentiable."""
-    R_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
-    t_b_a = -(R_b_a @ T_a_b[..., :3, 3:])
-    return torch.cat((torch.cat((R_b_a, t_b_a), -1), T_a_b[..., 3:, :]), -2)
-
-
 def look_at(eye: Float64, target: Float64, up: Float64) -> Float64:
     """Pose (4, 4) of a camera at ``eye`` that looks at ``target``, with image-up along ``up`` (world).
 
@@ -204,57 +203,6 @@ def unproject(depth_m: Float32, intrinsics: CameraIntrinsics) -> Float64:
 def transform(T_a_b: Float64, p_b: Float64) -> Float64:
     """Map points (..., 3) of frame b to frame a."""
     return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-
-
-def pixel_rays(
-    pixels: torch.Tensor,
-    intrinsics: CameraIntrinsics,
-    T_world_camera: torch.Tensor,
-    *,
-    near_m: float,
-    far_m: float,
-    prior_depth_m: torch.Tensor | None = None,
-    measured: torch.Tensor | None = None,
-    stamp_ns: int | None = None,
-) -> RayBatch:
-    """Rays through pixels, in world coordinates (S-Ray Eq. 3 with z as the parameter).
-
-    Args:
-        pixels: (R, 2) float32 as (u, v).
-        intrinsics: Of the query view.
-        T_world_camera: (4, 4) float32.
-        near_m, far_m: z bounds for every ray.
-        prior_depth_m: (R,) z, 0 = none.
-        measured: (R,) bool, where the prior is not filled in; None = wherever there is one.
-        stamp_ns: Of the view.
-    """
-    count = expect_shape(pixels, "R 2", "pixels")["R"]
-    x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx
-    y = (pixels[:, 1] - intrinsics.cy) / intrinsics.fy
-    d_camera = torch.stack((x, y, torch.ones_like(x)), dim=-1)  # (R, 3), z = 1
-    direction = d_camera @ T_world_camera[:3, :3].T
-    origin = T_world_camera[:3, 3].expand(count, 3)
-    if prior_depth_m is None:
-        prior_depth_m = torch.zeros_like(x)
-    return RayBatch(
-        origin=origin,
-        direction=direction,
-        near_m=torch.full_like(x, near_m),
-        far_m=torch.full_like(x, far_m),
-        prior_depth_m=prior_depth_m,
-        measured=measured,
-        stamp_ns=stamp_ns,
-    )
-
-
-def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> torch.Tensor:
-    """All pixels of an image, row by row: (H * W, 2) float32 as (u, v)."""
-    v, u = torch.meshgrid(
-        torch.arange(height, dtype=torch.float32, device=device),
-        torch.arange(width, dtype=torch.float32, device=device),
-        indexing="ij",
-    )
-    return torch.stack((u, v), dim=-1).reshape(-1, 2)
 
 
 def turn_onto(a: Float64, b: Float64) -> Float64:

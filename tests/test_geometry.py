@@ -16,16 +16,14 @@ from semantic_mapper.geometry import (
     check_pose,
     expect_shape,
     invert_pose,
-    invert_pose_torch,
     look_at,
-    pixel_grid,
-    pixel_rays,
     project,
     scale_intrinsics,
     transform,
     unproject,
     yaw_transform,
 )
+from semantic_mapper.rays import invert_pose_torch, pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(fx=100, fy=200, cx=10, cy=20, width=32, height=24)

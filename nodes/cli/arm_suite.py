@@ -16,12 +16,12 @@ from semantic_mapper.benchmark.claims import Claim, ClaimResult, CountTable, Mea
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import Config, convert_config, load_config, to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.files import write_json
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.artifacts import write_json
 
 ArmT = TypeVar("ArmT")
 ConfigT = TypeVar("ConfigT", bound=Config)

@@ -143,7 +143,8 @@ def bench(
 
 def _finish(found: dict[str, Any], output: Output, out: Path | None) -> None:
     """Say where it was measured, and write the file."""
-    from semantic_mapper.replay.artifacts import versions, write_json
+    from semantic_mapper.files import write_json
+    from semantic_mapper.replay.artifacts import versions
 
     found["machine"] = {"cpu": cpu_name(), "versions": versions()}
     output.print(f"on {found['machine']['cpu']}")

@@ -135,11 +135,11 @@ def _evaluate_targets(
     output = Output.guarded()
     output.quiet = print_json
     from semantic_mapper.errors import ConfigError
+    from semantic_mapper.files import write_json
     from semantic_mapper.nodes.cli.outputs import prepare_file, say_replaced
     from semantic_mapper.nodes.cli.report import write_eval_report
     from semantic_mapper.nodes.cli.results import print_results
     from semantic_mapper.nodes.cli.saved_maps import MAP_SUFFIX, is_log
-    from semantic_mapper.replay.artifacts import write_json
 
     for target in targets:
         if target.suffix == MAP_SUFFIX:

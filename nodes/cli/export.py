@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.plain_text import counted
@@ -68,11 +69,8 @@ def export(
     Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """
     output = Output.guarded()
-    from semantic_mapper.errors import ConfigError
-    from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
     from semantic_mapper.nodes.cli.export_log import export_recording
     from semantic_mapper.nodes.cli.saved_maps import is_log
-    from semantic_mapper.replay.exporters.map_files import ExportRequest, format_of, parse_up
 
     if is_log(source):
         given = {"--color": color, "--height": height, "--resolution": resolution, "--floor": floor}
@@ -80,6 +78,9 @@ def export(
         given |= {"--up": up != "auto", "--min-weight": min_weight is not None, "--min-confidence": min_confidence > 0}
         map_options = [name for name, value in given.items() if value]
         return export_recording(output, source, out, format, camera, max_frames, map_options)
+    from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
+    from semantic_mapper.replay.exporters.map_files import ExportRequest, format_of, parse_up
+
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
     kind = format_of(out, format)

@@ -119,8 +119,8 @@ def query(
     if picture is not None and question is not Question.GRAPH:
         raise typer.BadParameter("goes with `graph`", param_hint="--picture")
     output = Output.guarded()
+    from semantic_mapper.files import write_json
     from semantic_mapper.nodes.cli.map_answers import answer_table
-    from semantic_mapper.replay.artifacts import write_json
 
     out, output.quiet = results_file(out, json)
     for path in (out, picture):
@@ -145,7 +145,6 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     Raises:
         ConfigError, MapError, LabelError: no map there, or a question that cannot be answered.
     """
-    from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli import map_answers
     from semantic_mapper.nodes.cli.saved_maps import map_path
     from semantic_mapper.queries.graph import GraphTracker
@@ -154,7 +153,7 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     from semantic_mapper.queries.mirror import MapMirror
     from semantic_mapper.queries.nearest import nearest
 
-    snapshot = MapMirror.of(VoxelMap.load(map_path(Path(source)))).snapshot()
+    snapshot = MapMirror.load(map_path(Path(source))).snapshot()
     match asked.question:
         case Question.INFO:
             return map_answers.describe_map(snapshot)

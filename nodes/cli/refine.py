@@ -58,9 +58,6 @@ def refine(
         raise typer.BadParameter("goes with --weights; without, other classes are smoothed", param_hint="--by-name")
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED, SMOOTHING, find_nesf
-    from semantic_mapper.mapping.refine import refine as refine_map
-    from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.outputs import prepare_file
     from semantic_mapper.nodes.cli.saved_maps import map_path, refuse_overwriting
     from semantic_mapper.replay.exporters.map_files import parse_up
@@ -68,6 +65,10 @@ def refine(
     path, direction = map_path(source), parse_up(up)
     refuse_overwriting(out, path)
     prepare_file(out)
+    from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED, SMOOTHING, find_nesf
+    from semantic_mapper.mapping.refine import refine as refine_map
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+
     voxel_map = VoxelMap.load(path)
     network = find_nesf(weights, voxel_map.label_set)
     with frame_progress("refine", None, unit="tiles") as bar:

@@ -22,7 +22,7 @@ from semantic_mapper.fields.checkpoint import (
 from semantic_mapper.fields.irt import IRT
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.panoptic import Panoptic
-from semantic_mapper.fields.primitives import MAX_INTERVALS
+from semantic_mapper.fields.primitive_rays import MAX_INTERVALS
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet

@@ -163,11 +163,12 @@ def _find_live(source: str, query: str, server: str, keys: Path | None) -> Live:
     """
     from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
     from semantic_mapper.nodes.supervisor.running_launches import launch_folder, node_endpoints
+
+    folder = None if "://" in source else launch_folder(source)
     from semantic_mapper.nodes.viewer.sources import Live
 
-    if "://" in source:
+    if folder is None:
         return Live(source, (), server_identity(server, keys))
-    folder = launch_folder(source)
     nodes = node_endpoints(folder)
     streams = sum(camera in nodes for camera in read_launch_note(folder).names("camera"))
     return Live(f"ipc://{folder}/{query}", tuple(nodes.values()), streams=streams)
@@ -183,7 +184,7 @@ def _show_log(
     stop: StopRequest,
 ) -> None:
     from semantic_mapper.nodes.cli.run_replay import mapper_config
-    from semantic_mapper.nodes.viewer.sources import show_log
+    from semantic_mapper.nodes.viewer.mapped_log import show_log
 
     settings = mapper_config(config, None)
     with frame_progress("map", None) as bar:

@@ -243,9 +243,9 @@ _SCORES = ("miou", "total_accuracy", "average_accuracy", "coverage", "map_miou")
 
 
 def _eval(job: Job) -> Findings:
+    from semantic_mapper.files import write_json
     from semantic_mapper.nodes.cli.report import write_eval_report
     from semantic_mapper.nodes.cli.scoring import ScoreRequest, evaluate_log, score_table
-    from semantic_mapper.replay.artifacts import write_json
 
     settings: EvalSettings = job.settings
     request = ScoreRequest(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from semantic_mapper.files import write_json
 from semantic_mapper.nodes.cli.report import write_replay_report
-from semantic_mapper.replay.artifacts import write_json
 from semantic_mapper.replay.session import MapSession
 
 

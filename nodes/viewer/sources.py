@@ -1,4 +1,4 @@
-"""What the viewer is shown: a saved map, a log that is mapped, or the nodes and the map of a running system."""
+"""What the viewer is shown: a saved map, or the nodes and the map of a running system; logs are in ``mapped_log``."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import MapError, SemanticMapperError, TransportError
-from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.bridge.packing import thinned, thinning
 from semantic_mapper.nodes.map_poses import MapPoses
@@ -23,13 +21,10 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.graph import GraphTracker, find_graph
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.exporters.rerun_log import RerunLog
 from semantic_mapper.replay.exporters.rerun_sdk import rr
-from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.transport.sockets import NewestSubscriber
@@ -63,7 +58,7 @@ class Live:
     refined: bool = False
 
 
-class _MapShow:
+class MapShow:
     """Shows one state of a map after the other."""
 
     def __init__(self, log: RerunLog) -> None:
@@ -109,64 +104,6 @@ def show_saved(path: Path, begin: Begin) -> None:
     log.finish(voxel_map.points(), find_graph(voxel_map))
 
 
-def show_log(
-    path: Path,
-    weights: Path | None,
-    config: MapperConfig,
-    frames: int,
-    begin: Begin,
-    refresh_s: float,
-    going: Callable[[], bool],
-    on_start: Callable[[int], None],
-    on_frame: Callable[[int], None],
-) -> None:
-    """Map a log and show it meanwhile, its map every n seconds and at the end.
-
-    Args:
-        path: The log.
-        weights, config: See ``Mapper.load``.
-        frames: At most this many; 0 = all.
-        begin: Says where to write it, once log and weights are open.
-        refresh_s: Time between two maps.
-        going: Whether to go on.
-        on_start: Called with how many frames there are.
-        on_frame: Called with how many are done.
-
-    Raises:
-        LogError, WeightsError, ConfigError, MapError: it cannot be mapped.
-    """
-    bundle = Mapper.load(weights, config)
-    pipeline = bundle.pipeline
-    voxel_map = pipeline.voxel_map
-    with open_log(path) as reader:
-        log = RerunLog(begin(), pipeline.label_set, voxel_map.config.voxel_size_m)
-        show, mirror = _MapShow(log), MapMirror.of(voxel_map)
-        session = MapSession(
-            bundle,
-            stream_labels=None,
-            source=reader.info.source,
-            scale_known=reader.info.scale_known,
-            rerun=log,
-        )
-        total = min(len(reader), frames or len(reader))
-        on_start(total)
-        shown_at, stamp_ns = time.monotonic(), 0
-        for done, item in enumerate(reader.frames_or_errors(total), 1):
-            if not going():
-                break
-            if isinstance(item, PosedFrame):
-                session.process(item)
-                stamp_ns = item.stamp_ns
-            else:
-                session.refuse(done - 1, 0, str(item))
-            on_frame(done)
-            if time.monotonic() - shown_at > refresh_s:
-                show.show(mirror.apply(voxel_map.changes(mirror.version)), stamp_ns)
-                shown_at = time.monotonic()
-        show.show(mirror.apply(voxel_map.changes(mirror.version)), stamp_ns)
-        log.close()
-
-
 def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]) -> None:
     """Show a running system until its streams have ended or somebody asks to stop.
 
@@ -189,7 +126,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
             return
         log = RerunLog(stream, snapshot.label_set, snapshot.voxel_size_m)
         log.note_scale(snapshot.scale_known)
-        show = _MapShow(log)
+        show = MapShow(log)
         show.show(snapshot, time.monotonic_ns())
         following = _Following(client, show, refresh_s)
         thread = threading.Thread(target=following.run, name="map", daemon=True)
@@ -223,7 +160,7 @@ def _first_snapshot(client: MapClient, stop: StopRequest, tell: Callable[[str], 
 class _Following:
     """Shows the map of a running mapper again and again, in a thread of its own."""
 
-    def __init__(self, client: MapClient, show: _MapShow, refresh_s: float) -> None:
+    def __init__(self, client: MapClient, show: MapShow, refresh_s: float) -> None:
         self.ended = threading.Event()
         self.stamp_ns = 0  # of the newest frame
         self._client = client

@@ -23,10 +23,10 @@ from semantic_mapper.fields.render import render_view
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
-from semantic_mapper.geometry import pixel_grid, pixel_rays
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
+from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.training.views import stack_sources, view_from_frame

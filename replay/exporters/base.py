@@ -8,8 +8,8 @@ from typing import Protocol
 
 import cv2
 import numpy as np
+import scipy  # loads `spatial` when it is first used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import encode_rgb
@@ -79,7 +79,7 @@ def depth_units(depth_m: Float32, scale: float) -> tuple[NDArray[np.uint16], flo
 
 def quaternion(T_a_b: Float64) -> Float64:
     """Rotation of a pose (4, 4) as (x, y, z, w)."""
-    return np.asarray(Rotation.from_matrix(T_a_b[:3, :3]).as_quat(), np.float64)
+    return np.asarray(scipy.spatial.transform.Rotation.from_matrix(T_a_b[:3, :3]).as_quat(), np.float64)
 
 
 def seconds(stamp_ns: int) -> str:

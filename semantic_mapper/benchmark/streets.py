@@ -26,7 +26,8 @@ from semantic_mapper.config import AtLeastOne, Config, Fraction, NotNegative, Po
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, nearest_points
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
-from semantic_mapper.fields.primitives import Primitive, PrimitiveSet, ShapeName
+from semantic_mapper.fields.primitive_rays import PrimitiveSet
+from semantic_mapper.fields.primitives import Primitive, ShapeName
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.scenes.sequence import RoomView
 from semantic_mapper.scenes.streets.boxes import THINGS, StreetBox, street_boxes

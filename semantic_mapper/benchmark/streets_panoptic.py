@@ -29,8 +29,8 @@ from semantic_mapper.benchmark.streets import (
 from semantic_mapper.config import PanopticConfig, to_plain
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.panoptic import Panoptic, box_config, ray_share
-from semantic_mapper.geometry import pixel_grid, pixel_rays
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.scenes.suite import STREETS_SUITE
 from semantic_mapper.training.finetune import FinetuneConfig, PanopticFitConfig
 from semantic_mapper.training.grid_fit import GridFitConfig

@@ -16,7 +16,8 @@ from torch import nn
 from semantic_mapper.config import GridConfig
 from semantic_mapper.fields.grid.field import RaySamples
 from semantic_mapper.fields.grid.scene_grid import SceneGrid, grid_box
-from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, trimmed
+from semantic_mapper.fields.primitive_rays import Intervals, PrimitiveSet, trimmed
+from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.types import Float64, RayBatch
 
 FINER = 0.5  # voxels of a box, as a fraction of the scene's

@@ -24,7 +24,8 @@ from semantic_mapper.fields.grid.march import KEPT
 from semantic_mapper.fields.irt import at_measured
 from semantic_mapper.fields.moving_boxes import MovingBoxes
 from semantic_mapper.fields.nerf_math import relu_layers
-from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, resized, trimmed
+from semantic_mapper.fields.primitive_rays import Intervals, PrimitiveSet, trimmed
+from semantic_mapper.fields.primitives import Primitive, resized
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.types import FieldRender, Int64, RayBatch
 

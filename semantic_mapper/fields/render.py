@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import EncodedViews, SemanticField
-from semantic_mapper.geometry import pixel_grid, pixel_rays
+from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics, FieldRender, Float32, Float64
 
 CPU_CHUNK = 2048  # rays rendered at once: what fits in a core's cache

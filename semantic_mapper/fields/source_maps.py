@@ -9,7 +9,8 @@ from torch.nn import functional
 
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS
-from semantic_mapper.geometry import expect_shape, invert_pose_torch, pixel_grid
+from semantic_mapper.geometry import expect_shape
+from semantic_mapper.rays import invert_pose_torch, pixel_grid
 from semantic_mapper.types import SourceViews
 
 UNSURE_SPREAD = 0.10  # spread of computed depth, as a fraction of it, from which on it counts as a hole

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import EncodedViews, SemanticField
 from semantic_mapper.fields.render import chunk_size
-from semantic_mapper.geometry import expect_shape, pixel_rays
+from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.rays import pixel_rays
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 COARSEST = 4  # pixels between the first rays, a power of two

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import inspect
+import os
 import platform
 import struct
 import typing
@@ -131,12 +132,19 @@ def load_library() -> ctypes.CDLL:
 def _variants() -> list[str]:
     machine = platform.machine()
     names = [f"kernels-{machine}"]
-    if machine == "x86_64":
-        import torch  # it knows what the processor can do, and ATEN_CPU_CAPABILITY holds for both
-
-        if torch.backends.cpu.get_cpu_capability() != "DEFAULT":  # AVX2 and FMA, at least
-            names.insert(0, "kernels-x86_64-avx2")
+    if machine == "x86_64" and has_avx2():
+        names.insert(0, "kernels-x86_64-avx2")
     return names
+
+
+def has_avx2() -> bool:
+    """Whether this x86-64 processor has AVX2 and FMA, as torch sees it: ATEN_CPU_CAPABILITY holds for both."""
+    wanted = os.environ.get("ATEN_CPU_CAPABILITY")
+    if wanted in ("default", "avx2", "avx512"):
+        return wanted != "default"
+    with Path("/proc/cpuinfo").open(encoding="ascii", errors="replace") as lines:
+        flags = next((line.split() for line in lines if line.startswith("flags")), [])
+    return {"avx2", "fma"} <= set(flags)
 
 
 def _packer(hint: Any) -> tuple[str, _Pack]:

@@ -1,15 +1,14 @@
-"""Kernels whose loop is split over threads, as many as torch uses."""
+"""Kernels whose loop is split over threads, as many as torch uses, or would use: kernels do not load it."""
 
 from __future__ import annotations
 
 import functools
 import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Concatenate, Generic, ParamSpec
-
-import torch
 
 import semantic_mapper
 from semantic_mapper.kernels.binding import Kernel
@@ -30,7 +29,7 @@ class ParallelKernel(Generic[P]):
     def __call__(self, count: int, /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Run iterations 0 to ``count`` on as many threads as torch uses, this one included; returns when all ended."""
         packed = self._kernel.pack(*args, **kwargs)
-        threads = min(torch.get_num_threads(), count)
+        threads = min(_thread_count(), count)
         if threads <= 1:
             self._run(0, count, packed)
             return
@@ -74,6 +73,16 @@ def parallel_kernel(
     return decorate
 
 
+def _thread_count() -> int:
+    # None where torch is not loaded; without the function while another thread is just loading it.
+    return getattr(sys.modules.get("torch"), "get_num_threads", _count_of_environment)()
+
+
+def _count_of_environment() -> int:
+    count = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    return int(count) if count.isdecimal() and int(count) > 0 else len(os.sched_getaffinity(0))
+
+
 @functools.cache
 def _stop_spinning() -> None:
     """Make torch's OpenMP threads sleep between operations where torch was loaded before this package.
@@ -84,6 +93,8 @@ def _stop_spinning() -> None:
     """
     if not semantic_mapper.SPINNING_THREADS:
         return
+    import torch  # is loaded
+
     started = threading.Event()
 
     def start_team() -> None:

@@ -10,7 +10,8 @@ import torch
 
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.geometry import invert_pose_torch, transform, unproject
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from semantic_mapper.view_selection import GUESSED_DEPTHS_M, LABELLED_VALUE, select_views, visible_points
 

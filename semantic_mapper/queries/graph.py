@@ -5,19 +5,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
+import scipy  # loads `ndimage` when it is first used
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_scale import require_metres
-from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.checks import check_direction
 from semantic_mapper.queries.instances import LEAST_OVERLAP, Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
@@ -26,6 +25,9 @@ from semantic_mapper.queries.rooms import RoomPlan, find_walls, part_rooms
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import SurfaceVoxels, surface_points, surface_voxels
 from semantic_mapper.types import Bool, Float64, Int64, UInt8
+
+if TYPE_CHECKING:
+    from semantic_mapper.mapping.voxel_map import VoxelMap
 
 CELL_M = 0.05  # of a plan, or a voxel where that is larger
 STOREY_M = 1.8  # floors are at least so far from each other
@@ -378,5 +380,5 @@ def _room_of(
 
 def _nearest(mask: Bool) -> tuple[Float64, Int64]:
     """Distance (H, W) in cells to the nearest cell of a mask, and the flat index of that cell."""
-    distance, (row, column) = ndimage.distance_transform_edt(~mask, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
+    distance, (row, column) = scipy.ndimage.distance_transform_edt(~mask, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
     return distance, row * mask.shape[1] + column

@@ -10,20 +10,25 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, make_block_index, pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import BlockChanges
-from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.snapshot import COMPUTED, MEASURED, BlockVoxels, MapSnapshot
 from semantic_mapper.queries.surface import NEAREST_STEPS
 from semantic_mapper.types import UInt8
+
+if TYPE_CHECKING:
+    from semantic_mapper.mapping.voxel_map import VoxelMap
 
 LEAST_SPARE = 256  # blocks that a new pool has room for beyond the living ones; or half of these, if that is more
 
@@ -54,6 +59,19 @@ class MapMirror:
         """Mirror of a live or loaded map as it is now; further ``changes`` since its version may be applied."""
         mirror = cls(voxel_map.config.voxel_size_m, voxel_map.config.truncation_voxels, voxel_map.label_set)
         mirror.apply(voxel_map.changes(0), voxel_map.instances)
+        return mirror
+
+    @classmethod
+    def load(cls, path: Path) -> MapMirror:
+        """Mirror of a saved map, as ``of`` makes it of the loaded one, without its class evidence in memory.
+
+        Raises:
+            MapError: no such file, not a map, of another format version, or damaged (and what is).
+        """
+        with open_map(path) as reader:
+            config = reader.manifest.config
+            mirror = cls(config.voxel_size_m, config.truncation_voxels, reader.manifest.label_set)
+            mirror.apply(reader.changes(), reader.instances())
         return mirror
 
     @property

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+import scipy  # loads `ndimage` when it is first used
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
@@ -92,7 +92,7 @@ def distance_field(
     state[tuple(moving.T)] = State.MOVING
     obstacle = (state >= State.OCCUPIED) | ((state == State.UNKNOWN) & unknown_is_occupied)
     if obstacle.any():
-        distance = ndimage.distance_transform_edt(~obstacle, sampling=snapshot.voxel_size_m)
+        distance = scipy.ndimage.distance_transform_edt(~obstacle, sampling=snapshot.voxel_size_m)
     else:
         distance = np.full(state.shape, np.inf)
     origin = first.astype(np.float64) * snapshot.voxel_size_m

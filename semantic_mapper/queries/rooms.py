@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy  # loads `ndimage` when it is first used
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from semantic_mapper.types import Bool, Float64, Int64
 
@@ -73,7 +73,7 @@ def part_rooms(seen: Bool, wall: Bool, cell_m: float) -> RoomPlan:
     inside = _bridged(seen, round(MOST_UNSEEN_M / 2 / cell_m)) & ~wall
     inside[[0, -1]] = inside[:, [0, -1]] = False
     inside |= _small_parts(~inside & ~wall, MOST_HIDDEN_M2 / cell_m**2)
-    clearance = np.asarray(ndimage.distance_transform_edt(inside, sampling=cell_m), np.float64)
+    clearance = np.asarray(scipy.ndimage.distance_transform_edt(inside, sampling=cell_m), np.float64)
     basin, peak = _basins(inside, clearance)
     first, second, saddle = _contacts(basin, clearance)
     group = _merge(first, second, saddle, peak)

@@ -239,7 +239,7 @@ class TiledMap:
                     self._tiles.popitem(last=False)
                 row = self._rows[index]
                 with self._fetch(row) as path:
-                    tile = _split(MapMirror.of(VoxelMap.load(path)).snapshot(), index, self.manifest.edge_blocks)
+                    tile = _split(MapMirror.load(path).snapshot(), index, self.manifest.edge_blocks)
                 self.loads += 1
             self._tiles[index] = tile
             return tile

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from semantic_mapper.fields.primitives import PrimitiveSet
-from semantic_mapper.geometry import pixel_grid, pixel_rays, transform, unproject
+from semantic_mapper.fields.primitive_rays import PrimitiveSet
+from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 NEAR_M = 0.3

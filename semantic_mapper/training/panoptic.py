@@ -23,7 +23,7 @@ from semantic_mapper.fields.grid.kernels import adam_grid
 from semantic_mapper.fields.grid.scene_grid import NOTHING
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, heaviest, merged_classes, ray_share
-from semantic_mapper.fields.primitives import MAX_INTERVALS
+from semantic_mapper.fields.primitive_rays import MAX_INTERVALS
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger

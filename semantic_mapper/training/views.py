@@ -10,9 +10,10 @@ import torch
 from torch.nn import functional
 
 from semantic_mapper.fields.source_maps import UNSURE_SPREAD
-from semantic_mapper.geometry import camera_matrix, pixel_rays
+from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.rays import pixel_rays
 from semantic_mapper.types import CameraIntrinsics, PosedFrame, RayBatch, SourceViews
 
 

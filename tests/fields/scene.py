@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from semantic_mapper.geometry import camera_matrix, pixel_grid, pixel_rays
+from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics, RayBatch, SourceViews
 
 INTRINSICS = CameraIntrinsics(40.0, 40.0, 23.5, 15.5, 48, 32)

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.primitives import Primitive, PrimitiveSet, closed_mesh, triangulate
+from semantic_mapper.fields.primitive_rays import PrimitiveSet
+from semantic_mapper.fields.primitives import Primitive, closed_mesh, triangulate
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.types import Float64, RayBatch
 

@@ -154,6 +154,16 @@ def test_kernels_leave_torchs_thread_count_as_it_is(script: Path, wanted: int) -
     assert output(start(script, code, OMP_NUM_THREADS=str(wanted))) == [str(wanted)]
 
 
+@pytest.mark.parametrize(("wanted", "threads"), [("1", 1), ("3", 3), ("4,2", 4), ("", None), ("none", None)])
+def test_kernels_without_torch_use_the_threads_that_it_would_and_do_not_load_it(
+    script: Path, wanted: str, threads: int | None
+) -> None:
+    code = "import sys, kernels; from semantic_mapper.kernels import threads as t; kernels.run()\n"
+    code += "print(t._thread_count(), 'torch' in sys.modules)"
+    expected = len(os.sched_getaffinity(0)) if threads is None else threads
+    assert output(start(script, code, OMP_NUM_THREADS=wanted)) == [str(expected), "False"]
+
+
 @pytest.mark.parametrize(("given", "policy"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
 def test_importing_the_package_keeps_torchs_threads_from_spinning(
     script: Path, given: dict[str, str], policy: str

@@ -6,23 +6,31 @@ import dataclasses
 import subprocess
 import sys
 import threading
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
+from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LabelError, MapError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS
+from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import mirror as mirror_module
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
-from tests.mapping.rendered_views import small_map
+from tests.mapping.rendered_views import frame, small_map
 from tests.mapping.storage.test_paging import MEMORY_MB, walk
 from tests.queries.random_map import random_map
-from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, whole_map
+from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, seen, whole_map
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -170,6 +178,61 @@ def test_queries_see_whole_versions_while_another_thread_applies() -> None:
     for thread in threads:
         thread.join()
     assert not wrong and min(asked) >= 5
+
+
+@pytest.mark.parametrize("evidence", ["float32", "int16"])
+def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(
+    evidence: Literal["float32", "int16"], tmp_path: Path
+) -> None:
+    voxel_map = VoxelMap(VoxelMapConfig(evidence=evidence, unknown_below=0.6), LABELS)
+    for seq, pose in enumerate(poses(4)):
+        integrate(voxel_map, pose, seq)
+    voxel_map.note_scale(False)
+    voxel_map.instances = InstanceLayer(np.arange(5), np.arange(5, dtype=np.int32))
+    voxel_map.save(tmp_path / "map.npz")
+    assert voxel_map.block_count > CHUNK_BLOCKS  # more than one chunk
+    loaded, of_loaded = MapMirror.load(tmp_path / "map.npz"), MapMirror.of(VoxelMap.load(tmp_path / "map.npz"))
+    a, b = loaded.snapshot(), of_loaded.snapshot()
+    assert_same(a, b)
+    names = ("epoch", "voxel_size_m", "truncation_voxels", "label_set", "scale_known")
+    assert [getattr(a, name) for name in names] == [getattr(b, name) for name in names]
+    np.testing.assert_array_equal(a.versions, b.versions)
+    assert a.instances is not None and (a.instances.packed == np.arange(5)).all() and loaded.is_whole
+
+
+def test_of_an_empty_saved_map_there_is_an_empty_mirror(tmp_path: Path) -> None:
+    small_map(LABELS).save(tmp_path / "map.npz")
+    assert MapMirror.load(tmp_path / "map.npz").snapshot().block_count == 0
+
+
+def test_a_saved_map_is_mirrored_without_its_class_evidence_in_memory(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    ids = tuple(range(1, 61))
+    many = LabelSet("many", ids, tuple(f"class {n}" for n in ids), ((0, 0, 0),) * len(ids))
+    voxel_map = small_map(many, voxel_size_m=0.006)
+    pose = poses(1)[0]
+    depth, _ = seen(pose)
+    voxel_map.integrate(frame(pose), depth, np.full((*depth.shape, len(many)), 1 / len(many), np.float32), None)
+    voxel_map.save(path)
+
+    def peak_bytes(load: Callable[[], object]) -> int:
+        tracemalloc.start()
+        load()
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    assert peak_bytes(lambda: MapMirror.load(path)) < 0.75 * peak_bytes(lambda: VoxelMap.load(path))
+
+
+def test_a_damaged_map_has_no_mirror(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    whole_map().save(path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(MapError, match=r"map\.npz: chunk .*damaged"):
+        MapMirror.load(path)
 
 
 def test_a_mirror_needs_no_open3d() -> None:

@@ -14,8 +14,8 @@ from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.fields.irt import IRT
 from semantic_mapper.fields.render import render_image
-from semantic_mapper.geometry import pixel_grid
 from semantic_mapper.labels import make_label_set
+from semantic_mapper.rays import pixel_grid
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, IRTFitConfig
 from semantic_mapper.training.fitters import fitter_of

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.fields.primitives import Primitive, PrimitiveSet
+from semantic_mapper.fields.primitive_rays import PrimitiveSet
+from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.labels import KITTI360
 from semantic_mapper.training.label_transfer import box_crf, nearest_labels
 from semantic_mapper.types import CameraIntrinsics, PosedFrame, UInt8

@@ -16,7 +16,8 @@ from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
-from semantic_mapper.fields.primitives import MAX_INTERVALS, Primitive
+from semantic_mapper.fields.primitive_rays import MAX_INTERVALS
+from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.fields.source_maps import encoded_views
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.boxes_in_view import boxes_in_view

@@ -13,8 +13,8 @@ from semantic_mapper.config import SRayConfig, convert_config, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.registry import build_field
-from semantic_mapper.geometry import invert_pose_torch
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.training.images import ImageStepConfig, draw_images, images_loss
 from semantic_mapper.training.losses import image_loss
 from semantic_mapper.training.recipe import rooms_before

@@ -14,7 +14,7 @@ from semantic_mapper.fields.projection import MIN_DEPTH_M, gather, reproject
 from semantic_mapper.fields.ray_render import weighted_moments
 from semantic_mapper.fields.sampling import sample_inverse_depth
 from semantic_mapper.fields.source_maps import scaled_camera
-from semantic_mapper.geometry import invert_pose_torch
+from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.types import RayBatch
 
 RADIAN_M = 0.7  # a turn of one radian makes a view as unlike another as this many metres (15 cm are 12 degrees)

@@ -37,9 +37,11 @@ from semantic_mapper.mapping.files.map_manifest import (
     encode_manifest,
     parse_manifest,
 )
+from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
+from semantic_mapper.mapping.storage.changes import BlockChanges, ChosenBlocks, compact_saved
 from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
 
 BlockPart = tuple[NDArray[np.int32], BlockValues]  # keys (B, 3) and voxels
@@ -184,6 +186,22 @@ class MapReader:
                 raise MapError(f"{where}: block coordinates are out of range or not in order. {MEND}")
             last = int(packed[-1])
             yield keys, values
+            del values  # while the next ones are read
+
+    def changes(self) -> BlockChanges:
+        """What ``VoxelMap.changes(0)`` of the loaded map gives, in memory for the result and one chunk.
+
+        Raises:
+            MapError: a chunk is damaged, or there is no memory.
+        """
+        saved = self.manifest
+        decision = (saved.label_set, saved.config.vote_discount, saved.config.unknown_below, SURFACE_WEIGHT)
+        try:
+            packed = np.zeros(saved.blocks, np.int64)
+            chosen = ChosenBlocks(packed, 0, saved.frames, saved.frames, 0, *decision, saved.scale_known)
+            return compact_saved(self.parts(), chosen)
+        except MemoryError as error:
+            raise MapError(f"{self._path}: no memory for its {saved.blocks:,} blocks: {error}") from error
 
     def instances(self) -> InstanceLayer | None:
         """Which voxels belong to which thing; None where the map does not say.

@@ -7,6 +7,7 @@ probability a voxel.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.storage.block_grid import BLOCK_VOXELS, BlockGrid
 from semantic_mapper.mapping.storage.block_index import unpack_keys
-from semantic_mapper.mapping.storage.block_store import PackedBlocks
+from semantic_mapper.mapping.storage.block_store import BlockValues, PackedBlocks, pack_blocks
 from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED, ClearedBlocks
 from semantic_mapper.types import Float32, Int64, UInt8
 
@@ -171,6 +172,23 @@ def read_changes(grid: BlockGrid, chosen: ChosenBlocks) -> BlockChanges:
 def copy_changes(grid: BlockGrid, chosen: ChosenBlocks) -> CopiedChanges:
     """A copy of existing blocks to be made compact later, which takes four times as long as copying."""
     return CopiedChanges(chosen, tuple(grid.pack(chosen.packed)))
+
+
+def compact_saved(parts: Iterable[tuple[NDArray[np.int32], BlockValues]], chosen: ChosenBlocks) -> BlockChanges:
+    """Compact form of all blocks of a saved map, of which one part is in memory at a time.
+
+    Args:
+        parts: Keys (P, 3) and voxels of blocks, in lexicographic order.
+        chosen: What they are; of ``packed`` only the size counts.
+    """
+    out, row = _room_for(chosen), 0
+    for keys, values in parts:
+        rows = np.arange(row, row + len(keys))
+        out.keys[rows] = keys
+        _compact_into(out, rows, pack_blocks(values, np.arange(len(keys), dtype=np.int32)), chosen)
+        row += len(keys)
+        del values  # while the next ones are read
+    return out
 
 
 def _room_for(chosen: ChosenBlocks) -> BlockChanges:

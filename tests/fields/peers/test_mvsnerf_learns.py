@@ -14,8 +14,9 @@ from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.peers import mvsnerf
 from semantic_mapper.fields.peers.mvsnerf import MVSNeRF
 from semantic_mapper.fields.sampling import sample_inverse_depth
-from semantic_mapper.geometry import camera_matrix, pixel_grid, pixel_rays
+from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.labels import make_label_set
+from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics, RayBatch, SourceViews
 from tests.fields.scene import pose_at
 

@@ -29,8 +29,9 @@ from semantic_mapper.nodes.cli.view import _find_live, _Page
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
 from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote
+from semantic_mapper.nodes.viewer.mapped_log import show_log
 from semantic_mapper.nodes.viewer.server import WebViewer
-from semantic_mapper.nodes.viewer.sources import Live, show_live, show_log, show_saved
+from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
 from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file, recording_server

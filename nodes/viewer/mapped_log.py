@@ -1,0 +1,74 @@
+"""A log that is mapped while the viewer shows it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from semantic_mapper.config import MapperConfig
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.nodes.viewer.sources import Begin, MapShow
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.replay.exporters.rerun_log import RerunLog
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.session import MapSession
+from semantic_mapper.types import PosedFrame
+
+
+def show_log(
+    path: Path,
+    weights: Path | None,
+    config: MapperConfig,
+    frames: int,
+    begin: Begin,
+    refresh_s: float,
+    going: Callable[[], bool],
+    on_start: Callable[[int], None],
+    on_frame: Callable[[int], None],
+) -> None:
+    """Map a log and show it meanwhile, its map every n seconds and at the end.
+
+    Args:
+        path: The log.
+        weights, config: See ``Mapper.load``.
+        frames: At most this many; 0 = all.
+        begin: Says where to write it, once log and weights are open.
+        refresh_s: Time between two maps.
+        going: Whether to go on.
+        on_start: Called with how many frames there are.
+        on_frame: Called with how many are done.
+
+    Raises:
+        LogError, WeightsError, ConfigError, MapError: it cannot be mapped.
+    """
+    bundle = Mapper.load(weights, config)
+    pipeline = bundle.pipeline
+    voxel_map = pipeline.voxel_map
+    with open_log(path) as reader:
+        log = RerunLog(begin(), pipeline.label_set, voxel_map.config.voxel_size_m)
+        show, mirror = MapShow(log), MapMirror.of(voxel_map)
+        session = MapSession(
+            bundle,
+            stream_labels=None,
+            source=reader.info.source,
+            scale_known=reader.info.scale_known,
+            rerun=log,
+        )
+        total = min(len(reader), frames or len(reader))
+        on_start(total)
+        shown_at, stamp_ns = time.monotonic(), 0
+        for done, item in enumerate(reader.frames_or_errors(total), 1):
+            if not going():
+                break
+            if isinstance(item, PosedFrame):
+                session.process(item)
+                stamp_ns = item.stamp_ns
+            else:
+                session.refuse(done - 1, 0, str(item))
+            on_frame(done)
+            if time.monotonic() - shown_at > refresh_s:
+                show.show(mirror.apply(voxel_map.changes(mirror.version)), stamp_ns)
+                shown_at = time.monotonic()
+        show.show(mirror.apply(voxel_map.changes(mirror.version)), stamp_ns)
+        log.close()
