@@ -12,10 +12,14 @@ API := semantic_mapper semantic_mapper.types semantic_mapper.geometry semantic_m
 	semantic_mapper.fields.base semantic_mapper.evaluation.metrics
 KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 
-# One thread of computation for each of two test processes. A worker that crashes ends the run with an error.
-PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests -n 2 --dist worksteal --max-worker-restart 0
+# Two test processes, with one thread of computation each. A worker that crashes ends the run with an error.
+TESTS := .venv/bin/python -m pytest tests -n 2 --dist worksteal --max-worker-restart 0
+PYTEST := OMP_NUM_THREADS=1 $(TESTS)
 
-.PHONY: help setup demo test test-slow test-all test-v4l2 test-web check bench wheels docs format lock clean
+# Without bytecode, each process that a test starts would compile its packages again: seconds of CPU.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: help setup demo test test-loaded test-slow test-all test-v4l2 test-web check bench wheels docs format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -31,6 +35,10 @@ demo: $(READY)  ## map an embedded scene; results in runs/demo
 
 test: $(READY)  ## run the quick tests
 	$(PYTEST) -m "not slow"
+
+test-loaded: $(READY)  ## run the quick tests beside two busy processes, then on one thread with a limit on CPU time
+	env -u OMP_NUM_THREADS .venv/bin/python -m tools.beside_load 2 $(TESTS) -m "not slow"
+	$(PYTEST) -m "not slow" --cpu-limit 6
 
 test-slow: $(READY)  ## run the slow tests: crash rounds, launches, learning, training
 	$(PYTEST) -m slow

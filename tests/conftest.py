@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import settings
 
+pytest_plugins = ["tests.cpu_time"]
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # The same examples in every run, and no wall-clock limit on one: a failure must come from the code.

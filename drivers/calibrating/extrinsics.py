@@ -198,7 +198,14 @@ def _adjust_bundle(
     sparsity = np.kron(touched[:, 1:], np.ones((2, 6), np.uint8))
     guess = np.zeros(6 * (len(start) - 1))
     fit: Any = least_squares(
-        residuals, guess, jac_sparsity=sparsity, loss="huber", f_scale=_HUBER_PX, x_scale="jac", xtol=1e-10
+        residuals,
+        guess,
+        jac_sparsity=sparsity,
+        tr_options={"atol": 1e-12, "btol": 1e-12},  # with steps less exact, one wrong view takes thousands of them
+        loss="huber",
+        f_scale=_HUBER_PX,
+        x_scale="jac",
+        xtol=1e-10,
     )
     squares = (residuals(fit.x) ** 2).sum()
     hessian = (fit.jac.T @ fit.jac).toarray()  # of the robust cost

@@ -96,7 +96,7 @@ class ImageMaker:
 
     def image(self, frames: FrameSet) -> CameraImage | None:
         """The image of a set; None for one that is not later than the one before, or claims to be of the future."""
-        stamp_ns = self._stamp_ns(frames.color)
+        stamp_ns = self._stamp_ns(frames)
         self.reason = ""
         if stamp_ns > time.monotonic_ns() + FUTURE_NS:
             self.reason = "its stamp is in the future: check the clocks of this machine and of the device"
@@ -118,12 +118,12 @@ class ImageMaker:
         self._last = (number, stamp_ns)
         return CameraImage(stamp_ns, number, self._camera_id, rgb, depth_m, self.intrinsics)
 
-    def _stamp_ns(self, frame: Any) -> int:
+    def _stamp_ns(self, frames: FrameSet) -> int:
         """When it was captured, on the monotonic clock; the SDK tells milliseconds of the wall clock or its own."""
-        told_ns, now_ns = round(1e6 * frame.get_timestamp()), time.monotonic_ns()
-        if frame.get_frame_timestamp_domain() == load_realsense().timestamp_domain.hardware_clock:
-            return self._clock.stamp_ns(told_ns, now_ns)
-        return told_ns - time.time_ns() + now_ns
+        told_ns = round(1e6 * frames.color.get_timestamp())
+        if frames.color.get_frame_timestamp_domain() == load_realsense().timestamp_domain.hardware_clock:
+            return self._clock.stamp_ns(told_ns, frames.arrived_ns)
+        return told_ns - time.time_ns() + time.monotonic_ns()
 
     def _number(self, counted: int) -> int:
         """From 0, with gaps where images were lost."""

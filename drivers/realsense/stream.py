@@ -23,10 +23,14 @@ class StreamEnded(Exception):  # noqa: N818 -- an event, not an error: the camer
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Frames of one moment, of the SDK: ``depth`` is in the pixels of ``color``; None where none was asked for."""
+    """Frames of one moment, of the SDK: ``depth`` is in the pixels of ``color``; None where none was asked for.
+
+    ``arrived_ns`` is when they were read, on the monotonic clock.
+    """
 
     color: Any
     depth: Any | None
+    arrived_ns: int
 
 
 class Stream:
@@ -89,7 +93,8 @@ class Stream:
         """
         try:
             came, frames = self._syncer.try_wait_for_frames(max(1, round(1000 * timeout_s)))
-            found = self._complete(frames) if came else None
+            arrived_ns = time.monotonic_ns()
+            found = self._complete(frames, arrived_ns) if came else None
         except RuntimeError as error:  # the SDK's
             raise StreamEnded(f"it fails: {error}") from error
         now = time.monotonic()
@@ -112,15 +117,15 @@ class Stream:
                 sensor.close()
         self._sensors = []
 
-    def _complete(self, frames: Any) -> FrameSet | None:
+    def _complete(self, frames: Any, arrived_ns: int) -> FrameSet | None:
         """None of a set in which one frame is missing, as the syncer gives where one came late."""
         color, depth = frames.get_color_frame(), frames.get_depth_frame()
         if not self._config.depth:
-            return FrameSet(color, None) if color else None
+            return FrameSet(color, None, arrived_ns) if color else None
         if not color or not depth:
             return None
         aligned = self._align.process(frames)
-        return FrameSet(aligned.get_color_frame(), aligned.get_depth_frame())
+        return FrameSet(aligned.get_color_frame(), aligned.get_depth_frame(), arrived_ns)
 
     def _profile(self, sensors: list[Any], stream: Any, format_: Any, width: int, height: int) -> tuple[int, Any]:
         """Index of the sensor and its mode. Raises CameraError, with the modes that there are."""

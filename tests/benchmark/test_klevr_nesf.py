@@ -74,6 +74,7 @@ def test_the_digest_tells_all_that_a_fit_depends_on() -> None:
     assert grid_digest(GRID, 3) == grid_digest(msgspec.structs.replace(GRID), 3)
 
 
+@pytest.mark.slow
 def test_the_network_learns_more_than_the_background(tmp_path: Path) -> None:
     training = msgspec.structs.replace(training_of(TINY, size=32), first_rate=6e-3, last_rate=1e-3)
     torch.set_num_threads(1)

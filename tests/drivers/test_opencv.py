@@ -165,13 +165,13 @@ def sender() -> Iterator[Sender]:
 
 
 def test_a_stream_that_breaks_off_is_connected_anew(sender: Sender, tmp_path: Path) -> None:
-    with opencv(sender.url, tmp_path, stamps="arrival", open_timeout_s=3, stall_s=2) as camera:
+    began_ns = time.monotonic_ns()
+    with opencv(sender.url, tmp_path, stamps="arrival", open_timeout_s=20, stall_s=20) as camera:
         assert camera.info.source == f"stream {sender.url}"
         images = iter(camera)
-        began_ns = time.monotonic_ns()
         first = next(images)
         assert abs(first.rgb[20, 30].astype(int) - (200, 0, 0)).max() < 8
-        assert began_ns - 2_000_000_000 < first.stamp_ns <= time.monotonic_ns()
+        assert began_ns < first.stamp_ns <= time.monotonic_ns()
         sender.refuse.set()
         sender.break_off.set()
         deadline = time.monotonic() + 20
@@ -188,11 +188,12 @@ def test_a_stream_that_breaks_off_is_connected_anew(sender: Sender, tmp_path: Pa
 
 def test_a_stream_whose_clock_is_none_is_stamped_on_arrival_and_told(sender: Sender, tmp_path: Path) -> None:
     """Motion JPEG has no times of its own: FFmpeg counts 25 a second, which these are not."""
+    began_ns = time.monotonic_ns()
     with opencv(sender.url, tmp_path) as camera:
         images = iter(camera)
         stamps = [image.stamp_ns for image in islice(images, 20)]
         assert all(a < b for a, b in pairwise(stamps))
-        assert abs(stamps[-1] - time.monotonic_ns()) < 2_000_000_000
+        assert began_ns < stamps[-1] <= time.monotonic_ns()
 
 
 def test_nobody_at_an_address_is_told(tmp_path: Path) -> None:

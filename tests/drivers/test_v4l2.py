@@ -31,7 +31,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 
 def v4l2(named: Path | str, tmp_path: Path, **settings: Any) -> Camera:
-    config = {"device": str(named), "calibration": write_calibration(tmp_path / "webcam.toml"), "stall_s": 0.1}
+    config = {"device": str(named), "calibration": write_calibration(tmp_path / "webcam.toml"), "stall_s": PATIENCE_S}
     return open_camera("v4l2", config | settings, "front", "test")
 
 
@@ -189,7 +189,7 @@ def test_a_read_that_hangs_is_told_while_it_hangs(
 ) -> None:
     monkeypatch.setattr("tests.drivers.fake_v4l2.SELECT_S", 1.5)
     sensor = Sensor()
-    with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
+    with v4l2(machine.plug(sensor, 0), tmp_path, stall_s=0.1) as camera:
         next(iter(camera))
         sensor.stalled = True
         until(lambda: any("the stream has stalled" in t for t in camera.warnings))

@@ -171,20 +171,21 @@ def test_the_same_device_is_looked_for_again(calibration: Path) -> None:
 
     def connect(config: host.Config, on_state: object) -> Sources:
         asked.append(config.device)
+        if len(asked) == 2:
+            camera.stop()
         return host.played(calibration, rgb, None, ends=True)
 
     camera = host.OakCamera(host.CONFIG, "front", connect=connect)
     with camera:
         for _ in zip(range(2), camera, strict=False):
             pass
-        threading.Timer(1.0, camera.stop).start()
         list(camera)  # all that comes then is older than the last image
-    assert asked[:2] == ["", "1844301000000000"]
+    assert asked == ["", "1844301000000000"]
 
 
 def test_a_stream_that_stalls_is_opened_again(calibration: Path) -> None:
     start = long_ago(60)
-    config = host.Config(width=WIDTH, height=HEIGHT, fps=host.FPS, stall_s=1.0, retry_s=0.02)
+    config = host.Config(width=WIDTH, height=HEIGHT, fps=host.FPS, stall_s=3.0, retry_s=0.02)
     warnings: list[str] = []
 
     def again() -> Sources:
@@ -196,7 +197,7 @@ def test_a_stream_that_stalls_is_opened_again(calibration: Path) -> None:
     with camera:
         seqs = [image.seq for image in take(camera, 5)]
     assert seqs == [0, 1, 2, 40, 41]
-    assert len(warnings) == 1 and "no image for 1 s" in warnings[0]
+    assert len(warnings) == 1 and "no image for 3 s" in warnings[0]
 
 
 def test_a_device_without_images_is_refused(calibration: Path) -> None:
@@ -210,8 +211,10 @@ def test_a_device_without_images_is_refused(calibration: Path) -> None:
 def test_stop_ends_the_iteration(calibration: Path) -> None:
     rgb, _ = messages(3)
     with host.camera(lambda: host.played(calibration, rgb, None)) as camera:
-        threading.Timer(0.5, camera.stop).start()
-        assert len(list(camera)) == 3
+        for _ in zip(range(3), camera, strict=False):
+            pass
+        threading.Timer(0.1, camera.stop).start()
+        assert not list(camera)
 
 
 def test_info_of_a_closed_camera_says_so() -> None:

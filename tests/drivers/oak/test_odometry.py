@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from datetime import timedelta
 from pathlib import Path
 
@@ -78,12 +79,17 @@ def test_images_carry_the_pose_of_their_moment(calibration: Path) -> None:
 def test_images_do_not_wait_for_ever(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry, "ANSWER_S", 0.2)
     config = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, odometry=True, odometry_wait_s=0.1)
-    camera = host.camera(
-        lambda: host.tracked(live(calibration, 60), basalt_says, T_LEFT_RGB, slowness_s=3.0), config=config
-    )
+    go_on = threading.Event()
+
+    def says_nothing(k: int) -> dai.TransformData:
+        go_on.wait(60)
+        return basalt_says(k)
+
+    camera = host.camera(lambda: host.tracked(live(calibration, 60), says_nothing, T_LEFT_RGB), config=config)
     with camera:
         images = list(itertools.islice(camera, 40))
         assert any("odometry has not answered for 0.2 s" in trouble for trouble in camera.warnings)
+        go_on.set()
     assert not with_pose(images)
 
 
@@ -127,8 +133,7 @@ def test_a_reconnection_ends_the_camera_where_that_is_asked_for(calibration: Pat
 
 def test_a_lost_track_is_told(calibration: Path) -> None:
     lost = dai.TransformData(float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    config = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, odometry=True, odometry_wait_s=0.1)
-    camera = host.camera(lambda: host.tracked(live(calibration, 30), lambda _: lost, T_LEFT_RGB), config=config)
+    camera = host.camera(lambda: host.tracked(live(calibration, 30), lambda _: lost, T_LEFT_RGB), config=WAITS)
     with camera:
         assert not with_pose(list(itertools.islice(camera, 20)))
         assert any("lost track" in trouble for trouble in camera.warnings)

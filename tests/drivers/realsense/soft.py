@@ -84,6 +84,8 @@ class SoftDevice:
             frame.timestamp, frame.domain = ts_ms, getattr(rs.timestamp_domain, domain)
             frame.frame_number = self._number
             frame.profile = profile.as_video_stream_profile()
+            # Else the SDK takes number / stamp for the rate, by which its syncer decides whether to wait for depth.
+            sensor.set_metadata(rs.frame_metadata_value.actual_fps, 1000 * FPS)
             if size == 2:
                 frame.depth_units = 0.001
             self._keep = [*self._keep[-16:], frame]
@@ -105,7 +107,9 @@ class Feed:
     ) -> None:
         self.device: SoftDevice | None = device
         self.ahead_ms = 0.0  # of the true time
+        self.captured_ns: list[int] = []  # of the image of each number, on the monotonic clock
         self._make, self._domain = make, domain
+        self._began_ns = time.monotonic_ns() - 1_000_000_000  # the device has been on for a second
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -123,8 +127,10 @@ class Feed:
             device = self.device
             if device is None or not device.color_sensor.get_active_streams():
                 continue
-            ms = time.time() * 1000 if self._domain != "hardware_clock" else time.monotonic() * 1000 - 5e6
-            device.give(*self._make(number), ms - 20.0 + self.ahead_ms, self._domain)
+            captured_ns = time.monotonic_ns() - 20_000_000
+            self.captured_ns.append(captured_ns)
+            zero_ns = self._began_ns if self._domain == "hardware_clock" else time.monotonic_ns() - time.time_ns()
+            device.give(*self._make(number), (captured_ns - zero_ns) / 1e6 + self.ahead_ms, self._domain)
             number += 1
 
 

@@ -172,7 +172,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
 def test_a_pair_that_is_unplugged_is_waited_for(machine: Machine, tmp_path: Path) -> None:
     sensor = Sensor(card="Stereo", sizes=((960, 360), (64, 48)))
     device = machine.plug(sensor, 0)
-    with stereo(device, pairs.write_pair(tmp_path / "pair.toml"), source={"stall_s": 0.1}) as camera:
+    with stereo(device, pairs.write_pair(tmp_path / "pair.toml"), source={"stall_s": PATIENCE_S}) as camera:
         images = iter(camera)
         before = next(images)
         assert before.rgb.shape == (360, 480, 3) and before.depth_m is not None and not before.depth_m.any()

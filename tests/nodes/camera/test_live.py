@@ -173,7 +173,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 
 def v4l2(device: Path, tmp_path: Path, **settings: Any) -> dict[str, Any]:
-    config = {"device": str(device), "calibration": write_calibration(tmp_path / "webcam.toml"), "stall_s": 0.1}
+    config = {"device": str(device), "calibration": write_calibration(tmp_path / "webcam.toml"), "stall_s": PATIENCE_S}
     return {"camera": {"kind": "v4l2", "id": "front", "config": config | settings, "poses": {"kind": "walk"}}}
 
 

@@ -15,6 +15,7 @@ import pytest
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.irt import IRT
+from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.messages import StreamInfo
@@ -179,35 +180,41 @@ def test_eval_and_autolabel_say_that_a_grid_knows_no_classes(log: Path, tmp_path
     assert not (tmp_path / "new.mcap").exists()
 
 
-def test_ctrl_c_keeps_the_grid_so_far(log: Path, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_the_grid_so_far(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, settings = tmp_path / "early.safetensors", tmp_path / "small.toml"
     settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\nsteps = 1_000_000\n")
-    arguments = ("--kind", "grid", "--seconds", "600", "--config", settings, "--out", out)
-    with Running("finetune", log, *arguments) as running:
-        running.wait_for_line("step [1-9]")
-        running.process.send_signal(signal.SIGINT)
-        assert running.wait() == 130, running.text
+    notes, show = [], FrameProgress.set
+
+    def show_and_interrupt(progress: FrameProgress, done: int, note: str = "") -> None:
+        show(progress, done, note)
+        notes.append(note)
+        if len(notes) == 20:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(FrameProgress, "set", show_and_interrupt)
+    done = run("finetune", log, "--kind", "grid", "--seconds", "600", "--config", settings, "--out", out)
+    assert done.returncode == 130, done.stderr
     checkpoint = load_checkpoint(out)
     assert isinstance(checkpoint.model, GridField) and checkpoint.model.fitted
-    assert checkpoint.recipe["steps"] > 0 and checkpoint.recipe["seconds"] < 500
-    assert "the best weights so far" in running.text
+    assert 0 < checkpoint.recipe["steps"] < 1000 and checkpoint.recipe["seconds"] < 500
+    assert "the best weights so far" in done.stdout + done.stderr
 
 
-def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, tmp_path: Path) -> None:
+def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, config: Path, tmp_path: Path) -> None:
     out, settings = tmp_path / "irt.safetensors", tmp_path / "small.toml"
     settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\n")
-    arguments = ("--kind", "irt", "--steps", "40", "--seconds", "0", "--config", settings, "--variant", "RTTC")
+    arguments = ("--kind", "irt", "--steps", "16", "--seconds", "0", "--config", settings, "--variant", "RTTC")
     done = run("finetune", log, *arguments, "--frames", "1,4", "--out", out)
     assert done.returncode == 0, done.stderr
     assert "finetuned on frames 1, 4 of room.mcap" in done.stdout
-    assert "grid of room.mcap, 40 steps" in done.stdout and "accuracy" in done.stdout
+    assert "grid of room.mcap, 16 steps" in done.stdout and "accuracy" in done.stdout
     checkpoint = load_checkpoint(out)
     assert checkpoint.model.kind == "irt" and len(checkpoint.train_stamps_ns) == 2
     done = run("autolabel", log, "--weights", out, "--overwrite-labels", "--out", tmp_path / "labelled.mcap")
     assert done.returncode == 0, done.stderr
     with open_log(tmp_path / "labelled.mcap") as labelled:
         assert all(f.label is not None and f.label_is_pseudo for f in labelled)
-    done = run("replay", log, "--weights", out, "--out", tmp_path / "replayed")
+    done = run("replay", log, "--weights", out, "--config", config, "--out", tmp_path / "replayed")
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "replayed" / "summary.json").read_text())
     assert summary["frames"]["excluded_from_scores"] == 2 and summary["frames"]["scored"] == 4  # never on its keyframes

@@ -149,8 +149,8 @@ def s3_server(folder: Path, plan: FaultPlan | None = None) -> Iterator[S3Server]
     port = free_port()
     program = Path(sys.executable).parent / "rclone"
     command = [str(program), "serve", "s3", "--addr", f"127.0.0.1:{port}", "--auth-key", f"{ACCESS_KEY},{SECRET_KEY}"]
-    # What another process writes into the folder is seen at once.
-    command += ["--dir-cache-time", "0s", "--config", os.devnull, str(folder)]
+    # What another process writes into the folder is seen at once. With 0s, rclone spins on its timers.
+    command += ["--dir-cache-time", "1ms", "--config", os.devnull, str(folder)]
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     ) as rclone:

@@ -74,22 +74,26 @@ def test_who_waits_in_vain_for_a_mirror_is_told_so(endpoint: str, monkeypatch: p
         stranger.socket.close()
 
 
-def test_who_mirrors_a_map_now_and_then_gets_it_as_it_is_and_costs_nothing_in_between(endpoint: str) -> None:
+def test_who_mirrors_a_map_now_and_then_gets_it_as_it_is_and_costs_nothing_in_between(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(query_service, "CATCH_UP_S", 60.0)
+    monkeypatch.setattr(query_service, "ASKED_LATELY_S", 60.0)
     voxel_map = small_map(LABELS)
     places = iter(poses(4))
     integrate(voxel_map, next(places), 0)
     with answering(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
 
-        def copied_without_a_question() -> bool:
+        def copied_without_a_question(timeout_s: float) -> bool:
             time.sleep(2 * query_service.MIRRORED_LATELY_S)
             integrate(voxel_map, next(places), voxel_map.version)
-            return eventually(lambda: service._copied_version == voxel_map.version, 0.5)
+            return eventually(lambda: service._copied_version == voxel_map.version, timeout_s)
 
         client.mirror()
         client.mirror()  # the first one asks for classes, too, whose window is longer: let it pass
         service._wanted_until = 0.0
         assert client.mirror().version == voxel_map.version
-        assert not copied_without_a_question()
+        assert not copied_without_a_question(0.5)
         assert client.mirror().version == voxel_map.version, "it waits for a snapshot of the present map"
         client.at([(0.0, 0.0, 0.0)])
-        assert copied_without_a_question(), "who asks for an answer at once goes on to get one"
+        assert copied_without_a_question(30), "who asks for an answer at once goes on to get one"

@@ -8,17 +8,19 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.frame_gaps import Gaps
+from semantic_mapper.nodes.supervisor import heartbeat
 from semantic_mapper.nodes.supervisor.backoff import RestartBackoff
-from semantic_mapper.nodes.supervisor.hang_detector import HangDetector
+from semantic_mapper.nodes.supervisor.hang_detector import HangDetector, is_active
 from semantic_mapper.nodes.supervisor.heartbeat import ENDING, FRAME, RUNNING, STARTING, TURN, HeartbeatMonitor
 from semantic_mapper.nodes.supervisor.launch_config import NodeEntry, load_launch
-from tests.nodes.support import REPLAY_LAUNCH
+from tests.nodes.support import REPLAY_LAUNCH, eventually
 
 LIVE_LAUNCH = REPLAY_LAUNCH.with_name("replay-live.toml")
 
@@ -118,23 +120,26 @@ BUSY = "print(flush=True)\nwhile True: pass"
 @pytest.mark.parametrize(
     ("program", "stopped", "hangs"), [(SLEEPS, False, True), (BUSY, False, False), (BUSY, True, True)]
 )
-def test_a_frozen_process_is_told_from_a_busy_one(program: str, stopped: bool, hangs: bool) -> None:
+def test_a_frozen_process_is_told_from_a_busy_one(
+    program: str, stopped: bool, hangs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr(heartbeat, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
     assert process.stdout is not None and process.stdout.readline() == b"\n"
     if stopped:
         process.send_signal(signal.SIGSTOP)
-        time.sleep(0.05)
-    elif hangs:
-        time.sleep(0.3)  # until it sleeps, on whatever machine
+    if hangs:
+        assert eventually(lambda: not is_active(process.pid), 30)
     launch = msgspec.structs.replace(load_launch(LIVE_LAUNCH, ["log=room.mcap"]), heartbeat_s=0.2)
     read, write = os.pipe()
     monitor = HeartbeatMonitor(read)
     os.write(write, RUNNING)
     detector = HangDetector(process.pid, monitor, launch)
     assert not detector.find_hang(stopping=False)
-    time.sleep(0.15)
+    now_s[0] += 0.15
     assert not detector.find_hang(stopping=False), "it is not silent for long enough"
-    time.sleep(0.2)
+    now_s[0] += 0.2
     assert bool(detector.find_hang(stopping=False)) == hangs
     os.write(write, RUNNING)
     assert not detector.find_hang(stopping=False), "it lives"
