@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.replay.sfm.features import loop_pairs, match_features
-from semantic_mapper.types import UInt8
+from semantic_mapper.types import Bool, Float64, UInt8
 
 REQUEST, RESULT, DATABASE, FEATURES = "request.json", "result.json", "database.db", "features"
 OVERLAP = 8  # frames before each that it is matched to
@@ -28,6 +29,16 @@ INIT_TRIALS = 40
 LARGE, LEAST_PRECISION = 1280, 0.25  # pixels of the longer side from which on COLMAP's limits hold; their least factor
 MAX_FOCAL_CHANGE = 0.1  # of one that is known about: EXIF data has whole millimetres, and the picture may be cropped
 FOCAL_RANGE = 0.2, 5.0  # times the longer side; a model beyond it has run away
+LINK_MATCHES = 20  # of two frames that show one place
+FLAT = 0.93  # of the matches that one homography explains: nothing but a turn, or one plane
+TURNED = 0.8  # of the matches that a turn explains: nothing but that
+TURN_PX, TURN_FOCALS = 3.0, np.geomspace(0.4, 2.0, 12)  # off a turn at most, for 640 pixels; of the longer side
+# Where a first attempt fails: two frames to begin with may lie straight ahead of each other, and the median angle
+# between the rays to what both see may be this small. COLMAP's defaults, 0.95 and 16 degrees, leave none to a camera
+# that goes forwards. It begins with the widest, and halves the angle twice.
+AHEAD_MAX_FORWARD, AHEAD_ANGLE_DEG = 1.0, 8.0
+MAX_POINT_SIGMAS = 2000  # points whose depths are asked for
+UNKNOWN_FOCAL = 0.1  # standard deviation of a focal length that a film does not tell: it stays as assumed
 
 
 class Camera(msgspec.Struct, frozen=True):
@@ -65,10 +76,17 @@ class Model(msgspec.Struct, frozen=True):
 
 
 class Attempt(msgspec.Struct, frozen=True):
-    """What came of one focal length."""
+    """What came of one focal length.
+
+    Args:
+        focal_prior_px: To begin with.
+        models: The largest first.
+        ahead: Begun with two frames that may lie straight ahead of each other.
+    """
 
     focal_prior_px: float
     models: list[Model]
+    ahead: bool = False
 
 
 class Pair(msgspec.Struct, frozen=True):
@@ -78,12 +96,14 @@ class Pair(msgspec.Struct, frozen=True):
         first, second: The frames.
         matches: That agree.
         flat: Of these, the fraction that one homography explains: 1 for a camera that only turns, or one plane.
+        turn: The fraction that a turn on the spot explains.
     """
 
     first: int
     second: int
     matches: int
     flat: float
+    turn: float = 0.0
 
 
 class FocalCheck(msgspec.Struct, frozen=True):
@@ -98,13 +118,55 @@ class FocalCheck(msgspec.Struct, frozen=True):
     sigmas: float
 
 
+class Sigmas(msgspec.Struct, frozen=True):
+    """Standard deviations of a model, by the covariance of its bundle adjustment: noise of the features alone.
+
+    Args:
+        focal: Of the focal length, as a fraction of it; None where it was not free. Above ``UNKNOWN_FOCAL`` the model
+            has the one that it began with.
+        position: Of the place of a camera, the largest, as a fraction of the path, with the path's beginning held.
+        depth: Of the depths of points, with the cameras held: the median of their fractions.
+    """
+
+    focal: float | None
+    position: float
+    depth: float
+
+
 class Outcome(msgspec.Struct, frozen=True):
-    """All that the process tells; ``focal`` of the largest model of a calibrated camera."""
+    """All that the process tells.
+
+    Args:
+        attempts: In the order of trial.
+        pairs: Of frames near each other.
+        features: Of each frame.
+        focal: Of the largest model of a calibrated camera.
+        sigmas: Of the largest model of the best attempt; None where the adjustment is degenerate.
+    """
 
     attempts: list[Attempt]
     pairs: list[Pair]
     features: list[int]
     focal: FocalCheck | None = None
+    sigmas: Sigmas | None = None
+
+
+def best_attempt(attempts: Sequence[Attempt]) -> int:
+    """The one with the largest model, of equal ones that with the smallest error."""
+    sizes = [(a.models[0].images, -a.models[0].error_px) if a.models else (0, 0.0) for a in attempts]
+    return max(range(len(attempts)), key=sizes.__getitem__)
+
+
+def flat_fraction(pairs: Sequence[Pair]) -> float:
+    """Of the pairs some steps apart, those that one homography explains."""
+    apart = [p for p in pairs if p.second - p.first >= 2 and p.matches >= LINK_MATCHES]
+    return float(np.mean([p.flat >= FLAT for p in apart])) if apart else 0.0
+
+
+def turn_fraction(pairs: Sequence[Pair]) -> float:
+    """Of the pairs some steps apart, those that a turn on the spot explains."""
+    apart = [p for p in pairs if p.second - p.first >= 2 and p.matches >= LINK_MATCHES]
+    return float(np.mean([p.turn >= TURNED for p in apart])) if apart else 0.0
 
 
 def main(folder: Path) -> None:
@@ -119,17 +181,38 @@ def main(folder: Path) -> None:
     pairs = [(i, j) for i in range(len(files)) for j in range(i + 1, min(i + OVERLAP + 1, len(files)))]
     pairs += loop_pairs(descriptors, OVERLAP, SEED)
     _match(pycolmap, folder, [file.stem for file in files], descriptors, pairs, _precision(camera))
+    verified = _verified(pycolmap, folder / DATABASE, camera)
+    turns = max(flat_fraction(verified), turn_fraction(verified)) >= 0.5
+    attempts = _attempts(pycolmap, folder, camera, len(files), turns=turns)
+    counts = [len(rows) for rows in descriptors]
+    best = attempts[best_attempt(attempts)]
+    focal = sigmas = None
+    if best.models:
+        at = folder / best.models[0].folder
+        focal = None if camera.fixed is None else _check_focal(pycolmap, at)
+        known = camera.about and best.focal_prior_px == camera.focal_priors[0]
+        sigmas = _settle(pycolmap, at, camera, best.focal_prior_px, free=camera.fixed is None and not known)
+    outcome = Outcome(attempts, verified, counts, focal, sigmas)
+    (folder / RESULT).write_bytes(msgspec.json.encode(outcome))
+
+
+def _attempts(pycolmap: Any, folder: Path, camera: Camera, count: int, *, turns: bool) -> list[Attempt]:
+    """Until one has placed most frames; a camera that turns on the spot gets none that begins straight ahead.
+
+    Straight ahead, the focal length is tried free, and held: two frames of a straight way fit any.
+    """
     attempts: list[Attempt] = []
     for number, prior in enumerate(camera.focal_priors if camera.fixed is None else (camera.fixed[0],)):
-        models = _map(pycolmap, folder, number, camera, prior, len(files), held=camera.about and number == 0)
-        attempts.append(Attempt(prior, models))
-        if models and models[0].images >= ENOUGH * len(files):
-            break
-    counts = [len(rows) for rows in descriptors]
-    models = attempts[0].models
-    focal = _check_focal(pycolmap, folder / models[0].folder) if camera.fixed is not None and models else None
-    outcome = Outcome(attempts, _verified(pycolmap, folder / DATABASE, OVERLAP), counts, focal)
-    (folder / RESULT).write_bytes(msgspec.json.encode(outcome))
+        known = camera.about and number == 0
+        ways = [(False, known)] if turns else [(False, known), (True, known), (True, True)]
+        for ahead, held in dict.fromkeys(ways) if camera.fixed is None else ways[:2]:
+            models = _map(pycolmap, folder, len(attempts), camera, prior, count, held=held, ahead=ahead)
+            if known:
+                models = [_freed(pycolmap, folder, model, prior) for model in models]
+            attempts.append(Attempt(prior, models, ahead))
+            if models and models[0].images >= ENOUGH * count:
+                return attempts
+    return attempts
 
 
 def _fill_database(pycolmap: Any, path: Path, camera: Camera, files: list[Path]) -> list[UInt8]:
@@ -152,7 +235,7 @@ def _fill_database(pycolmap: Any, path: Path, camera: Camera, files: list[Path])
     return descriptors
 
 
-def _camera(pycolmap: Any, camera: Camera, prior: float) -> Any:
+def _camera(pycolmap: Any, camera: Camera, prior: float, *, held: bool = False) -> Any:
     if camera.fixed is not None:
         model, params = "PINHOLE", list(camera.fixed)
     else:
@@ -162,7 +245,7 @@ def _camera(pycolmap: Any, camera: Camera, prior: float) -> Any:
         width=camera.width,
         height=camera.height,
         params=params,
-        has_prior_focal_length=camera.fixed is not None,
+        has_prior_focal_length=camera.fixed is not None or held,  # else COLMAP begins with one of its own
         camera_id=1,
     )
 
@@ -193,11 +276,17 @@ def _match(
 
 
 def _map(
-    pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float, count: int, *, held: bool
+    pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float, count: int, *, held: bool, ahead: bool
 ) -> list[Model]:
-    """Models of one attempt, the largest first; ``held``: the focal length is about right, and freed at the end."""
+    """Models of one attempt, the largest first.
+
+    Args:
+        pycolmap, folder, number, camera, prior, count: What to map, and where.
+        held: The focal length stays.
+        ahead: The two frames to begin with may lie straight ahead of each other.
+    """
     with pycolmap.Database.open(folder / DATABASE) as database:
-        database.update_camera(_camera(pycolmap, camera, prior))
+        database.update_camera(_camera(pycolmap, camera, prior, held=held))
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.num_threads = options.mapper.num_threads = 1  # several threads add up in another order each time
@@ -207,6 +296,9 @@ def _map(
     options.extract_colors = False
     options.ba_refine_extra_params = camera.fixed is None
     options.ba_refine_focal_length = camera.fixed is None and not held
+    if ahead:
+        options.mapper.init_max_forward_motion = AHEAD_MAX_FORWARD
+        options.mapper.init_min_tri_angle = AHEAD_ANGLE_DEG
     precision = _precision(camera)
     options.mapper.init_max_error *= precision
     options.mapper.abs_pose_max_error *= precision
@@ -235,35 +327,34 @@ def _map(
         initial_image_pair_callback=lambda: step(2),
         next_image_callback=lambda: step(1),
     )
-    if held:
-        found = {index: _freed(pycolmap, out / str(index), prior) for index in found}
-    models = [
-        Model(
-            folder=f"{out.name}/{index}",
-            images=model.num_reg_images(),
-            error_px=float(model.compute_mean_reprojection_error()),
-            focal_px=float(next(iter(model.cameras.values())).mean_focal_length()),
-        )
-        for index, model in found.items()
-    ]
+    models = [_figures(f"{out.name}/{index}", model) for index, model in found.items()]
     size = max(camera.width, camera.height)
     models = [model for model in models if FOCAL_RANGE[0] < model.focal_px / size < FOCAL_RANGE[1]]
     return sorted(models, key=lambda model: (-model.images, model.error_px))
 
 
-def _freed(pycolmap: Any, folder: Path, prior: float) -> Any:
-    """The model in a folder, adjusted with a free focal length; as it was where that runs away from the known one."""
-    held, model = pycolmap.Reconstruction(folder), pycolmap.Reconstruction(folder)
+def _figures(folder: str, model: Any) -> Model:
+    return Model(
+        folder=folder,
+        images=model.num_reg_images(),
+        error_px=float(model.compute_mean_reprojection_error()),
+        focal_px=float(next(iter(model.cameras.values())).mean_focal_length()),
+    )
+
+
+def _freed(pycolmap: Any, folder: Path, held: Model, prior: float) -> Model:
+    """A model, adjusted with a free focal length; as it was where that runs away from the known one."""
+    model = pycolmap.Reconstruction(folder / held.folder)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.solver_options.num_threads = 1  # as above
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
-    focal = float(next(iter(model.cameras.values())).mean_focal_length())
-    if abs(focal / prior - 1) > MAX_FOCAL_CHANGE:
+    freed = _figures(held.folder, model)
+    if abs(freed.focal_px / prior - 1) > MAX_FOCAL_CHANGE:
         return held
-    model.write(folder)
-    return model
+    model.write(folder / held.folder)
+    return freed
 
 
 def _check_focal(pycolmap: Any, folder: Path) -> FocalCheck:
@@ -289,20 +380,109 @@ def _check_focal(pycolmap: Any, folder: Path) -> FocalCheck:
     return FocalCheck(focal[1] / focal[0], (max(0.0, errors[0] - errors[1]) * free_values / errors[1]) ** 0.5)
 
 
+def _settle(
+    pycolmap: Any, folder: Path, camera: Camera, prior: float, *, free: bool, assumed: bool = False
+) -> Sigmas | None:
+    """Adjust the model in a folder until it converges, and tell how exact it is; None where that cannot be told.
+
+    While it maps, COLMAP ends its adjustments early. A straight path fits many focal lengths nearly as well, and then
+    they end far from the best one.
+
+    Args:
+        pycolmap, folder, camera, prior: What to adjust.
+        free: The focal length.
+        assumed: The focal length becomes the prior, and stays.
+    """
+    model = pycolmap.Reconstruction(folder)
+    lens = next(iter(model.cameras.values()))
+    if assumed:
+        lens.params = [prior, *lens.params[1:]]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length, options.refine_extra_params = free, camera.fixed is None
+    options.ceres.solver_options.num_threads = 1  # as above
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    if not adjuster.solve().is_solution_usable():
+        return None
+    focal = float(lens.mean_focal_length())
+    covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+    model.update_point_3d_errors()
+    noise_px = _noise_px(model)
+    of_focal = None
+    if free:
+        of_lens = None if covariance is None else covariance.get_other_params_cov(lens.params)
+        of_focal = 1.0 if of_lens is None else min(1.0, noise_px * float(np.sqrt(of_lens[0, 0])) / focal)
+        in_range = FOCAL_RANGE[0] < focal / max(camera.width, camera.height) < FOCAL_RANGE[1]
+        if of_focal > UNKNOWN_FOCAL or not in_range:
+            held = _settle(pycolmap, folder, camera, prior, free=False, assumed=True)
+            return None if held is None else msgspec.structs.replace(held, focal=max(of_focal, UNKNOWN_FOCAL))
+    model.write(folder)
+    if covariance is None:
+        return None
+    return Sigmas(of_focal, noise_px * _position_sigma(model, covariance), noise_px * _depth_sigma(model, covariance))
+
+
+def _noise_px(model: Any) -> float:
+    """Standard deviation of one coordinate of a feature, by the residuals."""
+    points = model.points3D.values()
+    seen = sum(point.track.length() for point in points)
+    squares = sum(point.track.length() * point.error**2 for point in points)
+    return float(np.sqrt(squares / max(1, 2 * seen - 6 * model.num_reg_images() - 3 * len(points))))
+
+
+def _position_sigma(model: Any, covariance: Any) -> float:
+    """Largest of a camera's place over the length of the path, for features that are off by a pixel."""
+    images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
+    places = np.stack([image.projection_center() for image in images])
+    way = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    largest = 0.0
+    for image in images:
+        of_pose = covariance.get_cam_cov_from_world(image.image_id)
+        if of_pose is None or of_pose.shape != (6, 6):
+            continue  # held
+        R, (x, y, z) = image.cam_from_world().rotation.matrix(), image.cam_from_world().translation
+        across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        # The place is -R^T t. Ceres' tangent of a quaternion is half the angle.
+        jacobian = np.hstack((-2 * R.T @ across, -R.T))
+        largest = max(largest, float(np.sqrt(np.trace(jacobian @ of_pose @ jacobian.T))))
+    return largest / max(way, 1e-12)
+
+
+def _depth_sigma(model: Any, covariance: Any) -> float:
+    """Median of the points' depths as fractions, along the ray from the first frame that sees each; as above."""
+    ids = sorted(model.points3D)
+    fractions: list[float] = []
+    for point_id in ids[:: max(1, len(ids) // MAX_POINT_SIGMAS)]:
+        of_point, point = covariance.get_point_cov(point_id), model.points3D[point_id]
+        if of_point is not None:
+            ray = point.xyz - model.images[point.track.elements[0].image_id].projection_center()
+            fractions.append(float(np.sqrt(ray @ of_point @ ray)) / float(ray @ ray))
+    return float(np.median(fractions)) if fractions else 0.0
+
+
 def _precision(camera: Camera) -> float:
     """Factor of COLMAP's limits in pixels, which are for large photographs."""
     return min(1.0, max(LEAST_PRECISION, max(camera.width, camera.height) / LARGE))
 
 
-def _verified(pycolmap: Any, path: Path, window: int) -> list[Pair]:
+def _verified(pycolmap: Any, path: Path, camera: Camera) -> list[Pair]:
     """Pairs of frames near each other in the sequence, whose matches agree."""
     import cv2
 
+    size = max(camera.width, camera.height)
+    centre = np.array(((camera.width, camera.height), (camera.width, camera.height))) / 2
+    focals = TURN_FOCALS * size if camera.fixed is None else np.array(camera.fixed[:1])
+    if camera.fixed is not None:
+        centre[:] = camera.fixed[2:]
     pairs: list[Pair] = []
     with pycolmap.Database.open(path) as database:
         images = sorted(database.read_all_images(), key=lambda image: image.name)
         for i, first in enumerate(images):
-            for j in range(i + 1, min(i + window + 1, len(images))):
+            for j in range(i + 1, min(i + OVERLAP + 1, len(images))):
                 second = images[j]
                 if not database.exists_two_view_geometry(first.image_id, second.image_id):
                     continue
@@ -314,9 +494,35 @@ def _verified(pycolmap: Any, path: Path, window: int) -> list[Pair]:
                 b = np.asarray(database.read_keypoints(second.image_id))[matches[:, 1], :2]
                 cv2.setRNGSeed(SEED)
                 _, mask = cv2.findHomography(a, b, cv2.RANSAC, 3.0)
-                flat = 0.0 if mask is None else float(mask.mean())
-                pairs.append(Pair(i, j, len(matches), flat))
+                flat, turn = 0.0, 0.0
+                if mask is not None:
+                    flat, on = float(mask.mean()), mask[:, 0] > 0
+                    turn = turned(a - centre[0], b - centre[1], on, focals, TURN_PX * max(1.0, size / 640))
+                pairs.append(Pair(i, j, len(matches), flat, turn))
     return pairs
+
+
+def turned(a: Float64, b: Float64, on: Bool, focals: Float64, limit_px: float) -> float:
+    """Fraction of matches that a turn on the spot explains, with the best of some focal lengths.
+
+    Args:
+        a, b: (N, 2) pixels from the picture's centre, of both frames.
+        on: (N,) those to fit the turn to.
+        focals: Of both frames, in pixels.
+        limit_px: Off the turn at most.
+    """
+    best = 0.0
+    if on.sum() < 3:
+        return best
+    for focal in focals.tolist():
+        rays = [np.column_stack((xy, np.full(len(xy), focal))) for xy in (a, b)]
+        rays = [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]
+        u, _, vt = np.linalg.svd(rays[1][on].T @ rays[0][on])
+        R = u @ np.diag((1.0, 1.0, float(np.sign(np.linalg.det(u @ vt))))) @ vt
+        seen = rays[0] @ R.T
+        ahead = np.maximum(seen[:, 2:], 1e-6)
+        best = max(best, float((np.linalg.norm(focal * seen[:, :2] / ahead - b, axis=1) < limit_px).mean()))
+    return best
 
 
 def _tell(what: str, done: int, total: int) -> None:

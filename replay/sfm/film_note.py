@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import msgspec
 
 from semantic_mapper.replay.log.reader import LogAttachment
+from semantic_mapper.replay.sfm.colmap_process import Sigmas
 
 FILM_ATTACHMENT = "film.json"
 
@@ -20,6 +21,7 @@ class FilmNote(msgspec.Struct, frozen=True):
         picked, registered: Frames that structure from motion was given, and has placed.
         error_px: Mean reprojection error.
         focal_px: In pixels of the film.
+        sigmas: How exact the poses are; None where that cannot be told, and of older logs.
     """
 
     frames: int
@@ -28,6 +30,7 @@ class FilmNote(msgspec.Struct, frozen=True):
     registered: int
     error_px: float
     focal_px: float
+    sigmas: Sigmas | None = None
 
     def attachment(self) -> LogAttachment:
         """As it stands in the log."""

@@ -32,6 +32,7 @@ from semantic_mapper.replay.sfm.film_note import FilmNote
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsFit, place_by_gps
 from semantic_mapper.replay.sfm.refusals import (
     LEAST_ANGLE_DEG,
+    doubt_baseline,
     doubt_focal,
     refuse_features,
     refuse_look,
@@ -142,6 +143,7 @@ class FilmReport:
         pictures: RGB of a few frames of the log, with their times in seconds.
         info: What stands in the log's head.
         bytes: Size of the log.
+        sigmas: How exact focal length, places and depths are; None where that cannot be told.
     """
 
     film: Path
@@ -165,6 +167,7 @@ class FilmReport:
     pictures: tuple[tuple[float, UInt8], ...]
     info: StreamInfo
     bytes: int
+    sigmas: colmap.Sigmas | None = None
 
     @property
     def path_m(self) -> float:
@@ -307,7 +310,7 @@ class _Import:
         models, attempt = self._judge(outcome, look, picked)
         placed, scale, height, others = self._orient(models, look, picked, board)
         chosen = attempt.models[0]
-        report = self._write(dst, look, picked, placed, scale, chosen.error_px, overwrite=overwrite)
+        report = self._write(dst, look, picked, placed, scale, chosen.error_px, outcome.sigmas, overwrite=overwrite)
         ratio = film.full_width / film.width
         return FilmReport(
             film=film.path,
@@ -331,6 +334,7 @@ class _Import:
             pictures=tuple(report.pictures),
             info=report.info,
             bytes=dst.stat().st_size,
+            sigmas=outcome.sigmas,
         )
 
     def _find_features(self, look: FilmLook, rows: Int64, board: BoardScale | None) -> list[int]:
@@ -393,24 +397,24 @@ class _Import:
         Raises:
             FilmError: see ``refuse_outcome``.
         """
-        best = max(
-            outcome.attempts,
-            key=lambda a: (a.models[0].images, -a.models[0].error_px) if a.models else (0, 0.0),
-        )
+        best = outcome.attempts[colmap.best_attempt(outcome.attempts)]
         models = [read_model(self._folder / model.folder) for model in best.models]
         spans = [[int(image.name) for image in model.images] for model in models]
         times = [_seconds(look, index) for index in picked]
         refuse_outcome(self._film.path, outcome, times, spans)
-        if _parallax_deg(models[0]) < LEAST_ANGLE_DEG:
+        angle_deg = _parallax_deg(models[0])
+        if angle_deg < LEAST_ANGLE_DEG:
             raise turning(self._film.path)
+        self._notices += doubt_baseline(best.ahead, angle_deg, outcome.sigmas)
         if outcome.focal is not None and self._lens.measured is not None:
             given_px = self._lens.measured.fx * self._film.full_width / self._film.width
             doubt = doubt_focal(self._film.path, self._options.calibration, given_px, outcome.focal)
             self._notices += [doubt] if doubt else []
-        tried = len(outcome.attempts)
-        if tried > 1:
-            priors = ", ".join(f"{a.focal_prior_px:.0f}" for a in outcome.attempts)
-            self._notices.append(f"{tried} focal lengths were tried: {priors} px; that of the largest model was kept")
+        priors = list(dict.fromkeys(f"{a.focal_prior_px:.0f}" for a in outcome.attempts))
+        if len(priors) > 1:
+            self._notices.append(
+                f"{len(priors)} focal lengths were tried: {', '.join(priors)} px; that of the largest model was kept"
+            )
         return models, best
 
     def _orient(
@@ -552,6 +556,7 @@ class _Import:
         placed: _Placed,
         scale: str,
         error_px: float,
+        sigmas: colmap.Sigmas | None,
         *,
         overwrite: bool,
     ) -> _Written:
@@ -608,7 +613,13 @@ class _Import:
                 counts[part.reason] += part.frames
             ratio = film.full_width / film.width
             note = FilmNote(
-                len(look.index), dict(counts), len(picked), len(placed.frames), error_px, placed.seen.fx * ratio
+                frames=len(look.index),
+                left_out=dict(counts),
+                picked=len(picked),
+                registered=len(placed.frames),
+                error_px=error_px,
+                focal_px=placed.seen.fx * ratio,
+                sigmas=sigmas,
             )
             writer.attach(note.attachment())
         for file, reason in film.odd_pictures.items():

@@ -7,7 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair
+from semantic_mapper.replay.sfm.colmap_process import (
+    LINK_MATCHES,
+    UNKNOWN_FOCAL,
+    FocalCheck,
+    Outcome,
+    Sigmas,
+    flat_fraction,
+    turn_fraction,
+)
 from semantic_mapper.replay.sfm.selection import STEP, FilmLook
 
 LEAST_PICKS = 8
@@ -16,11 +24,11 @@ STILL = 0.1  # of the image's width: less motion in all is a camera that stands 
 MOST_DARK = 0.7  # of the frames
 LEAST_FEATURES = 80  # of a frame that can be matched, the median
 LEAST_LINKED = 0.5  # of the neighbours in the sequence
-LINK_MATCHES = 20
-FLAT = 0.93  # of the matches that one homography explains: nothing but a turn, or one plane
+MOST_TURNED = 0.9  # of the pairs some steps apart, that a turn explains: their model is noise, however large
 LEAST_MODEL = 0.6  # of the picked frames in the largest model
 LEAST_ANGLE_DEG = 1.0  # between the rays to a point, the median: less is a camera that turns on the spot
 DOUBTED_FOCAL, WRONG_FOCAL = 0.05, 0.1  # of a given focal length: its difference from what the pictures say
+UNSURE_FOCAL, UNSURE_DEPTH, UNSURE_POSITION = 0.02, 0.03, 0.02  # standard deviations that are worth a note
 LEAST_SIGMAS = 10.0  # of this difference: rolling shutter and the like make a few
 _HOW = "film again: walk slowly, sideways past things with texture, in good light"
 
@@ -110,7 +118,7 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
             f"camera moves too fast, or what it sees changes or has no texture; {_HOW}",
         )
     if not spans:
-        if flat_fraction(outcome.pairs) >= 0.5:
+        if max(flat_fraction(outcome.pairs), turn_fraction(outcome.pairs)) >= 0.5:
             raise turning(film)
         raise FilmError(
             film,
@@ -118,8 +126,10 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
             "no two of its pictures show one place from two sides far enough apart; give --calibration or "
             f"--focal-prior where the lens is unusual, or {_HOW}",
         )
+    if turn_fraction(outcome.pairs) >= MOST_TURNED:
+        raise turning(film)
     if len(spans[0]) < LEAST_MODEL * picks:
-        if flat_fraction(outcome.pairs) >= 0.5:  # what models it gives are noise
+        if max(flat_fraction(outcome.pairs), turn_fraction(outcome.pairs)) >= 0.5:  # what models it gives are noise
             raise turning(film)
         listed = "; ".join(
             f"{times_s[min(span)]:.1f} to {times_s[max(span)]:.1f} s ({len(span)} of {picks} views)"
@@ -168,7 +178,37 @@ def doubt_focal(film: object, calibration: object, focal_px: float, check: Focal
     return text
 
 
-def flat_fraction(pairs: Sequence[Pair]) -> float:
-    """Of the pairs some steps apart, those that one homography explains."""
-    apart = [p for p in pairs if p.second - p.first >= 2 and p.matches >= LINK_MATCHES]
-    return float(np.mean([p.flat >= FLAT for p in apart])) if apart else 0.0
+def doubt_baseline(ahead: bool, angle_deg: float, sigmas: Sigmas | None) -> list[str]:
+    """Notes on what a film tells badly, because its camera hardly moves sideways; none where it tells all.
+
+    Args:
+        ahead: The model begins with two frames that lie straight ahead of each other.
+        angle_deg: Between the rays to a point, the median.
+        sigmas: Of the model.
+    """
+    notes: list[str] = []
+    weak = ahead or sigmas is None or sigmas.depth > UNSURE_DEPTH or sigmas.position > UNSURE_POSITION
+    if weak:
+        how = "how exact the poses are cannot be told"
+        if sigmas is not None:
+            depth, position = _percent(sigmas.depth), _percent(sigmas.position)
+            how = f"depths are exact to {depth} (median), places to {position} of the way"
+        notes.append(
+            f"the camera {'goes straight ahead' if ahead else 'hardly changes its side'}: half of the points are seen "
+            f"from less than {angle_deg:.1f} degrees apart; {how} (one standard deviation, noise of the features alone)"
+        )
+    if sigmas is not None and sigmas.focal is not None and sigmas.focal > UNSURE_FOCAL:
+        found = (
+            f"is assumed: by the film alone it is exact to {_percent(sigmas.focal)}"
+            if sigmas.focal > UNKNOWN_FOCAL
+            else f"is exact to {_percent(sigmas.focal)} only"
+        )
+        notes.append(
+            f"the focal length {found}; a straight way fits many nearly as well, and lengths along it against those "
+            "across are off by as much; calibrate the camera and give --calibration"
+        )
+    return notes
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.2g} %"

@@ -14,6 +14,7 @@ from semantic_mapper.types import Bool, Float64, Int64, UInt8
 LOOK_WIDTH = 320  # frames are looked at in this size
 STEP = 0.04  # motion between two picked frames, of the image's width
 LEAST_MOTION = 0.005  # ... below which two frames are one
+EDGES = 0.75  # weight of what moves fast: straight ahead most of the picture hardly moves, and its edges pass by
 MAX_PICKS = 400  # longer ways get longer steps
 BLURRED = 0.5  # of the sharpness of the frames around: less is a blurred frame
 AROUND_NS = 700_000_000  # either side
@@ -28,7 +29,9 @@ class FilmLook:
     Args:
         index: (N,) number of the frame in the film.
         stamp_ns: (N,) rising.
-        motion: (N,) since the frame before, of the image's width; NaN where it could not be followed.
+        motion: (N,) since the frame before, of the image's width: median of what is followed; NaN where nothing is.
+        fast: (N,) the same of what moves most: 85th percentile. Without rotation, a camera moving sideways has about
+            1.25 times the median, one moving straight ahead 2 to 3 times.
         sharpness: (N,) RMS of the Laplacian over the contrast, to be compared with frames nearby only.
         dark: (N,) whether it shows nothing: black, covered, or one colour.
     """
@@ -36,6 +39,7 @@ class FilmLook:
     index: Int64
     stamp_ns: Int64
     motion: Float64
+    fast: Float64
     sharpness: Float64
     dark: Bool
 
@@ -52,27 +56,28 @@ class FilmLook:
     @property
     def way(self) -> Float64:
         """(N,) motion since the first frame; one that could not be followed counts as a whole step."""
-        return np.cumsum(np.nan_to_num(self.motion, nan=STEP))
+        return np.cumsum(np.nan_to_num(np.maximum(self.motion, EDGES * self.fast), nan=STEP))
 
 
 def look_through(film: Film, on_frame: Callable[[int], None]) -> FilmLook:
     """Read a film once; ``on_frame`` gets the number of frames read."""
-    rows: list[tuple[int, int, float, float, bool]] = []
+    rows: list[tuple[int, int, float, float, float, bool]] = []
     last: UInt8 | None = None
     height = max(1, round(LOOK_WIDTH * film.height / film.width))
     for frame in film:
         gray = np.asarray(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
         small = np.asarray(cv2.resize(gray, (LOOK_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
         dark = bool(small.mean() < DARK and small.std() < 2 * FLAT) or bool(small.std() < FLAT)
-        motion = 0.0 if last is None else _motion(last, small)
-        rows.append((frame.index, frame.stamp_ns, motion, _sharpness(gray), dark))
+        motion, fast = (0.0, 0.0) if last is None else _motion(last, small)
+        rows.append((frame.index, frame.stamp_ns, motion, fast, _sharpness(gray), dark))
         last = small
         on_frame(len(rows))
-    index, stamps, motion, sharpness, dark = zip(*rows, strict=True) if rows else ((), (), (), (), ())
+    index, stamps, motion, fast, sharpness, dark = zip(*rows, strict=True) if rows else ((),) * 6
     return FilmLook(
         np.array(index, np.int64),
         np.array(stamps, np.int64),
         np.array(motion, np.float64),
+        np.array(fast, np.float64),
         np.array(sharpness, np.float64),
         np.array(dark, np.bool_),
     )
@@ -96,16 +101,17 @@ def _sharpness(gray: UInt8) -> float:
     return float(cv2.Laplacian(gray, cv2.CV_32F).std()) / max(float(gray.std()), 1.0)
 
 
-def _motion(last: UInt8, now: UInt8) -> float:
-    """Median motion of corners, of the width; NaN where they cannot be followed."""
+def _motion(last: UInt8, now: UInt8) -> tuple[float, float]:
+    """Median and 85th percentile of the motion of corners, of the width; NaN where they cannot be followed."""
     corners = cv2.goodFeaturesToTrack(last, _CORNERS, 0.01, 7)
     if corners is None or len(corners) < _LEAST_TRACKED:
-        return float("nan")
+        return float("nan"), float("nan")
     moved, found, _ = cv2.calcOpticalFlowPyrLK(last, now, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(
         now, last, moved, np.zeros_like(corners), winSize=(15, 15), maxLevel=3
     )
     true = (np.linalg.norm(back - corners, axis=2) < 1.0) & (found > 0) & (found_back > 0)
     if true.sum() < _LEAST_TRACKED:
-        return float("nan")
-    return float(np.median(np.linalg.norm(moved - corners, axis=2)[true])) / now.shape[1]
+        return float("nan"), float("nan")
+    median, fast = np.percentile(np.linalg.norm(moved - corners, axis=2)[true], (50, 85)) / now.shape[1]
+    return float(median), float(fast)

@@ -56,8 +56,11 @@ def street_camera(width: int) -> CameraIntrinsics:
     return CameraIntrinsics(FULL_FOCAL * s, FULL_FOCAL * s, *centre, width, round(FULL_HEIGHT * s))
 
 
-def street_pose(street: Street, number: int) -> Float64:
-    """T_world_camera (4, 4) of the left camera: in the right lane, with the small sway of a car."""
+def street_pose(street: Street, number: float) -> Float64:
+    """T_world_camera (4, 4) of the left camera: in the right lane, with the small sway of a car.
+
+    Numbers between those of frames give places between them.
+    """
     rng = np.random.default_rng((STREETS_CODE, STREETS_VERSION, street.scene.seed, _POSE_STREAM))
     phase, s = rng.uniform(0, 2 * np.pi, 3), number * STEP_M
     x, y, yaw = street.way.at(s, LANE_M + 0.2 * float(np.sin(s / 17 + phase[0])))

@@ -107,12 +107,13 @@ def test_the_look_measures_motion_and_finds_blurred_and_dark_frames(tmp_path: Pa
     assert look.motion[1:4] == pytest.approx(2 / 128, rel=0.3)
 
 
-def look_of(motion: list[float], sharpness: list[float] | None = None) -> FilmLook:
+def look_of(motion: list[float], sharpness: list[float] | None = None, fast: list[float] | None = None) -> FilmLook:
     count = len(motion)
     return FilmLook(
         np.arange(count),
         np.arange(count) * 33_000_000,
         np.array(motion),
+        np.array(motion if fast is None else fast),
         np.array(sharpness or [1.0] * count),
         np.zeros(count, np.bool_),
     )
@@ -124,6 +125,19 @@ def test_of_each_step_of_motion_the_sharpest_frame_is_picked() -> None:
     assert pick_frames(look, step=0.04).tolist() == [1, 5]
     still = look_of([0.0] * 8, sharpness)
     assert pick_frames(still).tolist() == [5]
+
+
+def test_straight_ahead_the_edges_of_the_picture_tell_the_step() -> None:
+    sideways, ahead = look_of([0.01] * 41), look_of([0.01] * 41, fast=[0.03] * 41)
+    assert len(pick_frames(sideways)) == 11 and len(pick_frames(ahead)) == 23
+
+
+def test_the_look_measures_what_moves_at_the_edges(tmp_path: Path) -> None:
+    card_px = np.kron(np.random.default_rng(0).integers(0, 255, (12, 16), np.uint8), np.ones((20, 20), np.uint8))
+    zoomed = [cv2.warpAffine(card_px, cv2.getRotationMatrix2D((159, 119), 0, 1.01**n), (320, 240)) for n in range(6)]
+    pictures = [np.asarray(gray, np.uint8)[..., None].repeat(3, 2) for gray in zoomed]
+    look = look_through(Film(films.write_film(tmp_path / "a.avi", pictures)), lambda _: None)
+    assert (look.fast[1:] > 1.3 * look.motion[1:]).all()
 
 
 def test_a_long_way_gets_longer_steps() -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.drone_pictures import DIAGONAL_35MM, rows_over, save_picture
+from benchmarks.forward_film import compare, pinhole, street_drive
+from benchmarks.video import write_film
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.evaluation.trajectory import align_similar
@@ -192,6 +194,32 @@ def test_a_camera_that_turns_on_the_spot_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FilmError) as caught:
         import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
     assert caught.value.reason == "turning"
+
+
+@pytest.mark.slow
+def test_a_camera_that_stands_and_looks_around_is_refused(tmp_path: Path) -> None:
+    from semantic_mapper.scenes.camera import pose_of
+
+    start = films.walk(1)[0][:3, 3]
+    poses = np.stack([pose_of(start, 0.35 * np.sin(n / 6), 0.03 * np.sin(n / 3) - 0.1) for n in range(60)])
+    film = films.write_film(tmp_path / "a.mp4", films.take(poses))
+    with pytest.raises(FilmError) as caught:
+        import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
+    assert caught.value.reason == "turning"
+
+
+@pytest.mark.slow
+def test_a_drive_straight_ahead_is_reconstructed(tmp_path: Path) -> None:
+    drive = street_drive(200_000, 60, 480)
+    write_film(tmp_path / "drive.mp4", drive)
+    save_calibration(tmp_path / "camera.toml", pinhole(480), None, {})
+    log, options = tmp_path / "drive.mcap", FilmOptions(tmp_path / "camera.toml")
+    found = import_film(tmp_path / "drive.mp4", log, options, quiet)
+    path = compare(log, drive.poses)
+    assert found.registered >= 0.95 * found.picked and found.frames >= 30
+    assert path.rmse_m < 0.002 * path.way_m and path.rotation_deg < 0.5 and path.drift == pytest.approx(1, abs=0.03)
+    assert found.sigmas is not None and path.rmse_m < 3 * found.sigmas.position * path.way_m
+    assert "straight ahead" in " ".join(found.notices)
 
 
 @pytest.mark.slow

@@ -3,8 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair
-from semantic_mapper.replay.sfm.refusals import FilmError, doubt_focal, refuse_features, refuse_look, refuse_outcome
+from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair, Sigmas
+from semantic_mapper.replay.sfm.refusals import (
+    FilmError,
+    doubt_baseline,
+    doubt_focal,
+    refuse_features,
+    refuse_look,
+    refuse_outcome,
+)
 from semantic_mapper.replay.sfm.selection import FilmLook
 
 
@@ -12,6 +19,7 @@ def look_of(motion: float, count: int = 60, dark: float = 0.0) -> FilmLook:
     return FilmLook(
         np.arange(count),
         np.arange(count) * 100_000_000,
+        np.full(count, motion),
         np.full(count, motion),
         np.ones(count),
         np.arange(count) < dark * count,
@@ -43,9 +51,9 @@ def test_frames_without_features_are_refused() -> None:
 TIMES = [0.5 * n for n in range(20)]
 
 
-def outcome(linked: int, flat: float = 0.5) -> Outcome:
-    near = [Pair(n, n + 1, 100, flat) for n in range(linked)]
-    return Outcome([], near + [Pair(n, n + 3, 60, flat) for n in range(linked)], [500] * 20)
+def outcome(linked: int, flat: float = 0.5, turn: float = 0.2) -> Outcome:
+    near = [Pair(n, n + 1, 100, flat, turn) for n in range(linked)]
+    return Outcome([], near + [Pair(n, n + 3, 60, flat, turn) for n in range(linked)], [500] * 20)
 
 
 def test_a_film_that_hangs_together_passes() -> None:
@@ -59,6 +67,8 @@ def test_a_film_that_hangs_together_passes() -> None:
         (outcome(19, flat=0.99), [], "turning", "turns on the spot"),
         (outcome(19, flat=0.99), [range(4)], "turning", "turns on the spot"),
         (outcome(19, flat=0.99), [range(5), range(8, 12)], "turning", "turns on the spot"),
+        (outcome(19, flat=0.9, turn=0.9), [], "turning", "turns on the spot"),
+        (outcome(19, flat=0.9, turn=0.9), [range(20)], "turning", "turns on the spot"),
         (outcome(19), [], "no-matches", "from two sides"),
         (outcome(19), [range(9), range(11, 19)], "several-scenes", r"0.0 to 4.0 s \(9 of 20 views\); 5.5 to 9.0 s"),
     ],
@@ -78,3 +88,13 @@ def test_a_calibration_is_doubted_where_the_pictures_are_sure() -> None:
     with pytest.raises(FilmError, match=r"500 px .* 1000 px") as caught:
         doubt(2.0, 50.0)
     assert caught.value.reason == "calibration"
+
+
+def test_what_a_straight_way_tells_badly_is_noted() -> None:
+    assert doubt_baseline(False, 12.0, Sigmas(0.003, 0.004, 0.01)) == []
+    (ahead,) = doubt_baseline(True, 6.3, Sigmas(None, 0.0074, 0.011))
+    assert "straight ahead" in ahead and "6.3 degrees" in ahead and "1.1 % (median)" in ahead and "0.74 %" in ahead
+    assert "cannot be told" in doubt_baseline(False, 6.3, None)[0]
+    (lens,) = doubt_baseline(False, 12.0, Sigmas(0.047, 0.004, 0.01))
+    assert "exact to 4.7 % only" in lens and "--calibration" in lens
+    assert "57 %" in doubt_baseline(True, 6.3, Sigmas(0.57, 0.01, 0.01))[1]

@@ -1,0 +1,85 @@
+"""Where a reconstruction begins: cameras that go straight ahead, and cameras that only turn; features, no pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from semantic_mapper.evaluation.trajectory import align_similar
+from semantic_mapper.geometry import transform
+from semantic_mapper.replay.sfm import colmap_process as colmap
+from semantic_mapper.replay.sfm.colmap_model import read_model
+from semantic_mapper.scenes.daylight import pose_of
+from semantic_mapper.types import Float64
+
+W, H, FOCAL, FRAMES = 640, 360, 400.0, 10
+AHEAD = np.stack([pose_of(np.array([0.6 * n, 0.0, 1.5]), 0.0, 0.0) for n in range(FRAMES)])  # no sway at all
+TURN = np.stack([pose_of(np.array([0.0, 0.0, 1.5]), yaw, 0.0) for yaw in np.linspace(0.0, 0.6, FRAMES)])
+
+
+def street(rng: np.random.Generator) -> Float64:
+    """(N, 3) points of houses on both sides, and of a road."""
+    x, side = rng.uniform(2, 40, 500), rng.choice([-1.0, 1.0], 500)
+    houses = np.column_stack((x, side * rng.uniform(4, 7, 500), rng.uniform(0, 6, 500)))
+    return np.concatenate((houses, np.column_stack((x[:150], rng.uniform(-3, 3, 150), np.zeros(150)))))
+
+
+def reconstruct(folder: Path, poses: Float64, camera: colmap.Camera) -> colmap.Outcome:
+    """What the process makes of the features of a street, seen from poses (N, 4, 4)."""
+    rng = np.random.default_rng(0)
+    points = street(rng)
+    descriptors = rng.integers(0, 90, (len(points), 128)).astype(np.float64)
+    descriptors = np.round(512 * descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.uint8)
+    (folder / colmap.FEATURES).mkdir()
+    for n, pose in enumerate(poses):
+        seen = transform(np.linalg.inv(pose), points)
+        xy = FOCAL * seen[:, :2] / np.maximum(seen[:, 2:], 1e-6) + np.array([W / 2, H / 2]) - 0.5
+        xy += 0.3 * rng.standard_normal(xy.shape)
+        rows = np.flatnonzero((seen[:, 2] > 1) & (seen[:, 2] < 30) & (abs(xy - (W / 2, H / 2)) < (W / 2, H / 2)).all(1))
+        np.savez(
+            folder / colmap.FEATURES / f"{n:06d}.npz", xy=xy[rows].astype(np.float32), descriptors=descriptors[rows]
+        )
+    (folder / colmap.REQUEST).write_bytes(msgspec.json.encode(camera))
+    colmap.main(folder)
+    return msgspec.json.decode((folder / colmap.RESULT).read_bytes(), type=colmap.Outcome)
+
+
+CALIBRATED = colmap.Camera(W, H, (FOCAL, FOCAL, W / 2, H / 2), (FOCAL,))
+
+
+def test_a_camera_that_goes_straight_ahead_is_placed(tmp_path: Path) -> None:
+    outcome = reconstruct(tmp_path, AHEAD, CALIBRATED)
+    usual, ahead = outcome.attempts
+    assert not usual.ahead and (not usual.models or usual.models[0].images < FRAMES)
+    assert ahead.ahead and ahead.models[0].images == FRAMES
+    model = read_model(tmp_path / ahead.models[0].folder)
+    found, true = np.stack([image.T_world_camera[:3, 3] for image in model.images]), AHEAD[:, :3, 3]
+    T, scale = align_similar(found, true)
+    assert np.linalg.norm(transform(T, scale * found) - true, axis=1).max() < 0.03  # of a way of 5.4 m
+    assert outcome.sigmas is not None and outcome.sigmas.focal is None
+    assert 0.0002 < outcome.sigmas.position < 0.02 and 0.002 < outcome.sigmas.depth < 0.05
+    assert colmap.turn_fraction(outcome.pairs) == 0
+
+
+def test_a_straight_way_does_not_tell_the_focal_length_and_says_so(tmp_path: Path) -> None:
+    outcome = reconstruct(tmp_path, AHEAD, colmap.Camera(W, H, None, (1.2 * FOCAL,)))
+    best = outcome.attempts[colmap.best_attempt(outcome.attempts)]
+    assert best.ahead and best.models[0].images == FRAMES
+    assert outcome.sigmas is not None and outcome.sigmas.focal is not None
+    kept = next(iter(read_model(tmp_path / best.models[0].folder).cameras.values())).fx
+    assert outcome.sigmas.focal > colmap.UNKNOWN_FOCAL and kept == pytest.approx(1.2 * FOCAL)
+
+
+def test_a_camera_that_only_turns_is_recognised_and_not_begun_straight_ahead(tmp_path: Path) -> None:
+    outcome = reconstruct(tmp_path, TURN, CALIBRATED)
+    assert colmap.turn_fraction(outcome.pairs) == 1 and not any(a.ahead for a in outcome.attempts)
+
+
+def test_the_best_attempt_has_the_largest_model_then_the_smallest_error() -> None:
+    def attempt(*models: tuple[int, float]) -> colmap.Attempt:
+        return colmap.Attempt(500.0, [colmap.Model("", images, error, 500.0) for images, error in models])
+
+    assert colmap.best_attempt([attempt(), attempt((9, 0.4), (2, 0.1)), attempt((9, 0.3)), attempt((5, 0.1))]) == 2
