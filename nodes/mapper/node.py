@@ -365,7 +365,7 @@ class _Mapper:
 
     def _publish_status(self, state: NodeState, *, now: bool = False) -> None:
         from semantic_mapper.mapping.map_scale import MEND
-        from semantic_mapper.transport.codec import encode
+        from semantic_mapper.nodes.status import publish_status
         from semantic_mapper.transport.messages import Status
 
         if not now and time.monotonic() - self._last_status < STATUS_PERIOD_S:
@@ -412,7 +412,7 @@ class _Mapper:
             counters |= self._refinement.counters
             degraded += self._refinement.degraded
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, degraded)
-        self._publisher.publish(encode(status))
+        publish_status(self._publisher, status)
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

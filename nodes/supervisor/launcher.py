@@ -66,7 +66,8 @@ class Launcher:
         """Watch until all nodes have ended, one has failed for good, or a stop is requested; then end all in order.
 
         Raises:
-            NodeError: a node failed, hung, or had to be killed; names it and its last words.
+            NodeError: a node failed, hung, had to be killed, or says at its end what it has lost; names it and its
+                last words.
         """
         while not stop and not self._failures() and self._sources_run():
             self._look_after_all()
@@ -79,7 +80,7 @@ class Launcher:
         for kind in PROCESS_TABLE:
             self._end(kind, stop)
         self._status.report(self._processes, "ended", now=True)
-        if failures := self._failures():
+        if failures := self._failures() + [p.loss for p in self._processes if p.loss and not p.failure]:
             raise NodeError("; then ".join(failures))
 
     def _start(self, folder: Path) -> None:

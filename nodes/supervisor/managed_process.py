@@ -88,10 +88,15 @@ class ManagedProcess:
         return "running" if self.process.heartbeat.ready else "starting"
 
     @property
+    def loss(self) -> str:
+        """What a node that has ended in order has lost, with its last words; empty = nothing that it knows of."""
+        return self.process.describe_end() if self.process is not None and self.process.has_lost else ""
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What happened to it lately."""
-        if self.failure:
-            return (self.failure,)
+        if self.failure or self.loss:
+            return (self.failure or self.loss,)
         lately = self._backoff.lately(time.monotonic())
         if not lately:
             return ()
