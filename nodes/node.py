@@ -15,7 +15,7 @@ import structlog
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.memory import is_out_of_memory, memory_message
+from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
 from semantic_mapper.nodes.process import STOP_SIGNAL, StopRequest, prepare_process
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
@@ -132,12 +132,9 @@ def run_node(
     except SemanticMapperError as error:
         _log.error(FAILURE_EVENT, error=str(error))
     except Exception as error:
-        if is_out_of_memory(error):  # native packages raise whatever they like then
-            _log.error(FAILURE_EVENT, error=memory_message(error))
-        elif isinstance(error, OSError):
-            _log.error(FAILURE_EVENT, error=str(error))
-        else:
+        if not (message := failure_message(error)):
             raise
+        _log.error(FAILURE_EVENT, error=message)
     sys.exit(code)
 
 

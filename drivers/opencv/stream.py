@@ -13,6 +13,8 @@ from semantic_mapper.drivers.opencv.config import Config
 from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import CameraError
 
+MIN_HZ = 1e-3  # of a film or camera: one divided by it is still a time
+
 
 class StreamDevice:
     """A ``Device`` (drivers/live.py) over a URL.
@@ -74,5 +76,5 @@ class StreamDevice:
 
 
 def nominal_hz(told: float) -> float:
-    """A rate as a container tells it; 0 for what cannot be one."""
-    return told if 0 < told <= 1000 else 0.0
+    """A rate as a container or a device tells it; 0 for what cannot be one."""
+    return told if MIN_HZ <= told <= 1000 else 0.0
