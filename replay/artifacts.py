@@ -24,6 +24,7 @@ from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
+from semantic_mapper.redaction import plain_without_secrets
 from semantic_mapper.types import Float64
 
 if TYPE_CHECKING:  # session imports this module
@@ -218,9 +219,9 @@ def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write JSON atomically."""
+    """Write JSON atomically, without secrets of the addresses in it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+    write_bytes(path, (json.dumps(plain_without_secrets(data), indent=1, allow_nan=False) + "\n").encode())
 
 
 def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from semantic_mapper.nodes.cli.console import stderr_console
 from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.process import prepare_process
 from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import without_secrets
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
@@ -132,5 +133,6 @@ def _check_values(options: Mapping[str, object]) -> None:
 
 def show_error(message: str) -> None:
     """One red line on stderr."""
-    line = Text.assemble(("error: ", "bold red"), (visible(" ".join(message.split("\n"))), "red"))
+    message = without_secrets(" ".join(message.split("\n")))
+    line = Text.assemble(("error: ", "bold red"), (visible(message), "red"))
     stderr_console().print(line, soft_wrap=True)

@@ -22,6 +22,7 @@ from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatMonitor
 from semantic_mapper.nodes.supervisor.process_table import PROCESS_TABLE
 from semantic_mapper.nodes.supervisor.systemd import SYSTEMD_VARIABLES
 from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import without_secrets
 
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
@@ -158,7 +159,7 @@ class NodeProcess:
     def _pass_on(self) -> None:
         with os.fdopen(self._output, "rb") as stream:
             for raw in stream:
-                line = visible(raw.decode(errors="replace").rstrip("\n"))
+                line = visible(without_secrets(raw.decode(errors="replace").rstrip("\n")))
                 self.tail.append(line)
                 try:
                     sys.stderr.write(f"[{self.name}] {line}\n")
