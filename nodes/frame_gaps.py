@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+MAX_MISSED = 2**53  # numbers may jump by anything; beyond this, sums of counts would not be exact in every reader
+
 
 class Gaps:
-    """Counts the gaps between the numbers of frames, camera by camera."""
+    """Counts the gaps between the numbers of frames, camera by camera.
+
+    Attributes:
+        missed: Frames, ``MAX_MISSED`` at most.
+    """
 
     def __init__(self) -> None:
         self.missed = 0
@@ -20,4 +26,4 @@ class Gaps:
         if seq <= last:
             self.begun_anew += 1
         else:
-            self.missed += seq - last - 1
+            self.missed = min(self.missed + seq - last - 1, MAX_MISSED)

@@ -15,11 +15,11 @@ import structlog
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.memory import is_out_of_memory, memory_message
+from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
 from semantic_mapper.nodes.process import STOP_SIGNAL, StopRequest, prepare_process
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.nodes.supervisor.node_process import FAILURE_EVENT, JOB_PREFIX
+from semantic_mapper.nodes.supervisor.node_process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT
 
 _log = structlog.get_logger(__name__)
 
@@ -92,16 +92,17 @@ class NodeContext:
 
 
 def run_node(
-    kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], None], job: NodeJob | None = None
+    kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], str | None], job: NodeJob | None = None
 ) -> NoReturn:
-    """Run a node to its end and exit: 0 done (also when asked to stop), 1 failed with one line that says why.
+    """Run a node to its end and exit: 0 done (also when asked to stop), 1 failed with one line that says why,
+    ``EXIT_LOSS`` done, but a part of what it was to keep is lost, with one line that says what.
 
     In a launch only the launcher's ``STOP_SIGNAL`` asks for an end that is one: after SIGTERM or SIGINT of anybody
     else, a restartable node does what it does at its end, and exits with 128 + the signal's number.
 
     Args:
         kind: Of its options.
-        work: Does it all; looks at ``stop`` often.
+        work: Does it all; looks at ``stop`` often. Returns what is lost, in words, if anything.
         job: What it is to do; None = what its one argument says.
     """
     prepare_process()
@@ -123,17 +124,17 @@ def run_node(
                 folder=Path(job.folder) if job.folder else None,
                 restartable=job.restartable,
             )
-            work(context, options)
+            losses = work(context, options)
         code = stop.exit_code if job.heartbeat_fd >= 0 else 0
+        if losses and not code:
+            _log.error(LOSS_EVENT, lost=losses)
+            code = EXIT_LOSS
     except SemanticMapperError as error:
         _log.error(FAILURE_EVENT, error=str(error))
     except Exception as error:
-        if is_out_of_memory(error):  # native packages raise whatever they like then
-            _log.error(FAILURE_EVENT, error=memory_message(error))
-        elif isinstance(error, OSError):
-            _log.error(FAILURE_EVENT, error=str(error))
-        else:
+        if not (message := failure_message(error)):
             raise
+        _log.error(FAILURE_EVENT, error=message)
     sys.exit(code)
 
 

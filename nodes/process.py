@@ -15,6 +15,7 @@ from typing import Any, Self
 import structlog
 
 from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import without_secrets
 
 STOP_SIGNAL = signal.SIGUSR1  # by which a launcher asks its nodes to end: SIGTERM may come from anybody
 MAX_THREADS = 16  # more gain nothing on the small work of one frame
@@ -136,9 +137,10 @@ def _make_logger(*names: Any) -> structlog.PrintLogger:
 
 
 def _one_line(logger: Any, method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
-    """Keep one event on one line and the terminal as it is, whatever a message says."""
-    return {k: _shown(v, k) if isinstance(v, str) else v for k, v in event.items()}
+    """Keep one event on one line, the terminal as it is, and secrets out, whatever a message says."""
+    return {k: v if isinstance(v, bool | int | float | None) else _shown(str(v), k) for k, v in event.items()}
 
 
 def _shown(text: str, key: str) -> str:
+    text = without_secrets(text)
     return visible(text, keep="\n") if key == "exception" else visible(text.replace("\n", " | "))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -42,24 +42,60 @@ MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones ar
 PACKAGES = ("torch", "open3d", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
 
-def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> dict[str, Any]:
-    """Write everything to ``out`` (made if missing); the summary comes last, so its presence means "complete"."""
+def write_artifacts(
+    session: MapSession,
+    out: Path,
+    rerun: RerunLog | None,
+    more: Mapping[str, Any],
+    progress: Callable[[], object] = lambda: None,
+) -> dict[str, Any]:
+    """Write everything to ``out`` (made if missing): first the map, then the summary, pictures last.
+
+    Each file is there whole or not at all, whenever the process is killed; what an earlier run left is removed first,
+    but for its map. A summary that is there means that the map beside it is whole, and the one that it is of.
+
+    Args:
+        session: To be written.
+        out: The folder.
+        rerun: Gets the map, too.
+        more: What else the summary says.
+        progress: Called after each step.
+
+    Returns:
+        The summary.
+
+    Raises:
+        MapError: the map cannot be written.
+    """
     from semantic_mapper.queries.graph import find_graph  # needs SciPy, which machines that train lack
 
     out.mkdir(parents=True, exist_ok=True)
-    points = session.pipeline.voxel_map.points()
+    clear_results(out)
     voxel_map = session.pipeline.voxel_map
+    voxel_map.save(out / "map.npz", progress)
+    points = voxel_map.points()
+    progress()
     write_ply(out / "map.ply", points, session.pipeline.label_set, scale_known=voxel_map.scale_known)
-    voxel_map.save(out / "map.npz")
-    graph = find_graph(voxel_map)
-    _draw_overview(session, points, graph, out / "overview.png")
-    if rerun is not None:
-        rerun.finish(points, graph)
-    summary = build_summary(session, points)
+    progress()
+    summary = {**build_summary(session, points), **more}
     if summary["map"]["nearly_empty"]:
         _log.warning("map_nearly_empty", reason=summary["map"]["nearly_empty"])
     write_json(out / "summary.json", summary)
+    progress()
+    graph = find_graph(voxel_map)
+    progress()
+    _draw_overview(session, points, graph, out / "overview.png")
+    progress()
+    if rerun is not None:
+        rerun.finish(points, graph)
+        progress()
     return summary
+
+
+def clear_results(out: Path) -> None:
+    """Take away what an earlier run left beside its map: beside the next one, it would be of another map."""
+    for name in ("summary.json", "map.ply", "overview.png", "report.html"):
+        (out / name).unlink(missing_ok=True)
 
 
 def _draw_overview(session: MapSession, points: MapPoints, graph: SceneGraph | None, path: Path) -> None:

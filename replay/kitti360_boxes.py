@@ -53,6 +53,8 @@ def read_kitti360(text: bytes, path: Path) -> BoxFile:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ConfigError(f"{path} is no XML: {error}") from error
+    except (ValueError, LookupError) as error:  # of another character set
+        raise ConfigError(f"{path}: cannot be read: {error}; save it as UTF-8") from error
     nodes = [node for node in root if node.find("transform") is not None]
     if not nodes:
         raise ConfigError(f"{path} holds no boxes; give XML of KITTI-360's data_3d_bboxes")

@@ -7,7 +7,7 @@ a log, so that both write the same map and the same summary.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -241,14 +241,29 @@ class MapSession:
         self.published += count
         self.dropped += count
 
-    def finish(self, out: Path) -> dict[str, Any]:
-        """Map what still waits, and write ``summary.json``, ``map.ply``, ``map.npz`` and ``overview.png`` to ``out``;
-        returns the summary."""
+    def finish(
+        self, out: Path, more: Mapping[str, Any] | None = None, progress: Callable[[], object] = lambda: None
+    ) -> dict[str, Any]:
+        """Map what still waits, and write ``map.npz``, ``map.ply``, ``summary.json``, ``overview.png``, in this order.
+
+        Args:
+            out: The folder; made if missing.
+            more: What else the summary says.
+            progress: Called after each step.
+
+        Returns:
+            The summary.
+
+        Raises:
+            MapError: the map cannot be written.
+        """
         try:
             self.process_rest()
         except SemanticMapperError as error:  # the map is full, for one: what is in it is worth keeping
             _log.error("last_frames_not_mapped", reason=str(error))
-        return {**write_artifacts(self, out, self._rerun), **self._scene_summary(), **self._world_summary()}
+        progress()
+        more = {**self._scene_summary(), **self._world_summary(), **(more or {})}
+        return write_artifacts(self, out, self._rerun, more, progress)
 
     def _world_summary(self) -> dict[str, Any]:
         """Of worlds that had to be found in the map."""

@@ -8,6 +8,7 @@ written, so that what a killed process has left can be distinguished from what a
 from __future__ import annotations
 
 import codecs
+import errno
 import fcntl
 import json
 import os
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
+from semantic_mapper.redaction import plain_without_secrets
 
 Sync = Literal["none", "file", "folder"]
 
@@ -38,6 +40,7 @@ def open_regular(path: Path) -> BinaryIO:
         ConfigError: no regular file.
         OSError: it is missing or cannot be read; ``filename`` is set.
     """
+    _check_name(path)
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not block
     if not stat.S_ISREG(os.fstat(fd).st_mode):
         os.close(fd)
@@ -137,9 +140,9 @@ def write_bytes(
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write JSON atomically; makes the folder where it is missing."""
+    """Write JSON atomically, without secrets of the addresses in it; makes the folder where it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+    write_bytes(path, (json.dumps(plain_without_secrets(data), indent=1, allow_nan=False) + "\n").encode())
 
 
 def open_unlinked(path: str | Path, flags: int) -> int:
@@ -148,7 +151,18 @@ def open_unlinked(path: str | Path, flags: int) -> int:
     Raises:
         OSError: as of ``os.open``; ELOOP for a link.
     """
+    _check_name(path)
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
+def _check_name(path: str | Path) -> None:
+    """Python raises ``ValueError`` for such names, which nobody expects of a file.
+
+    Raises:
+        OSError: a NUL character in it.
+    """
+    if "\0" in os.fspath(path):
+        raise OSError(errno.EINVAL, "the name holds a NUL character, which no name may", str(path))
 
 
 def remove_stale(folder: Path, name: str = "") -> list[Path]:

@@ -29,7 +29,7 @@ class Config(semantic_mapper.config.Config, frozen=True):
     right: Socket = "CAM_C"
     width: Width = 640  # of the images, undistorted; another ratio than the sensor's crops
     height: Height = 480
-    fps: Annotated[float, msgspec.Meta(gt=0, le=120)] = 20.0
+    fps: Annotated[float, msgspec.Meta(ge=0.01, le=120)] = 20.0
     depth: bool = True  # False for boards without a stereo pair
     stereo_width: Width = 640  # of the images that depth and odometry are computed from
     stereo_height: Height = 400

@@ -10,8 +10,8 @@ from semantic_mapper.drivers.live import LiveCamera
 from semantic_mapper.drivers.opencv.config import Config
 from semantic_mapper.drivers.opencv.file import VideoFile
 from semantic_mapper.drivers.opencv.stream import StreamDevice
-from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import CameraError
+from semantic_mapper.redaction import without_secrets
 
 
 def open_camera(config: Config, camera_id: str = "camera") -> Camera:
@@ -23,7 +23,7 @@ def open_camera(config: Config, camera_id: str = "camera") -> Camera:
     """
     if not config.source:
         raise CameraError(f'camera \'{camera_id}\': no video is named; give source = "FILE" or source = "rtsp://..."')
-    shown = hide_password(config.source)
+    shown = without_secrets(config.source)
     measured = require_calibration(config.calibration, config.uncalibrated, f"video {shown}")
     if "://" not in config.source:
         return VideoFile(config, camera_id, measured)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -144,4 +145,5 @@ def _shots(capture: cv2.VideoCapture) -> Iterator[tuple[int, UInt8]]:
         good, bgr = capture.read()
         if not good or bgr is None:
             return
-        yield round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6), np.asarray(bgr, np.uint8)
+        within_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+        yield round(within_ms * 1e6) if math.isfinite(within_ms) else 0, np.asarray(bgr, np.uint8)

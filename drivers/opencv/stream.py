@@ -10,8 +10,10 @@ import numpy as np
 from semantic_mapper.drivers.live import Shot
 from semantic_mapper.drivers.opencv.clock import StreamClock
 from semantic_mapper.drivers.opencv.config import Config
-from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import CameraError
+from semantic_mapper.redaction import without_secrets
+
+MIN_HZ = 1e-3  # of a film or camera: one divided by it is still a time
 
 
 class StreamDevice:
@@ -22,7 +24,7 @@ class StreamDevice:
     """
 
     def __init__(self, config: Config) -> None:
-        self.description = f"stream {hide_password(config.source)}"
+        self.description = f"stream {without_secrets(config.source)}"
         self._config = config
         self._clock = StreamClock()
         timeouts = {
@@ -74,5 +76,5 @@ class StreamDevice:
 
 
 def nominal_hz(told: float) -> float:
-    """A rate as a container tells it; 0 for what cannot be one."""
-    return told if 0 < told <= 1000 else 0.0
+    """A rate as a container or a device tells it; 0 for what cannot be one."""
+    return told if MIN_HZ <= told <= 1000 else 0.0

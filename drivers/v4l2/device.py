@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.live import Shot
+from semantic_mapper.drivers.opencv.stream import nominal_hz
 from semantic_mapper.drivers.v4l2 import ioctls
 from semantic_mapper.drivers.v4l2.config import Config
 from semantic_mapper.drivers.v4l2.controls import apply_controls
@@ -84,7 +85,7 @@ class V4l2Device:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
         capture.set(cv2.CAP_PROP_FPS, config.fps)
         self.size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
-        self.frame_hz = max(0.0, float(capture.get(cv2.CAP_PROP_FPS)))
+        self.frame_hz = nominal_hz(float(capture.get(cv2.CAP_PROP_FPS)))
         self._warnings: tuple[str, ...] = ()
         given = ioctls.fourcc_text(int(capture.get(cv2.CAP_PROP_FOURCC)))
         if config.fourcc and given != config.fourcc:

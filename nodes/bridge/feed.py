@@ -27,12 +27,13 @@ from semantic_mapper.nodes.bridge.packing import describe_map, thinned
 from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import BridgeOptions
+from semantic_mapper.nodes.status import publish_status
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
-from semantic_mapper.transport.codec import decode_as, encode, read_envelope
+from semantic_mapper.transport.codec import decode_as, read_envelope
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.security import ServerIdentity, load_keys
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
@@ -183,7 +184,7 @@ class _Told:
         ages = {} if silent is None else {"frame": silent}
         degraded = tuple(filter(None, (self._follower.trouble, self._follower.no_graph)))
         status = Status(self._node, state, time.monotonic_ns(), counters, ages, degraded)
-        self._publisher.publish(encode(status))
+        publish_status(self._publisher, status)
         return status
 
 

@@ -128,9 +128,9 @@ def _camera_source(name: str, place: str, size: str) -> Source:
 
 
 def _read_size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    found = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if found is None:
-        raise ConfigError(f"--size {text}: write WIDTHxHEIGHT, such as 1280x720")
+        raise ConfigError(f"--size {text:.40}: write WIDTHxHEIGHT, such as 1280x720")
     return int(found[1]), int(found[2])
 
 

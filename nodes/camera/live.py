@@ -379,7 +379,7 @@ class _StatusReporter:
         return "degraded" if self._source.warnings or sender or self._notes else "running"
 
     def _tell(self, state: NodeState) -> None:
-        from semantic_mapper.transport.codec import encode
+        from semantic_mapper.nodes.status import publish_status
         from semantic_mapper.transport.messages import Status
 
         counters = {"published": self.published}
@@ -396,4 +396,4 @@ class _StatusReporter:
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, warnings)
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
-            self._publisher.publish(encode(status), 0.0)
+            publish_status(self._publisher, status, 0.0)

@@ -207,7 +207,7 @@ def _whole(word: str) -> int:
     try:
         return int(word)
     except ValueError:
-        raise typer.BadParameter(f"must be the id of a box, a whole number, got '{word}'", param_hint="ID") from None
+        raise typer.BadParameter(f"must be a box's id, a whole number, got '{word:.20}'", param_hint="ID") from None
 
 
 def _number(word: str) -> float:

@@ -29,6 +29,7 @@ from rich.table import Table
 from rich.text import Text
 
 from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import plain_without_secrets, without_secrets
 
 _log = structlog.get_logger(__name__)
 
@@ -56,7 +57,7 @@ class PlainConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """Every string that rich is given comes by here, whatever it is part of."""
         plain = {"markup": False, "emoji": False, "highlight": False}
-        return super().render_str(visible(text), **{**options, **plain})
+        return super().render_str(visible(without_secrets(text)), **{**options, **plain})
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """And every ``Text``, which may hold line breaks of its own."""
@@ -96,9 +97,15 @@ class Output:
             self._stream.write("\n".join(line.rstrip(" ") for line in printed.get().split("\n")))
         self._stream.flush()
 
+    def address(self, said: str, url: str) -> None:
+        """Show an address of this machine that people are to open, whole; ``print`` hides its parameters."""
+        if not self.quiet:
+            self._stream.write(f"{said} {url}\n")
+            self._stream.flush()
+
     def json(self, data: Any) -> None:
-        """Write one JSON document."""
-        self._stream.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
+        """Write one JSON document, without secrets of the addresses in it."""
+        self._stream.write(json.dumps(plain_without_secrets(data), indent=1, allow_nan=False) + "\n")
         self._stream.flush()
 
 

@@ -240,6 +240,6 @@ def _refuse_without_finetuner(folder: Path) -> None:
 def frame_numbers(text: str) -> list[int]:
     """Numbers of frames, as an option names them."""
     words = [word for word in text.replace(" ", "").split(",") if word]
-    if not all(word.isdecimal() for word in words):
-        raise typer.BadParameter(f"numbers with commas between them, got {text}", param_hint="--frames")
+    if not all(word.isdecimal() and len(word) < 20 for word in words):
+        raise typer.BadParameter(f"numbers with commas between them, got {text:.80}", param_hint="--frames")
     return [int(word) for word in words]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any, cast
 
 import typer
+from typer.core import TyperGroup
 
 from semantic_mapper import __version__
 from semantic_mapper.nodes.cli import autolabel as cli_autolabel
@@ -37,9 +40,37 @@ from semantic_mapper.nodes.cli import up as cli_up
 from semantic_mapper.nodes.cli import view as cli_view
 from semantic_mapper.nodes.cli import weights as cli_weights
 from semantic_mapper.nodes.cli.verb import JsonCommand, Settings
+from semantic_mapper.redaction import without_secrets
+
+_UsageError = cast("type[Exception]", typer.BadParameter.__base__)  # Click's, or Typer's own copy of it
+
+
+class _Group(TyperGroup):
+    """Shows wrong usage without the secrets of what was typed."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """As of Click."""
+        with _redacted():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: Any) -> Any:
+        """As of Click."""
+        with _redacted():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _redacted() -> Iterator[None]:
+    try:
+        yield
+    except _UsageError as error:
+        error.__dict__["message"] = without_secrets(str(error.__dict__["message"]))
+        raise
+
 
 app = typer.Typer(
     name="semantic-mapper",
+    cls=_Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -50,8 +50,9 @@ def record(
     A live launch does not notice. One that plays a log in lockstep or fast waits for this reader, too: it gets no
     faster than the disk here, and fails where this reads nothing for 30 s (lockstep: 300 s), such as after Ctrl-Z.
 
-    The log keeps the calibration and the launch's settings as attachments. Exit code 1 where the disk was full and
-    something is missing; what was written is whole. A launch can also have a recorder of its own (launch/record.toml).
+    The log keeps the calibration and the launch's settings as attachments. Exit code 1 where something is missing,
+    such as where the disk was full; what was written is whole. A launch can also have a recorder of its own
+    (launch/record.toml).
 
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
@@ -100,9 +101,9 @@ def _tell(output: Output, log: Path, recorder: Recorder) -> int:
         output.print(f"  note: {counted(recorder.gaps.missed, 'frame')} never came: sent too early, or lost on the way")
     if done.deleted:
         output.print(f"  note: {counted(done.deleted, 'part')} deleted to make room")
-    if not done.lost:
+    if not recorder.losses:
         return 0
-    output.print(f"  {counted(done.lost, 'message')} not recorded: {done.trouble or 'the disk was full for a while'}")
+    output.print(f"  not all is recorded: {recorder.losses}")
     return EXIT_FAILED
 
 

@@ -30,6 +30,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.plain_text import visible
 from semantic_mapper.plots import UNKNOWN, Bar, class_rows, draw_bars, png_bytes
+from semantic_mapper.redaction import without_secrets
 from semantic_mapper.replay.artifacts import MAX_LISTED, map_up, picture_unit, view_strips
 from semantic_mapper.replay.summary import dig
 from semantic_mapper.types import Float64, UInt8
@@ -108,9 +109,9 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: value if isinstance(value, Markup) else visible(str(value)),
+        finalize=lambda value: value if isinstance(value, Markup) else _shown(str(value)),
     )
-    pages.filters["lines"] = lambda text: Markup(escape(visible(text, keep="\n")))
+    pages.filters["lines"] = lambda text: Markup(escape(visible(without_secrets(text), keep="\n")))
     script = (_TEMPLATES / "points.js").read_text(encoding="utf-8")
     parts = [_plain(section) for section in sections]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
@@ -122,6 +123,11 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
         write_bytes(path, page.encode())
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _shown(text: str) -> str:
+    """A text as people see it; pictures stay as they are."""
+    return text if text.startswith("data:image/") else visible(without_secrets(text))
 
 
 def _plain(section: Section) -> dict[str, Any]:

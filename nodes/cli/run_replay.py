@@ -26,6 +26,7 @@ from semantic_mapper.nodes.cli.outputs import hold_folder
 from semantic_mapper.nodes.mapper.finish import finish_session
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.artifacts import clear_results
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.session import MapSession, open_recording
@@ -98,7 +99,7 @@ def replay_session(
             _log.warning("log_notice", notice=notice)
         config = request.config if trajectory is None else keeping_frames(request.config, len(log))
         bundle = Mapper.load(request.weights, config)
-        clear_summary(request.out)
+        clear_results(request.out)
         session = MapSession(
             bundle,
             stream_labels=log.info.label_set,
@@ -183,8 +184,3 @@ def mapper_config(
         config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, source=depth))
     given = {"seed": seed, "quality": quality}
     return msgspec.structs.replace(config, **{name: value for name, value in given.items() if value is not None})
-
-
-def clear_summary(out: Path) -> None:
-    """Take an earlier run's summary away: one that is there says that the results beside it are whole."""
-    (out / "summary.json").unlink(missing_ok=True)

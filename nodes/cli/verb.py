@@ -19,16 +19,18 @@ from rich.text import Text
 from typer.core import TyperCommand
 
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.memory import is_out_of_memory, memory_message
 from semantic_mapper.nodes.cli.console import stderr_console
+from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.process import prepare_process
 from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import without_secrets
 
 EXIT_FAILED = 1
 EXIT_UNTRUSTED = 3  # poses and depth of a recording contradict each other, so that its map cannot be trusted
 EXIT_INTERRUPTED = 130
 STDOUT = "-"
 MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
+MIN_OPTION = 1e-9  # of the same, but for 0: one divided by it must be a number
 
 _log = structlog.get_logger(__name__)
 
@@ -52,7 +54,7 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
     @functools.wraps(function)
     def command(*args: ParamsT.args, **kwargs: ParamsT.kwargs) -> None:
         prepare_process(verbose=Settings.verbose)
-        _check_numbers(kwargs)
+        _check_values(kwargs)
         try:
             code = function(*args, **kwargs)
         except SemanticMapperError as error:
@@ -66,11 +68,7 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
         except BrokenPipeError:  # the reader of our stdout is gone (`... | head`): nothing is left to be said
             code = EXIT_FAILED
         except Exception as error:
-            if is_out_of_memory(error):  # native packages raise whatever they like then
-                message = memory_message(error)
-            elif isinstance(error, OSError):  # disk full, permission denied: the system's own words and the file
-                message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-            else:
+            if not (message := failure_message(error)):
                 raise
             if Settings.verbose:
                 _log.exception("failed")
@@ -117,20 +115,25 @@ def warn_of_old_name(old: str, new: str) -> None:
     _log.warning("option_renamed", old=old, new=new)
 
 
-def _check_numbers(options: Mapping[str, object]) -> None:
-    """Options know lower bounds only, and NaN passes these.
+def _check_values(options: Mapping[str, object]) -> None:
+    """Options know lower bounds only, and NaN passes these; programs that call a verb may name anything.
 
     Raises:
-        typer.BadParameter: a number that nothing can be computed with.
+        typer.BadParameter: a number that nothing can be computed with, or a NUL character.
     """
     for name, value in options.items():
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, float) and not -MAX_OPTION <= number <= MAX_OPTION:
-                hint = f"--{name.replace('_', '-')}"
-                raise typer.BadParameter(f"{number:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
+        hint = f"--{name.replace('_', '-')}"
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, float) and not -MAX_OPTION <= item <= MAX_OPTION:
+                raise typer.BadParameter(f"{item:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
+            if isinstance(item, float) and 0 < abs(item) < MIN_OPTION:
+                raise typer.BadParameter(f"{item:g}: give 0, or at least {MIN_OPTION:g}", param_hint=hint)
+            if isinstance(item, str | Path) and "\0" in str(item):
+                raise typer.BadParameter("holds a NUL character, which no name may", param_hint=hint)
 
 
 def show_error(message: str) -> None:
     """One red line on stderr."""
-    line = Text.assemble(("error: ", "bold red"), (visible(" ".join(message.split("\n"))), "red"))
+    message = without_secrets(" ".join(message.split("\n")))
+    line = Text.assemble(("error: ", "bold red"), (visible(message), "red"))
     stderr_console().print(line, soft_wrap=True)

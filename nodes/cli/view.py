@@ -128,7 +128,7 @@ class _Page:
         from semantic_mapper.replay.exporters.rerun_log import recording_server
 
         self._viewer = self._ends.enter_context(WebViewer(*self._settings))
-        self._output.print(f"watch at {self._viewer.page_url}")
+        self._output.address("watch at", self._viewer.page_url)
         stream = recording_server(self._viewer.data_url)
         self._ends.callback(stream.disconnect)  # before its server ends, which it would complain of at length
         return stream

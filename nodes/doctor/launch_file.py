@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -81,7 +82,7 @@ def _address(endpoint: str, folder: str) -> Check:
     except SemanticMapperError as error:
         return failed("address", error)
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    if endpoint.startswith("tcp://") and port.isdigit() and port_is_taken(int(port), host):
+    if endpoint.startswith("tcp://") and re.fullmatch("[0-9]{1,5}", port) and port_is_taken(int(port), host):
         mend = f"`ss -ltnp 'sport = :{port}'` says who; give another with --set"
         return Check("address", "note", f"{endpoint} is in use (by this very launch, if it runs)", mend)
     return Check("address", "ok", endpoint)

@@ -9,7 +9,7 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.backoff import backoff_s
-from semantic_mapper.errors import FrameError, LabelError, WeightsError
+from semantic_mapper.errors import CodecError, FrameError, LabelError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes
 from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
 from semantic_mapper.nodes.finetuner.keyframe_store import FOLDER, LearningStore, Progress
@@ -17,6 +17,7 @@ from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDE
 from semantic_mapper.nodes.mapper.offered_weights import read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions
+from semantic_mapper.nodes.status import publish_status
 from semantic_mapper.training.keyframe_pool import KeyframePool
 from semantic_mapper.training.online import OnlineConfig, OnlineResult
 from semantic_mapper.transport.codec import encode
@@ -246,7 +247,12 @@ class Finetuner:
             keyframes=len(checkpoint.anchors),
             held_out=len(result.keys) - len(checkpoint.anchors),
         )
-        self.publisher.publish(encode(update))
+        try:
+            parts = encode(update)
+        except CodecError as error:  # numbers of versions are the mapper's, who may have been offered any
+            self._fail(f"the weights cannot be sent: {error}")
+            return
+        self.publisher.publish(parts)
         self._offer = update, result
         self._counts["offered"] += 1
         _log.info("weights_offered", version=update.version, megabytes=round(len(data) / 1e6, 1))
@@ -281,7 +287,7 @@ class Finetuner:
             "step": 0 if self._round is None else self._round.step,
         }
         status = Status(self.context.name, state, time.monotonic_ns(), counters, {}, tuple(self._warnings()))
-        self.publisher.publish(encode(status))
+        publish_status(self.publisher, status)
 
     def _warnings(self) -> list[str]:
         warnings: list[str] = []

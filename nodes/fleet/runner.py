@@ -30,8 +30,9 @@ from semantic_mapper.nodes.fleet.inputs import LogInput
 from semantic_mapper.nodes.fleet.results import Failure
 from semantic_mapper.nodes.fleet.scratch import DiskError
 from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.urls import shown, without_secrets
+from semantic_mapper.nodes.fleet.urls import shown
 from semantic_mapper.nodes.fleet.worker import OtherCodeError, Outcome, Task, run_task
+from semantic_mapper.redaction import without_secrets
 
 FAILURES = 2  # of a log, and it is quarantined
 CRASHES = 3  # of the process that works on a log: the first may have been the machine's fault

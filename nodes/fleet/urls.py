@@ -12,18 +12,12 @@ from typing import Any, TypeVar
 from semantic_mapper.backoff import backoff_s
 from semantic_mapper.errors import ConfigError, DependencyError, FleetError, StoreError
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.redaction import CHAIN, HIDDEN, NAMING_SCHEMES, user_length, without_secrets
 
 TRIES = 8
 FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 15.0
 
 _SCHEME = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*)://(.*)", re.DOTALL)
-_URL_IN_TEXT = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://[^\s'\"<>()]+")
-_CHAIN = "::"  # between the parts of fsspec's chained URLs
-_PORT = re.compile(r"[^:]*:\d+")
-_HIDDEN = "..."
-# Where what stands before the @ is a container or the name of an account, and says where something is.
-_NAMING_SCHEMES = ("abfs", "abfss", "az", "ftp", "hdfs", "scp", "sftp", "smb", "ssh", "wasb", "wasbs")
-
 _log = get_logger(__name__)
 _T = TypeVar("_T")
 
@@ -63,7 +57,7 @@ def split_store_url(url: str) -> tuple[Any, str]:
     Raises:
         ConfigError: as there; or a query, which would be a part of every file's name.
     """
-    if is_url(url) and shown(url).endswith("?" + _HIDDEN):
+    if is_url(url) and shown(url).endswith("?" + HIDDEN):
         raise ConfigError(
             f"{shown(url)}: the URL of a folder cannot have a query or fragment; a signed URL is of one file only"
         )
@@ -79,7 +73,7 @@ def shown(url: str) -> str:
     Args:
         url: Also one of fsspec's chained URLs (``simplecache::s3://...``).
     """
-    return _CHAIN.join(_shown_part(part) for part in url.split(_CHAIN))
+    return without_secrets(CHAIN.join(_shown_part(part) for part in url.split(CHAIN)))
 
 
 def refuse_credentials(url: str) -> None:
@@ -88,10 +82,10 @@ def refuse_credentials(url: str) -> None:
     Raises:
         FleetError: It does; names the ways that are there instead.
     """
-    for part in url.split(_CHAIN):
+    for part in url.split(CHAIN):
         scheme, rest = _split(part)
-        user = rest[: _user_length(scheme, rest)]
-        if user and (":" in user or scheme.lower() not in _NAMING_SCHEMES):
+        user = rest[: user_length(scheme, rest)]
+        if user and (":" in user or scheme.lower() not in NAMING_SCHEMES):
             raise FleetError(
                 f"{shown(url)}: a URL must not hold a key, token or password; leave it out, and give it to every node "
                 "in its environment (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, GOOGLE_APPLICATION_CREDENTIALS), in "
@@ -103,32 +97,17 @@ def _shown_part(url: str) -> str:
     scheme, rest = _split(url)
     if not scheme:
         return url
-    length = _user_length(scheme, rest)
+    length = user_length(scheme, rest)
     user, place = rest[:length], rest[length:]
-    is_name = scheme.lower() in _NAMING_SCHEMES and ":" not in user
+    is_name = scheme.lower() in NAMING_SCHEMES and ":" not in user
     path = re.split(r"[?#]", place, maxsplit=1)[0]
-    return f"{scheme}://{user if is_name else ''}{path}{'' if path == place else '?' + _HIDDEN}"
+    return f"{scheme}://{user if is_name else ''}{path}{'' if path == place else '?' + HIDDEN}"
 
 
 def _split(url: str) -> tuple[str, str]:
     """Scheme and all after ``://``; an empty scheme for paths."""
     match = _SCHEME.fullmatch(url)
     return (match[1], match[2]) if match else ("", url)
-
-
-def _user_length(scheme: str, rest: str) -> int:
-    """Letters up to and including the @ of user information; 0 = there is nothing of the kind.
-
-    Secret keys of AWS contain slashes, so that user information may seem to end before it does.
-    """
-    if not scheme or scheme == "file":
-        return 0
-    host = re.split(r"[/?#]", rest, maxsplit=1)[0]
-    if "@" in host:
-        return host.rindex("@") + 1
-    if ":" in host and "@" in rest and not _PORT.fullmatch(host):
-        return rest.rindex("@") + 1
-    return 0
 
 
 def persistently(call: Callable[[], _T], what: str, tries: int = TRIES) -> _T:
@@ -169,11 +148,6 @@ def _is_missing(error: FileNotFoundError) -> bool:
     if cause is None or not type(cause).__module__.startswith("aiohttp"):
         return True
     return getattr(cause, "status", None) in (404, 410)  # of aiohttp's many errors only answers have one
-
-
-def without_secrets(text: str) -> str:
-    """A message of another package, whose URLs are shown as ``shown`` does."""
-    return _URL_IN_TEXT.sub(lambda match: shown(match[0]), text)
 
 
 def _errors_of_stores() -> tuple[type[BaseException], ...]:

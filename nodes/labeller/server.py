@@ -12,7 +12,7 @@ import re
 import secrets
 import threading
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,6 +22,7 @@ import structlog
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.labeller.session import SESSION_ERRORS, ChangedElsewhereError, LabelSession, revision_of
+from semantic_mapper.nodes.local_server import LocalServer
 
 HOST = "127.0.0.1"
 PORT = 9092
@@ -62,12 +63,11 @@ class LabelServer:
     def __init__(self, session: LabelSession, port: int = PORT) -> None:
         self._token = secrets.token_urlsafe(24)
         try:
-            self._server = ThreadingHTTPServer((HOST, port), _make_handler(session, self._token))
+            self._server = LocalServer((HOST, port), _make_handler(session, self._token))
         except OSError as error:
             raise TransportError(
                 f"port {port} cannot be had ({error.strerror}); give another one with --port, or 0 for any"
             ) from error
-        self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, name="labelling page", daemon=True)
 
     @property
@@ -127,7 +127,7 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             """
             _check_name(self.headers.get("Host", ""))
             if (origin := self.headers.get("Origin")) is not None:
-                _check_name(urlsplit(origin).netloc)
+                _check_name(_netloc(origin))
             given, slash, path = self.path.removeprefix("/").partition("/")
             if not hmac.compare_digest(given.encode(), token.encode()):
                 raise _RefusedError(HTTPStatus.FORBIDDEN, "open the address that `label --serve` has shown")
@@ -156,9 +156,10 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             length = self.headers.get("Content-Length", "")
             if not length.isascii() or not length.isdigit():
                 raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "say how long the label is")
-            if int(length) != (pixels := session.pixels(number)):
-                raise _RefusedError(HTTPStatus.BAD_REQUEST, f"frame {number} has {pixels} pixels, and got {length}")
-            label, seen = self.rfile.read(int(length)), self.headers.get("If-Match")
+            if length.lstrip("0") != str(pixels := session.pixels(number)):
+                said = f"frame {number} has {pixels} pixels, and got {length:.20}"
+                raise _RefusedError(HTTPStatus.BAD_REQUEST, said)
+            label, seen = self.rfile.read(pixels), self.headers.get("If-Match")
             session.save(number, label, None if seen is None else seen.strip('"'))
             return b"{}", "application/json", revision_of(label)
 
@@ -184,6 +185,14 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             _log.debug("page_served", request=(format % args).replace(token, "TOKEN"))
 
     return Handler
+
+
+def _netloc(origin: str) -> str:
+    """Host and port of an ``Origin``; empty where that is no address."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:  # such as http://[
+        return ""
 
 
 def _check_name(netloc: str) -> None:

@@ -260,14 +260,18 @@ class _Mapper:
         if self._weights is not None:
             self._session.learned = self._weights.close()
         out = Path(self._options.out)
-        summary = finish_session(self._session, out, self._ended_by, self._taken_up)
+        summary = finish_session(self._session, out, self._ended_by, self._taken_up, self._step_of_finish)
         _log.info("map_written", out=str(out), **summary["frames"])
         if self._refinement is not None:
-            self._refinement.finish(lambda: self._publish_status("stopping"))
+            self._refinement.finish(self._step_of_finish)
         self._publish_status("ended", now=True)
 
-    def _while_stopping(self) -> None:
+    def _step_of_finish(self) -> None:
+        self._context.heartbeat.turn()
         self._publish_status("stopping")
+
+    def _while_stopping(self) -> None:
+        self._step_of_finish()
         if self._queries is not None:
             self._queries.follow()
 
@@ -289,9 +293,9 @@ class _Mapper:
             _log.error("results_not_written", reason=str(second), after=str(error))
 
     def _begin(self, info: StreamInfo) -> None:
-        from semantic_mapper.nodes.cli.run_replay import clear_summary
         from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
         from semantic_mapper.nodes.mapper.resume import keep_earlier, noted_worlds
+        from semantic_mapper.replay.artifacts import clear_results
         from semantic_mapper.replay.session import MapSession, open_recording
 
         # A stream is announced again to a newcomer, or by a restarted camera; or another camera begins.
@@ -303,7 +307,7 @@ class _Mapper:
         out = Path(self._options.out)
         if self._options.delivery == "newest":
             keep_earlier(self._context, out / MAP_NAME)
-        clear_summary(out)
+        clear_results(out)
         self._session = MapSession(
             self._bundle,
             stream_labels=info.label_set,
@@ -365,7 +369,7 @@ class _Mapper:
 
     def _publish_status(self, state: NodeState, *, now: bool = False) -> None:
         from semantic_mapper.mapping.map_scale import MEND
-        from semantic_mapper.transport.codec import encode
+        from semantic_mapper.nodes.status import publish_status
         from semantic_mapper.transport.messages import Status
 
         if not now and time.monotonic() - self._last_status < STATUS_PERIOD_S:
@@ -412,7 +416,7 @@ class _Mapper:
             counters |= self._refinement.counters
             degraded += self._refinement.degraded
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, degraded)
-        self._publisher.publish(encode(status))
+        publish_status(self._publisher, status)
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

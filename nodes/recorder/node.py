@@ -17,6 +17,7 @@ from semantic_mapper.nodes.frame_gaps import Gaps
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import NodeJob, RecorderOptions
 from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
     from semantic_mapper.replay.log.reader import LogAttachment
@@ -40,8 +41,11 @@ NOTE = "recording"  # the name of the recording, for the process that replaces t
 _log = structlog.get_logger(__name__)
 
 
-def run_recorder(context: NodeContext, options: RecorderOptions) -> None:
+def run_recorder(context: NodeContext, options: RecorderOptions) -> str:
     """Record until the stream ends or somebody asks to stop, and tell how it goes.
+
+    Returns:
+        What the log lacks, in words; empty = nothing that is known of.
 
     Raises:
         LogError: the log cannot be begun, or somebody has removed it meanwhile. A disk that is full later ends the
@@ -54,6 +58,7 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> None:
         reporter = StatusReporter(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
         recorder = record(context, options, reporter.follow)
         reporter.tell(recorder, "ended")
+    return "; ".join(filter(None, (recorder.losses, recorder.never_came)))
 
 
 def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Recorder], bool]) -> Recorder:
@@ -116,7 +121,9 @@ def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessS
             if now < deadline:
                 recorder.take(parts)
             elif now < deadline + COUNT_S:
-                recorder.left += read_topic(parts)[0].name not in ("info", "end")
+                name = read_topic(parts)[0].name
+                recorder.left += name not in ("info", "end")
+                recorder.received += name == "frame"
             else:  # a camera that publishes on and on
                 break
     recorder.rejected = sum(source.rejected for source in sources)
@@ -150,6 +157,7 @@ class Recorder:
         rejected: Messages that could not be read.
         unpacked: Frames that were kept as they came, because they could not be packed as ``options.rgb`` says.
         left: Messages that had come when there was no more time to write them.
+        received: Frames that came.
 
     Raises:
         LogError: the log is there already, and must not be replaced.
@@ -175,13 +183,15 @@ class Recorder:
         if options.rgb != "as-sent":
             self._packing = CodecOptions(rgb=options.rgb, jpeg_quality=options.jpeg_quality)
         self.recording: Recording | None = None
-        self.rejected = self.unpacked = self.left = 0
+        self.rejected = self.unpacked = self.left = self.received = 0
         self.gaps = Gaps()
         self._streams = Streams(options.streams)
         self._cameras: dict[str, CameraIntrinsics] = {}  # of all streams so far
-        if self._goes_on:  # what was lost in between is counted
-            for camera_id, seq in _last_frames(self._path).items():
-                self.gaps.note(camera_id, seq)
+        self._before = _last_frames(self._path) if self._goes_on else {}  # the first frames now should follow these
+        for camera_id, seq in self._before.items():  # what was lost in between is counted
+            self.gaps.note(camera_id, seq)
+        self._interrupted: list[str] = []
+        self._early_lost = 0
         self._told: set[bytes] = set()  # what the recording holds of streams
         self._early: deque[list[bytes]] = deque(maxlen=MAX_EARLY)
 
@@ -196,6 +206,27 @@ class Recorder:
                 size += file.stat().st_size
         return size
 
+    @property
+    def losses(self) -> str:
+        """What was sent and is not in the log, as far as anybody knows, in words; empty = nothing."""
+        r, texts = self.recording, list(self._interrupted)
+        if r is not None and r.lost:
+            texts.append(f"{counted(r.lost, 'message')} not written: {r.trouble or 'the disk was full for a while'}")
+        if self.left:
+            texts.append(f"{counted(self.left, 'message')} not written {DRAIN_S:g} s after the stop")
+        if early := self.received if r is None else self._early_lost:
+            texts.append(f"{counted(early, 'frame')} came before it was known of what stream they are")
+        texts += [f"no frame of camera '{camera}' came after a restart" for camera in sorted(self._before)]
+        return "; ".join(texts)
+
+    @property
+    def never_came(self) -> str:
+        """As ``losses``: frames that cameras say they have sent to one who listened from the beginning."""
+        missing = self._streams.published - self.received
+        if missing <= 0 or self._goes_on or "frame" not in self._options.topics:
+            return ""
+        return f"{missing} of {counted(self._streams.published, 'frame')} that were sent never came"
+
     def take(self, parts: list[bytes]) -> bool:
         """Keep one message; True where all streams have ended."""
         from semantic_mapper.transport.codec import decode_as
@@ -203,6 +234,7 @@ class Recorder:
         from semantic_mapper.transport.topics import parse_topic
 
         topic, _ = parse_topic(parts[0])
+        self.received += topic.name == "frame"
         if topic.name == "info":
             info = decode_as(StreamInfo, parts)
             self._cameras |= info.cameras
@@ -213,6 +245,8 @@ class Recorder:
             self._told.add(bytes(parts[1]))
         elif topic.name != "end":
             if self.recording is None:
+                if len(self._early) == MAX_EARLY:
+                    self._early_lost += parse_topic(self._early[0][0])[0].name == "frame"
                 self._early.append(parts)
             else:
                 self.recording.write(self._packed(parts, topic.name))
@@ -231,10 +265,8 @@ class Recorder:
         _log.info("recorded", log=str(r.path), frames=r.frames, messages=r.messages, parts=r.parts, deleted=r.deleted)
         if r.gone:
             _log.error("recording_incomplete", reason="a part of it was removed while it was recorded")
-        if r.lost:
-            _log.error("recording_incomplete", lost=r.lost, reason=r.trouble or "the disk was full for a while")
-        if self.left:
-            _log.error("recording_incomplete", lost=self.left, reason=f"not written {DRAIN_S:g} s after the stop")
+        if self.losses:
+            _log.error("recording_incomplete", reason=self.losses)
 
     def _begin(self, info: StreamInfo) -> None:
         from semantic_mapper.replay.log.recording import Recording
@@ -281,6 +313,7 @@ class Recorder:
         if topic != "frame":
             return parts
         envelope = read_envelope(parts)
+        self._note_restart(envelope.source, envelope.seq)
         self.gaps.note(envelope.source, envelope.seq)
         if self._packing is None:
             return parts
@@ -290,6 +323,15 @@ class Recorder:
             self.unpacked += 1
             _log.warning("frame_kept_as_sent", seq=envelope.seq, error=str(error))
             return parts
+
+    def _note_restart(self, camera_id: str, seq: int) -> None:
+        """The first frame of a camera after a restart: whether it follows the last one before."""
+        last = self._before.pop(camera_id, None)
+        if last is not None and seq != last + 1:
+            self._interrupted.append(
+                f"between frames {last} and {seq} of camera '{camera_id}' the recorder was restarted, and what was "
+                "sent meanwhile is missing"
+            )
 
 
 def _last_frames(path: Path) -> dict[str, int]:
@@ -337,7 +379,7 @@ class StatusReporter:
 
     def tell(self, recorder: Recorder, state: NodeState) -> None:
         """Tell now."""
-        from semantic_mapper.transport.codec import encode
+        from semantic_mapper.nodes.status import publish_status
         from semantic_mapper.transport.messages import Status
 
         self._last_sent = time.monotonic()
@@ -348,7 +390,7 @@ class StatusReporter:
             counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
             degraded = tuple(text for text in (r.trouble,) if text)
         status = Status(self._node, state, time.monotonic_ns(), counters, degraded=degraded)
-        self._publisher.publish(encode(status))
+        publish_status(self._publisher, status)
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

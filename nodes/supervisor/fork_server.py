@@ -24,9 +24,11 @@ import psutil
 import structlog
 
 from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.nodes.supervisor.progress import ProgressLimit, cpu_seconds
 
-START_S = 120.0  # for the imports, on a busy machine
-ANSWER_S = 5.0
+START_S = 120.0  # without progress, for the imports
+ANSWER_S = 5.0  # the same, for a node
+_POLL_S = 0.1
 _PRELOAD = ("zmq", "torch", "cv2", "scipy.spatial")
 _PR_SET_CHILD_SUBREAPER = 36
 _READY = b"ready"
@@ -57,9 +59,7 @@ class ForkServer:
         try:
             channel = self._connect()
             socket.send_fds(channel, [module.encode()], [job, heartbeat, output])
-            answer = channel.recv(64)
-            if not answer:
-                raise OSError(errno.ECONNRESET, "the fork server has ended")
+            answer = self._answer(channel, ANSWER_S)
         except OSError:
             self.close()
             raise
@@ -95,11 +95,28 @@ class ForkServer:
                 process_group=0,
             )
         _log.info("fork_server_started", pid=self._process.pid)
-        ours.settimeout(START_S)
-        if ours.recv(64) != _READY:
-            raise OSError(errno.ECONNRESET, "the fork server has ended")
-        ours.settimeout(ANSWER_S)
+        ours.settimeout(_POLL_S)
+        self._answer(ours, START_S)
         return ours
+
+    def _answer(self, channel: socket.socket, limit_s: float) -> bytes:
+        """What the server says next, however slow it is.
+
+        Raises:
+            OSError: it has ended, or did nothing for ``limit_s``.
+        """
+        assert self._process is not None
+        pid = self._process.pid
+        limit = ProgressLimit(limit_s, lambda: cpu_seconds(pid))
+        while not limit.exceeded():
+            try:
+                answer = channel.recv(64)
+            except TimeoutError:
+                continue
+            if not answer:
+                raise OSError(errno.ECONNRESET, "the fork server has ended")
+            return answer
+        raise TimeoutError(errno.ETIMEDOUT, f"the fork server did nothing for {limit_s:g} s")
 
 
 def serve(fd: int) -> None:

@@ -6,6 +6,7 @@ import psutil
 
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatMonitor
 from semantic_mapper.nodes.supervisor.launch_config import Launch
+from semantic_mapper.nodes.supervisor.progress import ProgressLimit, cpu_seconds
 
 BUSY_SILENCE_S = 30.0  # loading packages may hold up all threads, and so may an overloaded machine
 _ACTIVE = (psutil.STATUS_RUNNING, psutil.STATUS_DISK_SLEEP)
@@ -25,6 +26,10 @@ class HangDetector:
         self._heartbeat = heartbeat
         self._limits = limits
         self._cpu_s: float | None = None  # when the silence was noticed
+        self._silence, self._start, self._stall = (
+            ProgressLimit(limit_s, lambda: cpu_seconds(pid))
+            for limit_s in (max(limits.heartbeat_s, BUSY_SILENCE_S), limits.start_s, limits.stall_s)
+        )
 
     def find_hang(self, *, stopping: bool) -> str:
         """Why the process has to be killed; empty where it need not be.
@@ -41,25 +46,17 @@ class HangDetector:
         running = beat.ready and not beat.ending
         frozen = running and beat.silent_s > limits.heartbeat_s and self._cpu_s is not None and self._is_frozen()
         silence_s = limits.heartbeat_s if frozen else max(limits.heartbeat_s, BUSY_SILENCE_S)
-        if beat.silent_s > silence_s:
+        if frozen or (self._silence.exceeded(beat.beats) and beat.silent_s > silence_s):
             return f"it gave no sign of life for {silence_s:g} s and was killed"
-        if not beat.ready and not stopping and beat.age_s > limits.start_s:
+        if self._start.exceeded(beat.ready) and not beat.ready and not stopping and beat.age_s > limits.start_s:
             return f"it was not ready after {limits.start_s:g} s and was killed"
-        if beat.stalled_s is not None and beat.stalled_s > limits.stall_s:
+        stalled = self._stall.exceeded(beat.turns)
+        if stalled and beat.stalled_s is not None and beat.stalled_s > limits.stall_s:
             return f"its main loop made no turn for {limits.stall_s:g} s, and it was killed"
         return ""
 
     def _is_frozen(self) -> bool:
         return cpu_seconds(self._pid) == self._cpu_s and not is_active(self._pid)
-
-
-def cpu_seconds(pid: int) -> float:
-    """Processor time of all threads so far; -1 where it cannot be read."""
-    try:
-        times = psutil.Process(pid).cpu_times()
-    except (psutil.Error, OSError):
-        return -1.0
-    return times.user + times.system
 
 
 def is_active(pid: int) -> bool:

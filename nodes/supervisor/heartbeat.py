@@ -50,7 +50,10 @@ class HeartbeatWriter:
         self._write(RUNNING)
 
     def turn(self) -> None:
-        """One turn of the main loop. After the first call, more are expected until ``ending``."""
+        """One turn of the main loop. After the first call, more are expected until ``ending``.
+
+        Afterwards: one more step of writing results is done.
+        """
         now = time.monotonic()
         if now - self._last_turn > PERIOD_S:
             self._last_turn = now
@@ -110,6 +113,8 @@ class HeartbeatMonitor:
 
     Attributes:
         frames: Published, where the node counts them.
+        beats: How often something was read.
+        turns: How often turns were among it: of the main loop, or steps of writing results.
     """
 
     def __init__(self, fd: int) -> None:
@@ -118,7 +123,7 @@ class HeartbeatMonitor:
         self._started = self._last_beat = time.monotonic()
         self._last_turn: float | None = None
         self._last_frame: float | None = None
-        self.frames = 0
+        self.frames = self.beats = self.turns = 0
         os.set_blocking(fd, False)
 
     @property
@@ -160,7 +165,9 @@ class HeartbeatMonitor:
         if not beats:  # the process has ended
             return
         self._last_beat = time.monotonic()
+        self.beats += 1
         if TURN in beats:
+            self.turns += 1
             self._last_turn = self._last_beat
         if FRAME in beats:
             self._last_frame = self._last_beat

@@ -70,10 +70,14 @@ class Limits(Config, frozen=True):
     # A node that gives no sign of life for so long, and neither has had nor wants processor time meanwhile, is killed.
     # One that starts or ends, or is busy, or waits for a processor or a disk, may be silent for half a minute.
     heartbeat_s: Annotated[float, msgspec.Meta(ge=0.5)] = 30.0
-    stall_s: Positive = 300.0  # so long a turn of its main loop may take; the first frames compile
-    start_s: Positive = 300.0  # so long it may take from its start until it is ready; then the other two count
-    stop_s: Positive = 15.0  # how long camera and recorder may take to end when asked to
-    finish_s: Positive = 300.0  # how long a mapper may take to write its map, and a finetuner to end
+    # So long a turn of its main loop may take (the first frames compile), and its start until it is ready; while it
+    # waits for a processor that others use, that does not count.
+    stall_s: Positive = 300.0
+    start_s: Positive = 300.0
+    # How long a node may make no progress when it is to end: camera, recorder and bridges; mapper (it writes its map)
+    # and finetuner. One that gets on, be it slowly, may take as long as it needs.
+    stop_s: Positive = 15.0
+    finish_s: Positive = 300.0
     # A fixed endpoint at which the status of all nodes can be subscribed to (`semantic-mapper top`), beside the one in
     # the folder of sockets: ipc://PATH, tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
     publish: Annotated[str, msgspec.Meta(pattern=r"^([a-z]+://.+|\{\w+\}|)\Z")] = ""

@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 
 from semantic_mapper.config import MAX_FILE_BYTES
-from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.nodes.supervisor.launch_config import Launch
+from semantic_mapper.redaction import without_secrets
 
 NOTE = "launch.json"
 
@@ -54,7 +54,7 @@ def _without_passwords(value: Any) -> Any:
         return {key: _without_passwords(inner) for key, inner in value.items()}
     if isinstance(value, list):
         return [_without_passwords(inner) for inner in value]
-    return hide_password(value) if isinstance(value, str) else value
+    return without_secrets(value) if isinstance(value, str) else value
 
 
 def read_launch_note(folder: Path) -> LaunchNote:

@@ -66,7 +66,8 @@ class Launcher:
         """Watch until all nodes have ended, one has failed for good, or a stop is requested; then end all in order.
 
         Raises:
-            NodeError: a node failed, hung, or had to be killed; names it and its last words.
+            NodeError: a node failed, hung, had to be killed, or says at its end what it has lost; names it and its
+                last words.
         """
         while not stop and not self._failures() and self._sources_run():
             self._look_after_all()
@@ -75,11 +76,10 @@ class Launcher:
         self._look_after_all(last=True)  # a camera that has failed since the last look
         if stop:
             _log.info("stopping", by=stop.name)
-        self._notifier.stopping(sum(map(self._stop_limit_s, {process.kind for process in self._processes})))
         for kind in PROCESS_TABLE:
             self._end(kind, stop)
         self._status.report(self._processes, "ended", now=True)
-        if failures := self._failures():
+        if failures := self._failures() + [p.loss for p in self._processes if p.loss and not p.failure]:
             raise NodeError("; then ".join(failures))
 
     def _start(self, folder: Path) -> None:
@@ -120,20 +120,29 @@ class Launcher:
         nodes = ", ".join(f"{name} {state}" for name, state in states.items())
         self._notifier.status(f"{nodes}; {restarts} restarts")
 
+    def _stop_s(self) -> float:
+        """How long the end of all may take without progress."""
+        return sum(map(self._stop_limit_s, {process.kind for process in self._processes}))
+
     def _stop_limit_s(self, kind: str) -> float:
         return getattr(self._launch, PROCESS_TABLE[kind].stop_limit)
 
     def _end(self, kind: str, stop: StopRequest) -> None:
-        """Wait for all nodes of a kind; ask them as soon as there is a reason not to wait for the end of the stream."""
+        """Wait for all nodes of a kind; ask them as soon as there is a reason not to wait for the end of the stream.
+
+        Only one that does not get on any more is killed: on a starved machine, results take their time.
+        """
         limit_s = self._stop_limit_s(kind)
         processes = [p for p in self._processes if p.kind == kind]
         began = time.monotonic()
-        while time.monotonic() - began < limit_s:
+        while True:
             if kind == "mapper":  # its map was saved, the results that people look at were not
                 for process in processes:
                     process.start_to_finish()
-            if not any(p.runs for p in processes):
+            get_on = [p.gets_on(limit_s) for p in processes]  # of all: limits begin now
+            if not any(get_on):
                 break
+            self._notifier.stopping(self._stop_s())
             late = time.monotonic() - began > END_HEARD_S and any(p.restarts for p in self._processes)
             hears_no_end = bool(stop or self._failures()) or not PROCESS_TABLE[kind].ends_with_stream
             for process in processes:

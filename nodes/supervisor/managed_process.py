@@ -14,6 +14,7 @@ from semantic_mapper.nodes.supervisor.fork_server import ForkServer
 from semantic_mapper.nodes.supervisor.hang_detector import BUSY_SILENCE_S, HangDetector
 from semantic_mapper.nodes.supervisor.launch_config import Launch, NodeEntry
 from semantic_mapper.nodes.supervisor.node_process import KILL_S, NodeProcess
+from semantic_mapper.nodes.supervisor.progress import ProgressLimit, cpu_seconds
 from semantic_mapper.transport.messages import NodeState
 
 ORPHAN_TIMEOUT_S = 120  # see ``NodeJob.orphan_timeout_s``
@@ -88,10 +89,15 @@ class ManagedProcess:
         return "running" if self.process.heartbeat.ready else "starting"
 
     @property
+    def loss(self) -> str:
+        """What a node that has ended in order has lost, with its last words; empty = nothing that it knows of."""
+        return self.process.describe_end() if self.process is not None and self.process.has_lost else ""
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What happened to it lately."""
-        if self.failure:
-            return (self.failure,)
+        if self.failure or self.loss:
+            return (self.failure or self.loss,)
         lately = self._backoff.lately(time.monotonic())
         if not lately:
             return ()
@@ -120,6 +126,20 @@ class ManagedProcess:
         elif self.process.has_failed() and not self.failure:
             self._on_failure(self.process, "", last=last)
 
+    def gets_on(self, limit_s: float) -> bool:
+        """Whether it comes nearer to its end; to be asked often while that is awaited.
+
+        Args:
+            limit_s: Seconds without progress. Once it writes its results, turns are progress, too.
+        """
+        if self.process is None:
+            return self.runs
+        if self._end_limit is None:
+            pid = self.process.pid
+            self._end_limit = ProgressLimit(limit_s, lambda: cpu_seconds(pid))
+        beat = self.process.heartbeat
+        return self.runs and not self._end_limit.exceeded(beat.turns if beat.ending else -1)
+
     def overstay(self, patience_s: float) -> None:
         """End a process that has not ended when it should have; that is a failure."""
         if self.process is None or self.process.exit_code() is not None:
@@ -128,7 +148,7 @@ class ManagedProcess:
         if not self.process.wait(KILL_S):
             self.process.kill()
             self.process.wait(KILL_S)
-        self._on_failure(self.process, f"it did not end within {patience_s:g} s", last=True)
+        self._on_failure(self.process, f"it did not end, and made no progress for {patience_s:g} s", last=True)
 
     def ask_to_stop(self) -> None:
         """Ask its process, if there is one."""
@@ -176,6 +196,7 @@ class ManagedProcess:
         subscribers = 0 if restarts else self._job.subscribers
         job = msgspec.structs.replace(self._job, restarts=restarts, subscribers=subscribers)
         self.process = process = NodeProcess(self.kind, job, self._server)
+        self._end_limit: ProgressLimit | None = None  # of this process, once its end is awaited
         self._detector = HangDetector(process.pid, process.heartbeat, self._launch)
         return process
 

@@ -22,10 +22,12 @@ from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatMonitor
 from semantic_mapper.nodes.supervisor.process_table import PROCESS_TABLE
 from semantic_mapper.nodes.supervisor.systemd import SYSTEMD_VARIABLES
 from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import without_secrets
 
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
-FAILURE_EVENT = "node_failed"  # see node.py
+FAILURE_EVENT, LOSS_EVENT = "node_failed", "node_lost_data"  # see node.py
+EXIT_LOSS = 3  # of a node that came to its end in order, but a part of what it was to keep is lost
 # Of a process that somebody has asked to end, whether or not it was old enough to do so in order.
 TERMINATED = {code: s for s in (signal.SIGTERM, signal.SIGINT) for code in (128 + s, -s)}
 JOB_PREFIX = "fd:"  # of a node's argument that names an open file with its job
@@ -89,9 +91,14 @@ class NodeProcess:
     def has_failed(self) -> bool:
         """Ended otherwise than well; our request may hit a process that is too young to handle it."""
         code = self.exit_code()
-        if code in (None, 0):
+        if code in (None, 0, EXIT_LOSS):
             return False
         return not self.asked_to_stop or (code != -STOP_SIGNAL and not self.was_terminated)
+
+    @property
+    def has_lost(self) -> bool:
+        """Whether it ended in order, but says that a part of what it was to keep is lost."""
+        return self.exit_code() == EXIT_LOSS
 
     @property
     def was_terminated(self) -> bool:
@@ -135,7 +142,8 @@ class NodeProcess:
         self._reader.join(timeout=2.0)
         lines = [line for line in self.tail if line.strip()]
         # A node that knows why it fails says so in one line; of any other end, all the last lines may tell.
-        words = " | ".join([line for line in lines if FAILURE_EVENT in line] or lines)
+        known = [line for line in lines if FAILURE_EVENT in line or LOSS_EVENT in line]
+        words = " | ".join(known or lines)
         end = f"node '{self.name}' ({self.kind}) ended: {self.describe_exit()}"
         return end + (f"; its last words: {words}" if words else "")
 
@@ -151,7 +159,7 @@ class NodeProcess:
     def _pass_on(self) -> None:
         with os.fdopen(self._output, "rb") as stream:
             for raw in stream:
-                line = visible(raw.decode(errors="replace").rstrip("\n"))
+                line = visible(without_secrets(raw.decode(errors="replace").rstrip("\n")))
                 self.tail.append(line)
                 try:
                     sys.stderr.write(f"[{self.name}] {line}\n")

@@ -27,6 +27,7 @@ class Notifier:
         self._watchdog_s = watchdog_s
         self._last_sign = 0.0
         self._last_status = ""
+        self._extended_at = float("-inf")
         self._failed = False
 
     @classmethod
@@ -41,7 +42,10 @@ class Notifier:
         self._send(f"READY=1\nSTATUS={_one_line(status)}")
 
     def stopping(self, extend_s: float) -> None:
-        """The end has begun, and may take so long."""
+        """The end has begun, and may take so long from now; to be called in a loop."""
+        if time.monotonic() - self._extended_at < min(1.0, extend_s / 3):
+            return
+        self._extended_at = time.monotonic()
         self._send(f"STOPPING=1\nEXTEND_TIMEOUT_USEC={round(extend_s * 1e6)}")
 
     def status(self, text: str) -> None:

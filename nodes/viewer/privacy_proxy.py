@@ -9,11 +9,13 @@ from __future__ import annotations
 import http.client
 import shutil
 import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler
 
 import structlog
 
 from semantic_mapper.errors import TransportError
+from semantic_mapper.nodes.local_server import LocalServer
 
 TIMEOUT_S = 10.0
 _KEPT = ("Content-Type", "Content-Length", "rerun-final-length")  # headers that are passed on
@@ -41,10 +43,9 @@ class QuietPage:
             "form-action 'none'; base-uri 'self'"
         )
         try:
-            self._server = ThreadingHTTPServer(address, _make_handler(source, policy))
+            self._server = LocalServer(address, _make_handler(source, policy))
         except OSError as error:
             raise TransportError(f"port {address[1]} cannot be had: {error.strerror}; choose another one") from error
-        self._server.daemon_threads = True
         self.port = int(self._server.server_address[1])
         self._thread = threading.Thread(target=self._server.serve_forever, name="web page", daemon=True)
         self._thread.start()
@@ -64,8 +65,12 @@ def _make_handler(source: tuple[str, int], policy: str) -> type[BaseHTTPRequestH
 
         def do_GET(self) -> None:
             connection = http.client.HTTPConnection(*source, timeout=TIMEOUT_S)
+            path = self.path.partition("?")[0]
+            if not path.isascii():
+                self.send_error(HTTPStatus.BAD_REQUEST, "addresses are ASCII")
+                return
             try:
-                connection.request("GET", self.path.partition("?")[0])
+                connection.request("GET", path)
                 answer = connection.getresponse()
                 self.send_response(answer.status)
                 for name in _KEPT:

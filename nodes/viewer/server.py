@@ -24,11 +24,12 @@ import structlog
 from semantic_mapper.errors import DependencyError, TransportError
 from semantic_mapper.nodes.process_folder import OwnFolder
 from semantic_mapper.nodes.supervisor.heartbeat import end_with_launcher
+from semantic_mapper.nodes.supervisor.progress import ProgressLimit, cpu_seconds
 from semantic_mapper.nodes.viewer.privacy_proxy import QuietPage
 
 HOST = "127.0.0.1"  # what is seen has neither keys nor passwords: other machines come in by `ssh -L`
 WEB_PORT, DATA_PORT = 9090, 9876
-START_S = 20.0
+START_S = 20.0  # without progress
 STOP_S = 3.0
 _POLL_S = 0.05
 
@@ -135,9 +136,10 @@ class WebViewer:
                 process_group=0,  # Ctrl-C is for us; we end it
                 preexec_fn=end_with_launcher,  # and where we are killed, the kernel does
             )
-        deadline = time.monotonic() + START_S
+        pid = self._process.pid
+        limit = ProgressLimit(START_S, lambda: cpu_seconds(pid))
         while not (_answers(web) and _answers(data)):
-            if not self.alive or time.monotonic() > deadline:
+            if not self.alive or limit.exceeded():
                 words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-3:]
                 raise TransportError(f"the web viewer has not started; its last words: {' | '.join(words) or 'none'}")
             time.sleep(_POLL_S)

@@ -51,8 +51,9 @@ def _check(address: str, folder: Path | None) -> None:
             f"'{address}' is no address of Zenoh that is taken here; write tcp/127.0.0.1:PORT, or with certificates "
             "tls/ADDRESS:PORT"
         )
-    if int(found[2].rpartition(":")[2]) > MAX_PORT:
-        raise ConfigError(f"'{address}': ports end at {MAX_PORT}")
+    port = found[2].rpartition(":")[2].lstrip("0")
+    if len(port) > len(str(MAX_PORT)) or int(port or 0) > MAX_PORT:
+        raise ConfigError(f"'{address:.80}': ports end at {MAX_PORT}")
     if found[1] == "tcp" and not is_loopback(found[2]):
         raise TransportError(
             f"{address}: other machines would be at the other end, which needs certificates on both sides: give "

@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -76,7 +78,10 @@ class ZenohSession:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._session.close()
+        try:
+            self._session.close()
+        except zenoh.ZError as failure:  # what is connected is cut off all the same
+            _log.warning("session_not_closed", reason=str(failure))
 
     def asked(self, subject: Subject) -> int:
         """See ``Outlet``."""
@@ -104,25 +109,25 @@ class ZenohSession:
         about = describe_pose(frame, T_map_camera)
         camera = frame.camera_id
         if T_map_camera is not None and (pose := self._wanted(f"{camera}/pose")) is not None:
-            pose.put(_json(about), encoding=JSON)
+            _put(pose, _json(about), JSON)
         if (rgb := self._wanted(f"{camera}/rgb")) is not None:
-            rgb.put(to_jpeg(frame.rgb), encoding=JPEG, attachment=_json(about))
+            _put(rgb, to_jpeg(frame.rgb), JPEG, _json(about))
         if frame.depth_m is not None and (depth := self._wanted(f"{camera}/depth")) is not None:
             data = np.ascontiguousarray(frame.depth_m, "<f4").tobytes()
-            depth.put(data, encoding=BYTES, attachment=_json(about))
+            _put(depth, data, BYTES, _json(about))
 
     def send_update(self, update: MapUpdate) -> None:
         """See ``Outlet``."""
         about = {"stamp_ns": update.stamp_ns, "seq": update.seq, "camera": update.camera_id}
         if (semantics := self._wanted(f"{update.camera_id}/semantics")) is not None:
-            semantics.put(to_png(update.label), encoding=PNG, attachment=_json(about))
+            _put(semantics, to_png(update.label), PNG, _json(about))
         if (moving := self._wanted(f"{update.camera_id}/moving")) is not None:
-            moving.put(to_png(moving_mask(update)), encoding=PNG, attachment=_json(about))
+            _put(moving, to_png(moving_mask(update)), PNG, _json(about))
 
     def send_status(self, status: Status) -> None:
         """See ``Outlet``."""
         if (publisher := self._wanted(f"status/{status.node}")) is not None:
-            publisher.put(msgspec.json.encode(status), encoding=JSON)
+            _put(publisher, msgspec.json.encode(status), JSON)
 
     def send_map(self, points: MapPoints, about: dict[str, Any]) -> None:
         """See ``Outlet``."""
@@ -137,9 +142,10 @@ class ZenohSession:
         control, priority = zenoh.CongestionControl.DROP, zenoh.Priority.DATA
         if subject is not None:
             control, priority = zenoh.CongestionControl.BLOCK, zenoh.Priority.BACKGROUND
-        publisher = self._session.declare_publisher(
-            f"{self._prefix}/{key}", congestion_control=control, priority=priority
-        )
+        with _explained():
+            publisher = self._session.declare_publisher(
+                f"{self._prefix}/{key}", congestion_control=control, priority=priority
+            )
         self._publishers[key] = publisher
         return publisher
 
@@ -164,11 +170,30 @@ class ZenohSession:
                 _log.info("not_answered", key=KEYS[subject], reason=str(error))
         publisher = self._publishers[KEYS[subject]]
         if _has_subscribers(publisher):
-            publisher.put(payload, encoding=encoding, attachment=attachment)
+            _put(publisher, payload, encoding, attachment)
+
+
+@contextmanager
+def _explained() -> Iterator[None]:
+    """Errors of Zenoh as ours.
+
+    Raises:
+        TransportError: its session has ended.
+    """
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise TransportError(f"Zenoh sends nothing any more: {error}; start the node again") from error
+
+
+def _put(publisher: zenoh.Publisher, payload: bytes, encoding: zenoh.Encoding, attachment: bytes | None = None) -> None:
+    with _explained():
+        publisher.put(payload, encoding=encoding, attachment=attachment)
 
 
 def _has_subscribers(publisher: zenoh.Publisher) -> bool:
-    status: Any = publisher.matching_status  # the package's stubs say bool, which is wrong
+    with _explained():
+        status: Any = publisher.matching_status  # the package's stubs say bool, which is wrong
     return bool(status.matching)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -366,16 +366,20 @@ class VoxelMap:
         cube = (len(keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
         return {"keys": keys, **{name: v.reshape(*cube, *v.shape[2:]) for name, v in values._asdict().items()}}
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, between: Callable[[], object] = lambda: None) -> None:
         """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.
 
         Other threads may go on integrating: they wait for a copy of ``CHUNK_BLOCKS`` at most, and what they change
         before it is written is first put aside, in memory or in the folder for temporary files.
 
+        Args:
+            path: Of the file.
+            between: Called after every ``CHUNK_BLOCKS``.
+
         Raises:
             MapError: the file cannot be written; one that was there before is as it was.
         """
-        self.begin_save().write(path)
+        self.begin_save().write(path, between)
 
     def begin_save(self) -> MapSaving:
         """The map as it is now, for another thread to write; see ``save``."""

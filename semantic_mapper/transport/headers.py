@@ -25,7 +25,8 @@ SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # camera ids and node names, as th
 Source = Annotated[str, Meta(pattern=SOURCE_PATTERN)]
 Stamp = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 CaptureStamp = Annotated[int, Meta(ge=0, le=MAX_STAMP_NS)]
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+MAX_COUNT = 2**63 - 1
+Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
 Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
 PartBytes = Annotated[int, Meta(ge=0, le=MAX_PART_BYTES)]
 Word = Annotated[str, Meta(max_length=128)]

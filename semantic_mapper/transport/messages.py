@@ -7,6 +7,8 @@ message is sent and when one is received.
 from __future__ import annotations
 
 import hashlib
+import math
+import sys
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
@@ -17,6 +19,7 @@ from msgspec.structs import force_setattr
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.framing import MAX_KEYFRAME_PIXELS, Buffer
 from semantic_mapper.transport.headers import (
+    MAX_COUNT,
     MAX_HEADER_BYTES,
     Count,
     Digest,
@@ -37,6 +40,8 @@ MAX_DAMAGES = 50  # damaged places of a recording that its end tells of
 MAX_KEYFRAME_BYTES = 8 * MAX_KEYFRAME_PIXELS + 2 * MAX_HEADER_BYTES  # raw colour, float32 depth, labels: all of it
 MAX_WEIGHTS_BYTES = 1 << 26  # of a weights file on the wire: five times the shipped one
 _SENTENCE = 4096  # letters; longer ones are cut
+_WORD = 128
+_MAX_NUMBERS, _MAX_SENTENCES = 256, 64  # of a status
 # Metadata of a stream whose lengths are not metres, as poses from pictures alone give them; without it they are.
 SCALE_KEY, SCALE_UNKNOWN = "scale", "unknown"
 
@@ -69,6 +74,9 @@ class StreamInfo(Wire, frozen=True):
 class Status(Wire, frozen=True):
     """What a node says about itself, about once a second.
 
+    Numbers beyond their bounds become the nearest one that can be sent, and what is too long or too much is cut, so
+    that nothing that a node counts can keep it from saying so.
+
     Args:
         node: Name of the node.
         state: Where it is in its life.
@@ -81,12 +89,16 @@ class Status(Wire, frozen=True):
     node: Source
     state: NodeState
     stamp_ns: Stamp
-    counters: Annotated[Mapping[Word, Count], Meta(max_length=256)] = msgspec.field(default_factory=dict)
-    ages_s: Annotated[Mapping[Word, Finite], Meta(max_length=256)] = msgspec.field(default_factory=dict)
-    degraded: Annotated[tuple[Sentence, ...], Meta(max_length=64)] = ()
+    counters: Annotated[Mapping[Word, Count], Meta(max_length=_MAX_NUMBERS)] = msgspec.field(default_factory=dict)
+    ages_s: Annotated[Mapping[Word, Finite], Meta(max_length=_MAX_NUMBERS)] = msgspec.field(default_factory=dict)
+    degraded: Annotated[tuple[Sentence, ...], Meta(max_length=_MAX_SENTENCES)] = ()
 
     def __post_init__(self) -> None:
-        force_setattr(self, "degraded", tuple(text[:_SENTENCE] for text in self.degraded))
+        counters = [(_sendable(name, _WORD), min(max(n, 0), MAX_COUNT)) for name, n in self.counters.items()]
+        ages = [(_sendable(name, _WORD), _finite(age)) for name, age in self.ages_s.items() if not math.isnan(age)]
+        force_setattr(self, "counters", dict(counters[:_MAX_NUMBERS]))
+        force_setattr(self, "ages_s", dict(ages[:_MAX_NUMBERS]))
+        force_setattr(self, "degraded", tuple(_sendable(text, _SENTENCE) for text in self.degraded[:_MAX_SENTENCES]))
 
 
 class FrameRefused(Wire, frozen=True):
@@ -206,6 +218,15 @@ Message = (
     | WeightsUpdate
     | WeightsInUse
 )
+
+
+def _sendable(text: str, length: int) -> str:
+    """Cut, and without what is no UTF-8, such as the odd bytes of a file's name."""
+    return text[:length].encode(errors="replace").decode()
+
+
+def _finite(number: float) -> float:
+    return min(max(number, -sys.float_info.max), sys.float_info.max)
 
 
 def digest_of(data: Buffer) -> str:

@@ -14,12 +14,16 @@ import cv2
 import numpy as np
 import pytest
 
+from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
+from semantic_mapper.drivers.oak import config as oak_config
 from semantic_mapper.drivers.opencv import list_devices
 from semantic_mapper.drivers.opencv.clock import StreamClock
+from semantic_mapper.drivers.opencv.stream import nominal_hz
 from semantic_mapper.drivers.registry import open_camera
-from semantic_mapper.drivers.urls import hide_password
+from semantic_mapper.drivers.v4l2 import config as v4l2_config
 from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.redaction import without_secrets
 from tests.drivers.fake_v4l2 import write_calibration
 
 COUNT = 12
@@ -202,10 +206,11 @@ def test_nobody_at_an_address_is_told(tmp_path: Path) -> None:
 
 
 def test_passwords_do_not_appear() -> None:
-    assert hide_password("rtsp://me:secret@cam.local:554/live") == "rtsp://me:...@cam.local:554/live"
-    assert hide_password("rtsp://cam.local/live?x=a:b@c") == "rtsp://cam.local/live?x=a:b@c"
-    assert hide_password("rtsp://me:p@ss@cam.local/live") == "rtsp://me:...@cam.local/live"
-    assert hide_password("http://cam/v?user=me&password=a:b@c&x=1") == "http://cam/v?user=me&password=...&x=1"
+    assert without_secrets("rtsp://me:secret@cam.local:554/live") == "rtsp://cam.local:554/live"
+    assert without_secrets("rtsp://cam.local/live?x=a:b@c") == "rtsp://cam.local/live?x=a:b@c"
+    assert without_secrets("rtsp://me:p@ss@cam.local/live") == "rtsp://cam.local/live"
+    assert without_secrets("rtsp://cam/v?channel=2&password=a:b@c&x=1") == "rtsp://cam/v?channel=2&password=...&x=1"
+    assert without_secrets("http://cam/v?user=me&password=a:b@c&x=1") == "http://cam/v?..."
 
 
 def test_the_sender_s_clock_is_found_through_the_jitter_of_the_way(rng: np.random.Generator) -> None:
@@ -226,3 +231,11 @@ def test_a_clock_that_counts_images_is_found_out(told_hz: float) -> None:
     stamps = [(clock.stamp_ns(round(k * 1e9 / told_hz) if told_hz else 0, 10**12 + k * 10**8)) for k in range(60)]
     assert not clock.trustworthy
     assert stamps[-1] == 10**12 + 59 * 10**8
+
+
+def test_rates_that_no_camera_has_are_not_known() -> None:
+    rates = [nominal_hz(told) for told in (30.0, 0.001, 1e-300, 5e-324, 0.0, -1.0, float("nan"), float("inf"), 1e6)]
+    assert rates == [30.0, 0.001, *[0.0] * 7]
+    for kind, config in (("oak", oak_config), ("v4l2", v4l2_config)):
+        with pytest.raises(ConfigError, match="fps"):
+            convert_config({"fps": 1e-300}, config.Config, kind)

@@ -180,6 +180,20 @@ def test_files_without_boxes_are_refused(tmp_path: Path, text: str) -> None:
         load_boxes(tmp_path / "nothing.json")
 
 
+@pytest.mark.parametrize("charset", ["utf-32", "gb2312", "no-such", "base64", "idna", "cp037"])
+def test_xml_of_another_character_set_is_refused_by_name(tmp_path: Path, charset: str) -> None:
+    (tmp_path / "boxes.xml").write_bytes(f'<?xml version="1.0" encoding="{charset}"?><a/>'.encode())
+    with pytest.raises(ConfigError, match=r"boxes\.xml.*(UTF-8|no XML)"):
+        load_boxes(tmp_path / "boxes.xml")
+
+
+@pytest.mark.parametrize("text", ["[9]", '{"boxes": 9}', "<a><b>9</b></a>"])
+def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "boxes").write_text(text.replace("9", "9" * 5000))
+    with pytest.raises(ConfigError, match="boxes"):
+        load_boxes(tmp_path / "boxes")
+
+
 def test_an_outline_or_mesh_is_where_it_is_drawn_wherever_its_origin_is(tmp_path: Path) -> None:
     triangles = np.concatenate((QUADS[:, :3], QUADS[:, (0, 2, 3)])).tolist()
     ring = [[10, 0], [19, 0], [19, 0], [19, 4], [10, 0]]  # closed, one corner twice

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import msgspec
 import numpy as np
 import pytest
@@ -29,6 +31,7 @@ from semantic_mapper.nodes.cli.record import _join
 from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
 from semantic_mapper.nodes.cli.saved_maps import is_log
 from semantic_mapper.nodes.cli.scoring import ScoreRequest, score_log
+from semantic_mapper.nodes.frame_gaps import MAX_MISSED
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -40,13 +43,32 @@ from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame, repack_rgb
+from semantic_mapper.transport.headers import MAX_COUNT
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
-from tests.nodes.support import Running, eventually, repeated_frames, run, write_log
+from tests.nodes.support import Running, error_line, eventually, repeated_frames, run, write_log
 from tests.nodes.test_faults import alone
 from tests.small import INTRINSICS, tiny_frames
 from tests.transport import samples
+
+# A recorder beside the player of a log.
+RECORDED = """
+[[node]]
+name = "eye"
+kind = "camera"
+[node.options]
+log = "{log}"
+mode = "realtime"
+[[node]]
+name = "recorder"
+kind = "recorder"
+{policy}
+[node.options]
+sources = ["eye"]
+out = "{out}"
+{option}
+"""
 
 
 @dataclass
@@ -183,6 +205,63 @@ def test_a_restarted_recorder_counts_what_no_log_holds(tmp_path: Path, sockets: 
     assert (told["recorded"], told["missed"]) == (3, 6 if cut_off else 5)
     with LogReader(tmp_path / "a-1.mcap") as log:
         assert [envelope.seq for envelope, _ in log.frame_parts()] == [14, 15, 17]
+
+
+def test_numbers_that_jump_cost_no_frame_and_no_status(tmp_path: Path, sockets: Path) -> None:
+    numbers = [n for i in range(24) for n in (i, 2**62 + i, MAX_COUNT - i, 0, 2**62 - i)]
+    with streaming(tmp_path, sockets, reserve_mb=0) as stream:
+        for at, seq in enumerate(numbers):
+            stream.publisher.publish(encode_frame(dataclasses.replace(samples.make_frame(at), seq=seq)))
+        negative = encode_frame(samples.make_frame(3))
+        negative[1] = msgpack.packb({**msgpack.unpackb(negative[1]), "seq": -(2**62)})
+        stream.publisher.publish(negative)
+        stream.end()
+        told = stream.last_status().counters
+    assert (told["recorded"], told["rejected"], told["lost"]) == (120, 1, 0)
+    assert told["missed"] == MAX_MISSED
+    with LogReader(tmp_path / "a.mcap") as log:
+        assert [envelope.seq for envelope, _ in log.frame_parts()] == numbers
+
+
+def test_a_launch_records_every_frame_whatever_its_number(tmp_path: Path) -> None:
+    numbers = [n for i in range(24) for n in (i, 2**62 + i, MAX_COUNT - i, 0, 2**62 - i)]
+    frames = [dataclasses.replace(f, seq=n) for f, n in zip(repeated_frames(120), numbers, strict=True)]
+    log, launch = write_log(tmp_path / "jumps.mcap", frames), tmp_path / "recorded.toml"
+    text = RECORDED.format(log=log, out=tmp_path / "a.mcap", policy='restart = "never"', option="reserve_mb = 0")
+    launch.write_text(text.replace("realtime", "fast"))
+    with Running("up", launch) as running:
+        assert running.wait() == 0, running.text
+    with LogReader(tmp_path / "a.mcap") as recorded:
+        assert [envelope.seq for envelope, _ in recorded.frame_parts()] == numbers
+
+
+@pytest.mark.parametrize(
+    ("kill", "extra", "reason"),
+    [
+        (True, "", r"'recorder' \(recorder\) ended: killed by SIGKILL"),
+        (True, 'restart = "on-failure"', r"between frames \d+ and \d+ of camera 'rooms' the recorder was restarted"),
+        (False, "reserve_mb = 1e12", r"messages? not written: .*the disk is full"),
+    ],
+)
+def test_a_launch_whose_recorder_has_lost_frames_does_not_end_well(
+    tmp_path: Path, kill: bool, extra: str, reason: str
+) -> None:
+    log = write_log(tmp_path / "long.mcap", repeated_frames(600 if kill else 20))
+    policy, option = (extra, "") if "restart" in extra else ("", extra)
+    launch = tmp_path / "recorded.toml"
+    launch.write_text(RECORDED.format(log=log, out=tmp_path / "a.mcap", policy=policy, option=option))
+    with Running("up", launch) as running:
+        if kill:
+            running.wait_for_line(r"\brecorder\].* recording ")
+            assert eventually(lambda: (tmp_path / "a.mcap").stat().st_size > 100_000, 60)
+            os.kill(running.node_pid("recorder"), signal.SIGKILL)
+        if policy:
+            running.wait_for_line(r"node_started .*node=recorder .*restarts=1")
+            second = tmp_path / "a-1.mcap"
+            assert eventually(lambda: second.exists() and second.stat().st_size > 100_000, 60)
+            running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 1, running.text
+    assert re.search(reason, error_line(running.text)), running.text
 
 
 def test_full_disk_is_told_and_the_stream_goes_on(tmp_path: Path, sockets: Path) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,10 +17,13 @@ from resource import RLIMIT_NOFILE, getrlimit, setrlimit
 import pytest
 
 from semantic_mapper.nodes.options import NodeJob
+from semantic_mapper.nodes.supervisor import managed_process as managed_module
 from semantic_mapper.nodes.supervisor import node_process as process_module
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.nodes.supervisor.managed_process import ManagedProcess
 from semantic_mapper.nodes.supervisor.node_process import NodeProcess
+from semantic_mapper.nodes.supervisor.progress import ProgressLimit
+from tests.nodes.support import eventually
 
 LAUNCH = """
 [[node]]
@@ -145,6 +150,65 @@ def parent(process: Path) -> int:
         return int((process / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[1])
     except OSError:
         return 0
+
+
+# A node that writes its results one step after the other, whenever a file says so.
+WRITER = """
+import sys, time
+from pathlib import Path
+from semantic_mapper.nodes.node import run_node
+from semantic_mapper.nodes.options import CameraOptions
+
+def work(context, options):
+    context.heartbeat.ready()
+    while not context.stop:
+        time.sleep(0.01)
+    context.heartbeat.ending()
+    folder, step = Path(options.log).parent, 0
+    while not (folder / "done").exists():
+        if (folder / f"step-{step}").exists():
+            time.sleep(0.25)  # turns are told five times a second at most
+            context.heartbeat.turn()
+            step += 1
+        time.sleep(0.01)
+
+run_node(CameraOptions, work)
+"""
+
+
+def test_a_node_that_writes_results_is_killed_where_it_is_stuck_not_where_it_is_slow(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s, limit_s = 1000.0, 15.0
+
+    def interpreter(kind: str, job: int, beats: int, output: int) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-I", "-c", WRITER, f"fd:{job}"]
+        return subprocess.Popen(command, stdout=output, stderr=output, pass_fds=(beats, job))
+
+    def limit(seconds: float, cpu_s: Callable[[], float]) -> ProgressLimit:
+        return ProgressLimit(seconds, lambda: 0.0, lambda: now_s)
+
+    monkeypatch.setattr(process_module, "_start_interpreter", interpreter)
+    monkeypatch.setattr(managed_module, "ProgressLimit", limit)
+    (tmp_path / "room.mcap").symlink_to(log)
+    eye = starter(tmp_path, tmp_path / "room.mcap", restart="never")()
+    assert eye.process is not None
+    beat = eye.process.heartbeat
+    assert eventually(lambda: beat.poll() or beat.ready, 60), eye.process.tail
+    eye.ask_to_stop()
+    assert eventually(lambda: beat.poll() or beat.ending, 60)
+    for step in range(5):  # four times the limit in all
+        now_s += 0.8 * limit_s
+        assert eye.gets_on(limit_s)
+        before = beat.turns
+        (tmp_path / f"step-{step}").touch()
+        assert eventually(lambda n=before: beat.poll() or beat.turns > n, 60)
+        assert eye.gets_on(limit_s)
+    now_s += 1.1 * limit_s
+    assert not eye.gets_on(limit_s)
+    eye.overstay(limit_s)
+    assert "killed by SIGKILL (it did not end, and made no progress for 15 s)" in eye.failure
+    eye.close()
 
 
 def test_a_process_that_does_not_die_holds_nobody_up(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:

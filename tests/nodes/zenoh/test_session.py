@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import zenoh
+from structlog.testing import capture_logs
 
 from semantic_mapper.errors import ConfigError, TransportError
 from semantic_mapper.nodes.bridge.packing import POINT
@@ -24,6 +25,7 @@ from semantic_mapper.nodes.zenoh.node import run_zenoh
 from semantic_mapper.nodes.zenoh.session import ZenohSession
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.surface import surface_points, surface_voxels
+from semantic_mapper.transport.messages import Status
 from tests.nodes.bridge.robot import REFRESH_S, WARM_S, Robot, big_frame, bridged_robot
 from tests.nodes.support import eventually, free_port
 from tests.queries.scene import LABELS, whole
@@ -70,6 +72,29 @@ class Heard:
 def attached(sample: zenoh.Sample) -> dict[str, Any]:
     assert sample.attachment is not None
     return json.loads(sample.attachment.to_bytes())
+
+
+def test_a_session_that_has_ended_is_one_clear_error(address: str) -> None:
+    with ZenohSession(ZenohOptions(listen=address)) as outlet:
+        outlet._session.close()
+        status = Status("mapper", "running", 1)
+        for send in (lambda: outlet.wants("frame", "eye"), lambda: outlet.send_status(status)):
+            with pytest.raises(TransportError, match="Zenoh sends nothing any more: session closed"):
+                send()
+
+
+def test_a_session_that_cannot_be_closed_is_one_line(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Session:
+        """Of Zenoh, whose router has gone."""
+
+        def close(self) -> None:
+            opened.close()
+            raise zenoh.ZError("no answer")
+
+    with capture_logs() as told, ZenohSession(ZenohOptions(listen=address)) as outlet:
+        opened = outlet._session
+        monkeypatch.setattr(outlet, "_session", Session())
+    assert [(entry["event"], entry["reason"]) for entry in told] == [("session_not_closed", "no answer")]
 
 
 def test_images_poses_map_graph_and_status_arrive(robot: Robot, address: str) -> None:
