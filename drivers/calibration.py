@@ -1,7 +1,8 @@
 """Calibration files, and the one place where lens distortion is taken out of an image.
 
 A file is TOML or JSON: ``fx fy cx cy width height`` in pixels and ``distortion``, OpenCV's coefficients
-(k1 k2 p1 p2 k3 ...); with ``fisheye = true`` those of its fisheye model (k1 k2 k3 k4). Of a camera on a rig it also has ``T_rig_camera``, where the camera sits, row by row.
+(k1 k2 p1 p2 k3 ...); with ``fisheye = true`` those of its fisheye model (k1 k2 k3 k4). Of a camera on a rig it also has
+``T_rig_camera``, where the camera sits, row by row. YAML is that of ROS (camera_info) or Kalibr.
 """
 
 from __future__ import annotations

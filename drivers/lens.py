@@ -12,7 +12,7 @@ import numpy as np
 
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float64
+from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float32
 
 # Coefficients in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty.
 _PINHOLE = (
@@ -56,8 +56,8 @@ def lens_intrinsics(
     if name in _PINHOLE or name in _FISHEYE:
         raise ConfigError(f"lens model '{model}' with {len(values)} coefficients; it has fewer: calibrate again")
     raise ConfigError(
-        f"lens model '{model}' is not undone, only OpenCV's pinhole (plumb_bob, radtan, rational_polynomial) and fisheye "
-        "(equidistant): undistort the images first, or calibrate with one of these"
+        f"lens model '{model}' is not undone, only OpenCV's pinhole (plumb_bob, radtan, rational_polynomial) and "
+        "fisheye (equidistant): undistort the images first, or calibrate with one of these"
     )
 
 
@@ -88,7 +88,7 @@ def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
         ) from error
 
 
-def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float64, Float64]:
+def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float32, Float32]:
     """The ideal pinhole camera of a lens, and where each of its pixels lies in the image of the lens: (H, W) x and y.
 
     Raises:
@@ -102,7 +102,7 @@ def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float64,
     if isinstance(measured, FisheyeIntrinsics):
         ideal = ideal_fisheye_view(measured)
         x, y = cv2.fisheye.initUndistortRectifyMap(K, lens, np.eye(3), camera_matrix(ideal), size, cv2.CV_32FC1)
-        return ideal, np.asarray(x), np.asarray(y)
+        return ideal, np.asarray(x, np.float32), np.asarray(y, np.float32)
     new, _ = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
     fx, fy, cx, cy = (float(v) for v in (new[0, 0], new[1, 1], new[0, 2], new[1, 2]))
     try:
@@ -112,7 +112,7 @@ def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float64,
             f"the lens distortion {measured.distortion} leaves no usable image: {error}; calibrate the camera again"
         ) from error
     x, y = cv2.initUndistortRectifyMap(K, lens, np.eye(3), new, size, cv2.CV_32FC1)
-    return ideal, np.asarray(x), np.asarray(y)
+    return ideal, np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
 def _padded(values: Sequence[float], count: int) -> tuple[float, ...]:

@@ -6,12 +6,13 @@ the command's.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 
-# Counts in between, since asking for the parent is a system call.
-BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    for _ in range(1_000_000): pass"
+# Counts in between, since asking for the parent is a system call. The parent may be gone before the first question.
+BUSY = "import os, sys\nwhile os.getppid() == int(sys.argv[1]):\n    for _ in range(1_000_000): pass"
 
 
 def main(words: Sequence[str]) -> int:
@@ -24,7 +25,7 @@ def main(words: Sequence[str]) -> int:
         print("usage: python -m tools.beside_load COUNT COMMAND...", file=sys.stderr)
         return 2
     count, *command = words
-    busy = [subprocess.Popen([sys.executable, "-I", "-c", BUSY]) for _ in range(int(count))]
+    busy = [subprocess.Popen([sys.executable, "-I", "-c", BUSY, str(os.getpid())]) for _ in range(int(count))]
     try:
         return subprocess.run(command, check=False).returncode
     finally:

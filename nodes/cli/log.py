@@ -68,8 +68,8 @@ def import_(
         list[str] | None,
         typer.Option(
             metavar="ROLE=NAME",
-            help="ROS bags: topic of the image, depth, info (calibration), depth_info or pose; several times. Found by type. "
-            "depth=none: without depth, of every format.",
+            help="ROS bags: topic of the image, depth, info (calibration), depth_info or pose; several times. Found by "
+            "type. depth=none: without depth, of every format.",
         ),
     ] = None,
     world: Annotated[str, typer.Option(help="ROS bags: frame of tf that poses are in; map, world or odom.")] = "",

@@ -41,8 +41,8 @@ class ImportOptions:
         max_frames: Stop after this many frames; None = all.
         quarters: Turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side.
         match_s: TUM and ROS bags: largest time between a colour image, its depth image and its pose.
-        topics: ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), where several fit. Depth "none",
-            of every format: without.
+        topics: ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), where several fit. Depth
+            "none", of every format: without.
         world: ROS bags: frame of tf in which poses are; empty = map, world or odom.
         body: ROS bags: frame whose pose the topic of poses tells; empty = as its messages say.
         scale: Metres per unit of poses whose unit is their own (transforms, colmap, opensfm); None = not known.
@@ -534,7 +534,8 @@ def unknown_notice(file: Path, keys: Sequence[str]) -> list[str]:
         return []
     names = ", ".join(f"'{key[:40]}'" for key in keys[:8])
     return [
-        f"{file}: {names} {'is' if len(keys) == 1 else 'are'} not read; what it says of lens, axes, unit or time is lost"
+        f"{file}: {names} {'is' if len(keys) == 1 else 'are'} not read; what it says of lens, axes, unit or time is "
+        "lost"
     ]
 
 

@@ -1,9 +1,9 @@
 """The sequence-folder layout.
 
 ``color/NNNNNN.jpg|png``, ``depth/NNNNNN.png`` (uint16), ``label/NNNNNN.png`` (uint8) with ``labels.json``,
-``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx cy;
-of images that are not rectified, distortion: OpenCV's coefficients, with ``"fisheye": true`` those of its fisheye model;
-unless depth is in millimetres, depth_scale: units per metre;
+``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx
+cy; of images that are not rectified, distortion: OpenCV's coefficients, with ``"fisheye": true`` those of its fisheye
+model; unless depth is in millimetres, depth_scale: units per metre;
 ``"scale": "unknown"`` where poses are not in metres), and, if there is one, ``timestamps.txt`` (a row a
 frame: int nanoseconds, or seconds with a point). A frame without a depth image comes without depth.
 
@@ -103,16 +103,20 @@ class FolderRecording:
             raise ImportSourceError(f"{folder / 'color'}: no images named by number (000000.jpg or .png)")
         if not self._rows:
             raise ImportSourceError(f"{folder / 'poses.txt'}: holds no pose")
-        hz = options.frame_hz or DEFAULT_HZ
-        self._stamps = self._read_stamps(hz)
-        self._numbers = sorted(self._color)
-        poses_only = len(self._rows) - sum(number < len(self._rows) for number in self._numbers)
+        numbers = sorted({*self._color, *range(len(self._rows))})
+        # An image that is missing is a bad frame, but thousands of poses beside a few images are no bad frames.
+        self._numbers = numbers if len(numbers) <= 2 * len(self._color) else sorted(self._color)
+        poses_only = sum(number < len(self._rows) for number in numbers) - sum(
+            n < len(self._rows) for n in self._numbers
+        )
         if poses_only:
             missing = next(number for number in range(len(self._rows)) if number not in self._color)
             self.notices.append(
-                f"{counted(poses_only, 'row')} of poses.txt without an image in {folder / 'color'}, the first for image "
-                f"{missing}"
+                f"{counted(poses_only, 'row')} of poses.txt without an image in {folder / 'color'}, the first for "
+                f"image {missing}"
             )
+        hz = options.frame_hz or DEFAULT_HZ
+        self._stamps = self._read_stamps(hz)
         if max(self._color) >= len(self._rows) + len(self._color):
             raise ImportSourceError(
                 f"{folder}: images are numbered up to {max(self._color)}, poses.txt has {len(self._rows)} rows; row i "
@@ -143,7 +147,7 @@ class FolderRecording:
             BadFrameError: it cannot be used.
         """
         number = self._numbers[number]
-        file = self._color[number]
+        file = self._color.get(number, self._folder / "color" / f"{number:06d}.jpg")
         pose = self._pose(number)
         rgb, encoded = read_rgb(file)
         image_size_must_be(rgb, self._measured, file)
@@ -196,7 +200,7 @@ class FolderRecording:
 
     def _read_stamps(self, frame_hz: float) -> list[int]:
         file = self._folder / "timestamps.txt"
-        count = max(self._color) + 1
+        count = self._numbers[-1] + 1
         if not file.exists():
             self.notices.append(f"no timestamps.txt: stamps are made up at {frame_hz:g} frames a second")
             return [round(i * 1e9 / frame_hz) for i in range(count)]
@@ -213,8 +217,8 @@ class FolderRecording:
         back = next((n for n, (a, b) in enumerate(pairwise(stamps[:count]), 2) if b <= a), 0)
         if back:
             raise ImportSourceError(
-                f"{file}: row {back} is not later than the row before it; frames need rising stamps: sort the images, or "
-                "mend the stamps"
+                f"{file}: row {back} is not later than the row before it; frames need rising stamps: sort the images, "
+                "or mend the stamps"
             )
         if count > 1 and (stamps[count - 1] - stamps[0]) / (count - 1) < LEAST_PERIOD_NS:
             raise ImportSourceError(

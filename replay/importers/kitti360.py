@@ -196,8 +196,8 @@ class Kitti360Recording:
             poses.setdefault(number, (line, T_world_cam0))
         if not poses:
             raise ImportSourceError(
-                f"{self._poses_file}: holds no row of a frame number and the 16 numbers of a 4x4 matrix"
-                f"{': ' + bad[0] if bad else ''}; poses.txt, with 12, is another file"
+                f"{self._poses_file}: holds no pose: no row of a frame number and the 16 numbers of a 4x4 matrix"
+                f"{' (' + bad[0] + ')' if bad else ''}; poses.txt, with 12, is another file"
             )
         if bad:
             self.notices.append(f"{self._poses_file}: {counted(len(bad), 'row')} left out, no pose: {bad[0]}")

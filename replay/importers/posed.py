@@ -146,7 +146,7 @@ class PosedPictures:
         if picture.confidence_file is not None and picture.confidence_file.exists():
             of = (depth_m.shape[0], depth_m.shape[1])
             depth_m[read_plane(picture.confidence_file, "uint8", of, "confidence") == 0] = 0
-        if not same_view((depth_m.shape[1], depth_m.shape[0]), size[::-1]):
+        if not same_view((depth_m.shape[0], depth_m.shape[1]), size):
             raise BadFrameError(
                 picture.depth_file,
                 f"the depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, its picture {size[1]}x{size[0]}, which is "

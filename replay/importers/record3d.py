@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from semantic_mapper.errors import FrameError, ImportSourceError
+from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
@@ -37,13 +37,13 @@ _KNOWN = ("dw", "dh", "initPose", "cameraType")  # of the depth images, and of w
 MAX_NORM_ERROR = 0.1  # of a unit quaternion
 
 
-class _Metadata(msgspec.Struct):
+class _Metadata(msgspec.Struct, rename={"per_frame_k": "perFrameIntrinsicCoeffs", "frame_times": "frameTimestamps"}):
     w: Annotated[int, Meta(ge=1, le=1 << 14)]
     h: Annotated[int, Meta(ge=1, le=1 << 14)]
     poses: list[list[float] | None]
     K: Annotated[list[float], Meta(min_length=9, max_length=9)] | None = None
-    perFrameIntrinsicCoeffs: list[list[float]] | None = None
-    frameTimestamps: list[float] | None = None
+    per_frame_k: list[list[float]] | None = None
+    frame_times: list[float] | None = None
     fps: Annotated[float, Meta(gt=0, le=1000)] = 60.0
 
 
@@ -61,8 +61,8 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     if not images:
         raise ImportSourceError(f"{folder / 'rgb'}: no pictures; export as 'EXR + RGB'")
     for name, series in (
-        ("perFrameIntrinsicCoeffs", found.perFrameIntrinsicCoeffs),
-        ("frameTimestamps", found.frameTimestamps),
+        ("perFrameIntrinsicCoeffs", found.per_frame_k),
+        ("frameTimestamps", found.frame_times),
     ):
         if series and len(series) != len(found.poses):
             raise ImportSourceError(
@@ -73,10 +73,8 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     for number, image in images.items():
         try:
             pictures.append(_picture(found, number, image))
-        except ValueError as error:
+        except ValueError as error:  # FrameError, too
             left_out.append(f"{image}: {error}")
-        except FrameError as error:
-            raise ImportSourceError(f"{file}: intrinsics of picture {number}: {error}") from error
     if left_out:
         notices.append(f"{counted(len(left_out), 'picture')} left out; the first: {left_out[0]}")
     if not pictures:
@@ -98,13 +96,13 @@ def _picture(found: _Metadata, number: int, image: Path) -> PosedPicture:
     if row.shape != (7,) or not np.isfinite(row).all() or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
         raise ValueError("its pose is missing, or no unit quaternion qx qy qz qw and position")
     T = T_Z_UP_Y_UP @ pose_matrix(row[4:], row[:4]) @ GL_AXES
-    k = found.perFrameIntrinsicCoeffs[number][:4] if found.perFrameIntrinsicCoeffs else None
+    k = found.per_frame_k[number][:4] if found.per_frame_k else None
     if k is None and found.K is not None:
         k = [found.K[0], found.K[4], found.K[6], found.K[7]]
     if k is None or len(k) != 4:
         raise ValueError("it has no intrinsics: neither K nor 4 numbers of perFrameIntrinsicCoeffs")
     fx, fy, cx, cy = k
-    seconds = found.frameTimestamps[number] - found.frameTimestamps[0] if found.frameTimestamps else number / found.fps
+    seconds = found.frame_times[number] - found.frame_times[0] if found.frame_times else number / found.fps
     return PosedPicture(
         image, CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, found.w, found.h), T, stamp_ns=round(seconds * 1e9)
     )

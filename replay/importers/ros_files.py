@@ -83,7 +83,7 @@ def storage_files(folder: Path) -> list[Path]:
 def is_bag(src: Path) -> bool:
     """Whether a file is a bag, or a folder is one of ROS 2, complete or without its metadata."""
     if not src.is_dir():
-        return bag_kind(src) is not None
+        return src.suffix in (".bag", ".db3") or bag_kind(src) is not None  # a bag that is damaged is still one
     files = storage_files(src)
     return bool(files) and ((src / "metadata.yaml").exists() or all(bag_kind(file) is not None for file in files))
 

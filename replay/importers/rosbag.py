@@ -65,8 +65,8 @@ _SAME_LENS = (
 _REALSENSE_VIEWER = "/device_"  # begins the topics of its recordings
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 _VIEWER = (
-    ". Recordings of the RealSense Viewer have none: record with ROS and an odometry, or live with `semantic-mapper up` of "
-    "launch/realsense.toml, which finds poses"
+    ". Recordings of the RealSense Viewer have none: record with ROS and an odometry, or live with `semantic-mapper "
+    "up` of a launch file with a camera of kind realsense, which finds poses"
 )
 _MEND = (
     "`ros2 bag reindex`, `mcap recover` or `rosbag reindex` mends a bag whose recorder was killed; one that was copied "
@@ -454,7 +454,7 @@ class RosbagRecording:
         return pose_at, f"poses are those of {camera}, from {topic} of {body}"
 
     def _image_pose(self, color: _Topic, infos: list[Any]) -> Float64:
-        """``T_frame_image`` (4, 4): how a stereo camera's rectification turned, and moved, the image within its frame."""
+        """``T_frame_image`` (4, 4): how a stereo camera's rectification has turned the image within its frame."""
         T = np.eye(4)
         info = next((info for info in infos if self._bag.is_calibrated(info)), None)
         if not color.rectified or info is None:
@@ -467,8 +467,8 @@ class RosbagRecording:
             )
         if P[3]:
             self.notices.append(
-                f"{color.name}: is the right image of a stereo camera (P of its camera_info); '{color.frame}' is taken as "
-                "the frame of this camera, not of the left one"
+                f"{color.name}: is the right image of a stereo camera (P of its camera_info); '{color.frame}' is taken "
+                "as the frame of this camera, not of the left one"
             )
         return T
 
@@ -494,9 +494,9 @@ class RosbagRecording:
         if depth.frame == self._color_topic.frame and not own.distorted and not _one_lens(self._measured, own):
             raise ImportSourceError(
                 f"{self._bag.src}: {depth.name} has the frame of {self._color_topic.name}, '{depth.frame}', but its "
-                f"calibration has other intrinsics ({own}, colour {self._measured}). Where depth is registered to colour: "
-                f"--topic depth_info={name}; where it has a lens of its own: --topic depth_info={depth_name}; without it: "
-                "--topic depth=none"
+                f"calibration has other intrinsics ({own}, colour {self._measured}). Where depth is registered to "
+                f"colour: --topic depth_info={name}; where it has a lens of its own: --topic depth_info={depth_name}; "
+                "without it: --topic depth=none"
             )
 
     def _is_scaled(self, own: CameraIntrinsics) -> bool:
@@ -669,8 +669,8 @@ class _Bag:
     def intrinsics(self, info: Any, *, rectified: bool) -> CameraIntrinsics:
         """See ``ros_images.intrinsics``."""
         K, D, P = self._matrices(info)
-        rectified = rectified and (np.any(P) or np.any(D))  # a pinhole camera's driver may leave P empty
-        return ros_images.intrinsics(info, P if rectified else K, D, rectified=bool(rectified))
+        rectified = rectified and bool(np.any(P) or np.any(D))  # a pinhole camera's driver may leave P empty
+        return ros_images.intrinsics(info, P if rectified else K, D, rectified=rectified)
 
     def is_calibrated(self, info: Any) -> bool:
         """Whether a ``sensor_msgs/CameraInfo`` says anything: cameras send some before they know."""

@@ -131,7 +131,7 @@ def _what_folder(src: Path) -> str:
     """Why a folder is not imported."""
     if (src / "traj.txt").exists() and (src / "results").is_dir():
         return (
-            "is a room of Replica as NICE-SLAM renders it (results/frame*.jpg, traj.txt); only Replica of Semantic-NeRF is "
+            "is a room of Replica as NICE-SLAM renders it (results/frame*.jpg, traj.txt); only Semantic-NeRF's is "
             "read (rgb/, depth/, traj_w_c.txt). Rewrite it as a sequence folder: color/NNNNNN.jpg, depth/NNNNNN.png, "
             "poses.txt (the rows of traj.txt), intrinsics.json (of cam_params.json, depth_scale is its scale)"
         )
@@ -154,8 +154,6 @@ def _what_folder(src: Path) -> str:
 
 def _what_file(src: Path) -> str:
     """Why a file is not imported."""
-    if src.suffix.lower() == ".bag":
-        return "is no bag of ROS 1, or one that is cut off at its beginning; copy it again"
     if src.suffix.lower() in _FILES:
         return _FILES[src.suffix.lower()]
     if src.suffix != LOG_SUFFIX:
@@ -164,9 +162,9 @@ def _what_file(src: Path) -> str:
         LogReader(src, allow_empty=True).close()
     except LogError:
         return (
-            "is neither a bag of ROS 2 (none of its schemas is ros2msg or ros2idl) nor a log of semantic-mapper; other MCAP "
-            "files, such as those that `export` has written for Foxglove, cannot be imported: use the log that they were "
-            "made of, or convert bags of ROS 1 in MCAP with rosbags-convert"
+            "is neither a bag of ROS 2 (none of its schemas is ros2msg or ros2idl) nor a log of semantic-mapper; other "
+            "MCAP files, such as those that `export` has written for Foxglove, cannot be imported: use the log that "
+            "they were made of, or convert bags of ROS 1 in MCAP with rosbags-convert"
         )
     return "is a log already; replay it as it is"
 

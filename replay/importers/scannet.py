@@ -194,12 +194,13 @@ class ScanNetRecording:
         for image in images:
             try:
                 height, width = read_rgb(image)[0].shape[:2] if which == "color" else read_depth_size(image)
+                found = CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height)
                 if not (0.25 * width < K[0, 2] < 0.75 * width and 0.25 * height < K[1, 2] < 0.75 * height):
                     raise ImportSourceError(
                         f"{file}: its principal point ({K[0, 2]:g}, {K[1, 2]:g}) is far from the middle of images of "
                         f"{width}x{height}: they were resized, or cut; scale the matrix with them"
                     )
-                return CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height)
+                return found
             except BadFrameError:  # reported when its turn comes
                 continue
             except FrameError as error:

@@ -1,14 +1,14 @@
 """``transforms.json`` of nerfstudio and instant-ngp: pictures with poses, in OpenGL's camera axes.
 
 The layout is that of https://docs.nerf.studio/quickstart/data_conventions.html: ``fl_x fl_y cx cy w h`` and lens ``k1
-k2 k3 p1 p2`` (or ``camera_angle_x``, ``camera_angle_y``) for all frames or in a frame, and ``frames`` with ``file_path``
-and ``transform_matrix`` (camera to world). The first pixel's centre is at 0.5. ``camera_model`` OPENCV_FISHEYE, or
-instant-ngp's ``is_fisheye``, means OpenCV's fisheye lens, ``k1 k2 k3 k4``.
+k2 k3 p1 p2`` (or ``camera_angle_x``, ``camera_angle_y``) for all frames or in a frame, and ``frames`` with
+``file_path`` and ``transform_matrix`` (camera to world). The first pixel's centre is at 0.5. ``camera_model``
+OPENCV_FISHEYE, or instant-ngp's ``is_fisheye``, means OpenCV's fisheye lens, ``k1 k2 k3 k4``.
 
-With ``depth_file_path`` (16-bit PNG, millimetres unless ``depth_unit_scale_factor`` says otherwise) poses are in metres,
-otherwise in a unit of their own. A given scale makes metres of the poses alone: such depth images have a unit that the
-file tells, and poses of structure from motion with the depth of a sensor are the case in which both differ. The depth
-of instant-ngp, ``depth_path``, is in the unit of the poses, times ``integer_depth_scale``, and is scaled with them.
+With ``depth_file_path`` (16-bit PNG, millimetres unless ``depth_unit_scale_factor`` says otherwise) poses are in
+metres, otherwise in a unit of their own. A given scale makes metres of the poses alone: such depth images have a
+unit that the file tells, and poses of structure from motion with the depth of a sensor are the case in which both differ.
+The depth of instant-ngp, ``depth_path``, is in the unit of the poses, times ``integer_depth_scale``, and is scaled with them.
 """
 
 from __future__ import annotations
@@ -244,7 +244,8 @@ def _intrinsics(all_frames: _Lens, frame: _Lens, size: tuple[int, int] | None, w
     strange = [name for name, value in left.items() if value]
     if strange:
         raise ImportSourceError(
-            f"{where}: camera_model '{model}' has no {', '.join(strange)} that programs agree on; undistort the images first"
+            f"{where}: camera_model '{model}' has no {', '.join(strange)} that programs agree on; undistort the images "
+            "first"
         )
     try:
         return lens_intrinsics(model, lens, (fx, fy, cx - 0.5, cy - 0.5), (int(width), int(height)))

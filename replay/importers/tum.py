@@ -189,6 +189,7 @@ def read_trajectory(file: Path) -> TrajectoryFile:
     found: dict[int, list[float]] = {}
     left_out: list[str] = []
     remarks: list[str] = []
+    first = ""
     back, last_ns = 0, -1
     for line, text in read_lines(file):
         words = split_row(text)
@@ -204,11 +205,12 @@ def read_trajectory(file: Path) -> TrajectoryFile:
                 raise ValueError("a second pose of this stamp; the first counts")
         except (ValueError, IndexError) as error:
             left_out.append(f"{file}, line {line} is passed over: {error}")
+            first = first or f"; line {line}: {error}"
             continue
         back += stamp_ns < last_ns
         found[stamp_ns], last_ns = row, stamp_ns
     if not found:
-        raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'{'; '.join(['', *left_out[:1]])}")
+        raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'{first}")
     if back:
         remarks.append(f"{file}: stamps go back {counted(back, 'time')}; poses are sorted by them")
     order = sorted(found)

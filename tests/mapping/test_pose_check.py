@@ -25,6 +25,7 @@ from tests.small import tiny_frames
 
 Change = Callable[[PosedFrame], PosedFrame]
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+REP_103 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # T_body_camera
 
 
 def check(frames: Iterable[PosedFrame], change: Change = lambda frame: frame) -> PoseCheck:
@@ -68,7 +69,8 @@ def deeper(factor: float) -> Change:
 
 WRONG: dict[str, tuple[Change, str]] = {
     "inverted": (posed(invert_pose), "With poses inverted"),
-    "OpenGL axes": (posed(lambda T: T @ OPENGL), "With camera axes turned"),
+    "OpenGL axes": (posed(lambda T: T @ OPENGL), "With camera axes turned from OpenGL's"),
+    "REP 103 axes": (posed(lambda T: T @ np.linalg.inv(REP_103)), "With camera axes turned from a robot's (REP 103"),
     "millimetres": (posed(millimetres), "With translations divided by 1000"),
     "depth five times too large": (deeper(5), "With depth divided by 5"),
     "depth five times too small": (deeper(0.2), "With depth multiplied by 5"),

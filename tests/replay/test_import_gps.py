@@ -262,7 +262,8 @@ def test_a_lens_of_browns_model_is_undone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("camera", "says"),
     [
-        ({"projection_type": "fisheye"}, "'fisheye' is not read"),
+        ({"projection_type": "spherical"}, "'spherical' is not read"),
+        ({"projection_type": "brown", "focal": 0.8, "k4": 0.1}, "with k4 is not read"),
         ({"projection_type": "brown", "focal": None}, "no focal length"),
     ],
 )

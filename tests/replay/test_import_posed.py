@@ -147,8 +147,11 @@ def test_a_field_of_view_names_without_suffix_and_a_lens_are_understood(tmp_path
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, "no pinhole camera"),
-        ({"fl_x": None}, "no focal length"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not undone"),
+        ({"k4": 0.01}, "no k4 that programs agree on"),
+        ({"is_fisheye": True, "p1": 0.01}, "has no p1"),
+        ({"from_mitsuba": True}, "'from_mitsuba' means poses in other axes"),
+        ({"fl_x": None, "fl_y": None}, "no focal length"),
         ({"frames": []}, "no posed picture"),
         ({"frames": [{"file_path": "../a.png", "transform_matrix": np.eye(4).tolist()}]}, "outside"),
         ({"frames": [{"file_path": "a.png", "transform_matrix": [[1.0]]}]}, "transform_matrix"),
@@ -267,13 +270,14 @@ def test_what_is_wrong_with_a_colmap_model_is_told(tmp_path: Path) -> None:
         imported(folder)
     folder = make_colmap(tmp_path / "text", "txt")
     cameras = folder / "sparse" / "0" / "cameras.txt"
-    cameras.write_text(f"1 OPENCV_FISHEYE {W} {H} {F} {F} 32 24 0 0 0 0\n")
-    with pytest.raises(ImportSourceError, match="lens model 'OPENCV_FISHEYE' is not read"):
+    cameras.write_text(f"1 FOV {W} {H} {F} {F} 32 24 0.5\n")
+    with pytest.raises(ImportSourceError, match="lens model 'FOV' is not read"):
         imported(folder)
     cameras.write_text(f"2 PINHOLE {W} {H} {F} {F} 32 24\n")
     with pytest.raises(ImportSourceError, match="camera 1, which is missing"):
         imported(folder)
-    (folder / "images" / "0.png").unlink()
+    for picture in (folder / "images").iterdir():
+        picture.unlink()
     cameras.write_text(f"1 PINHOLE {W} {H} {F} {F} 32 24\n")
     with pytest.raises(ImportSourceError, match="pictures of the model are missing"):
         imported(folder)
@@ -330,7 +334,7 @@ def test_a_record3d_export_comes_with_poses_and_times(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("changes", "says"),
-    [({"poses": [[0, 0, 0, 1, 0, 0, 0]]}, "has 1 poses"), ({"poses": [[2.0] * 7] * 3}, "pose 0"), ({"K": [1]}, "K")],
+    [({"poses": []}, "pose of none"), ({"poses": [[2.0] * 7] * 3}, "no unit quaternion"), ({"K": [1]}, "K")],
 )
 def test_what_is_wrong_with_a_record3d_export_is_told(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
     with pytest.raises(ImportSourceError, match=says):

@@ -306,7 +306,9 @@ def test_of_two_cameras_one_has_to_be_named(tmp_path: Path) -> None:
     assert imported(src, topics={"image": "/rear/color/image_raw", "depth": DEPTH})[0].with_depth == 6
     with pytest.raises(ImportSourceError, match=r"no topic '/side' of images for image; there are /cam"):
         imported(src, topics={"image": "/side"})
-    with pytest.raises(ImportSourceError, match=r"no topic has the role 'rgb'; the roles are image, depth, info, pose"):
+    with pytest.raises(
+        ImportSourceError, match=r"no topic has the role 'rgb'; the roles are image, depth, info, depth_info, pose"
+    ):
         imported(src, topics={"rgb": COLOR})
 
 
@@ -341,7 +343,7 @@ def test_what_a_bag_lacks_is_named(
 
 def test_a_lens_that_is_not_opencvs_and_a_camera_without_calibration_are_refused(tmp_path: Path) -> None:
     for name, model, lens, focal, complaint in (
-        ("fish", "equidistant", (0.1, 0, 0, 0), 66.0, "'equidistant' with 4 coefficients.*rectify the images"),
+        ("fish", "thin_prism_fisheye", (0.1, 0, 0, 0), 66.0, "'thin_prism_fisheye' is not undone.*rectify the images"),
         ("blank", "plumb_bob", (0,) * 5, 0.0, "is not calibrated .K is zero."),
     ):
 

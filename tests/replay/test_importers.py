@@ -195,8 +195,8 @@ def test_stamps_come_from_timestamps_txt_where_there_is_one(folder: Path, text: 
         ("labels.json", " " * (1 << 20) + "{}", "larger than the limit"),
         ("labels.json", '{"classes": {"1": "wall", "2": "wall"}}', "twice"),
         ("poses.txt", "", "holds no pose"),
-        ("timestamps.txt", "1\n2", "rising stamp"),
-        ("timestamps.txt", "1\n2\n2\n3\n4\n5", "rising stamp"),
+        ("timestamps.txt", "1\n2", "a stamp for each of 6 frames"),
+        ("timestamps.txt", "1\n2\n2\n3\n4\n5", "row 3 is not later.*rising stamps"),
         ("timestamps.txt", "1\n2\n3\n4\n5\nsoon", "soon"),
         ("timestamps.txt", "1\n2\n3\n4\n5\n6", "1 ns apart; whole numbers are nanoseconds"),
         ("timestamps.txt", "1700\n1733\n1766\n1800\n1833\n1866", "or convert milliseconds"),
@@ -338,7 +338,7 @@ def test_tum_frames_without_depth_are_kept_and_those_without_a_pose_left_out(tum
 
 def test_tum_calibrations_go_by_the_name_of_the_sequence(tmp_path: Path) -> None:
     for name, fx, notice in (
-        ("freiburg1_desk", 517.3, "distortion"),
+        ("freiburg1_desk", 546.755, ""),  # 517.3 before its lens is undone
         ("freiburg3_office", 535.4, ""),
         ("mine", 525.0, "ROS"),
     ):
@@ -349,7 +349,7 @@ def test_tum_calibrations_go_by_the_name_of_the_sequence(tmp_path: Path) -> None
         for file in (src / "depth").iterdir():
             rec.write_image(file, np.full((480, 640), 5000, np.uint16))
         report, _ = imported(src)
-        assert report.info.cameras["camera"].fx == fx
+        assert report.info.cameras["camera"].fx == pytest.approx(fx, abs=1e-3)
         assert notice in " ".join(report.notices)
 
 
@@ -366,7 +366,7 @@ def test_windows_marks_and_line_ends_cost_nothing(tum: Path) -> None:
     [
         ("1305031102175304000 0 0 0 0 0 0 1", "divide nanoseconds by 1e9"),
         ("1305031102.1 0 0 0 0 0 0 2", "its quaternion has length 2, not 1"),
-        ("1305031102.1,0,0,0,0,0,0,1", "is not a time in seconds"),
+        ("noon,0,0,0,0,0,0,1", "is not a time in seconds"),
     ],
 )
 def test_a_trajectory_of_another_form_is_refused_with_its_first_mistake(tum: Path, pose: str, says: str) -> None:
@@ -380,7 +380,7 @@ def test_tum_lists_cannot_reach_outside_the_recording(tum: Path) -> None:
     lines[1] = "1305031102.175304 ../../etc/passwd"
     (tum / "rgb.txt").write_text("\n".join(lines))
     report, _ = imported(tum)
-    assert report.frames == 5 and any("outside the recording" in notice for notice in report.notices)
+    assert report.frames == 5 and any("outside of it" in notice for notice in report.notices)
 
 
 def test_each_depth_image_is_matched_once_to_its_nearest() -> None:
