@@ -59,7 +59,7 @@ def leaks(text: str) -> bool:
     ],
 )
 def test_no_form_of_an_address_shows_its_secret(url: str) -> None:
-    for text in (url, f"/work/{url}: is no store", f"error: '{url}', twice: {url}", f'["{url}"]'):
+    for text in (url, f"/data/{url}: is no store", f"error: '{url}', twice: {url}", f'["{url}"]'):
         shown = without_secrets(text)
         assert not leaks(shown), shown
         assert without_secrets(shown) == shown

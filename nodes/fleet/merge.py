@@ -40,6 +40,7 @@ from semantic_mapper.mapping.files.tiles import (
     TileManifest,
     TileRow,
     TileSource,
+    check_tile,
     content_digest,
     cut_map,
     encode_tiles,
@@ -47,6 +48,7 @@ from semantic_mapper.mapping.files.tiles import (
     load_to_cut,
     merged_header,
     parse_tiles,
+    tile_digest,
     write_piece,
 )
 from semantic_mapper.mapping.map_alignment import find_alignment
@@ -56,7 +58,7 @@ from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_
 from semantic_mapper.queries.tiles import describe_tile
 from semantic_mapper.types import Float64
 
-MERGE_VERSION = 2  # part of all names: raise it where the same maps would give other places or tiles
+MERGE_VERSION = 3  # part of all names: raise it where the same maps would give other places or tiles
 TASK_BYTES = 3_000_000_000  # of memory that a task declares: two maps of ``tiles.MEMORY_MB`` and the libraries
 MAP_NAME = "map.npz"
 _WAY_OUT = "Give it in the file of --poses"
@@ -493,10 +495,11 @@ def _fuse(
     with ExitStack() as stack:
         tile = fuse_pieces([stack.enter_context(_reading(store, piece)) for piece in pieces], header)
     blocks, surface = describe_tile(tile, index, edge_blocks)
-    row = TileRow(index=index, file=f"{name}.npz", blocks=blocks, surface=surface)
+    row = TileRow(index=index, file=f"{name}.npz", digest="", blocks=blocks, surface=surface)
     if blocks:  # else only its border holds something, which is inside of its neighbours
         with _writing(store, row.file) as file:
             tile.save(file)
+            row = msgspec.structs.replace(row, digest=tile_digest(file))
     store.write(f"{name}.json", msgspec.json.encode(row))
     return _Fused(row, _peak_bytes())
 
@@ -520,9 +523,25 @@ def _there(store: Store, plan: str) -> TileManifest:
 
 
 def _lost_tiles(store: Store, manifest: TileManifest) -> set[TileIndex]:
-    """Tiles of the manifest whose files are not there."""
+    """Tiles of the manifest whose files are not there; in a local store, also those in whose place others are."""
     there = set(store.names("tiles"))
-    return {row.index for row in manifest.tiles if row.file.removeprefix("tiles/") not in there}
+    lost = {row.index for row in manifest.tiles if row.file.removeprefix("tiles/") not in there}
+    if store.local is None:
+        return lost
+    for row in manifest.tiles:
+        if row.index not in lost and not _is_tile(store.local / row.file, row):
+            store.remove(row.file)
+            lost.add(row.index)
+    return lost
+
+
+def _is_tile(file: Path, row: TileRow) -> bool:
+    try:
+        check_tile(row, tile_digest(file))
+    except MapError as error:
+        _log.warning("tile_not_used", file=str(file), reason=str(error))
+        return False
+    return True
 
 
 def _remove_scraps(store: Store, manifest: TileManifest) -> None:

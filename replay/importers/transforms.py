@@ -6,9 +6,10 @@ k2 k3 p1 p2`` (or ``camera_angle_x``, ``camera_angle_y``) for all frames or in a
 OPENCV_FISHEYE, or instant-ngp's ``is_fisheye``, means OpenCV's fisheye lens, ``k1 k2 k3 k4``.
 
 With ``depth_file_path`` (16-bit PNG, millimetres unless ``depth_unit_scale_factor`` says otherwise) poses are in
-metres, otherwise in a unit of their own. A given scale makes metres of the poses alone: such depth images have a
-unit that the file tells, and poses of structure from motion with the depth of a sensor are the case in which both differ.
-The depth of instant-ngp, ``depth_path``, is in the unit of the poses, times ``integer_depth_scale``, and is scaled with them.
+metres, otherwise in a unit of their own. A given scale makes metres of the poses alone: such depth images have a unit
+that the file tells, and poses of structure from motion with the depth of a sensor are the case in which both differ.
+The depth of instant-ngp, ``depth_path``, is in the unit of the poses, times ``integer_depth_scale``, and is scaled with
+them.
 """
 
 from __future__ import annotations

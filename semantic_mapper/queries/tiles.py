@@ -27,9 +27,11 @@ from semantic_mapper.mapping.files.tiles import (
     TileManifest,
     TileRow,
     TileSurface,
+    check_tile,
     inside,
     load_tiles,
     read_tiles,
+    tile_digest,
 )
 from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.map_types import MapPoints
@@ -239,6 +241,7 @@ class TiledMap:
                     self._tiles.popitem(last=False)
                 row = self._rows[index]
                 with self._fetch(row) as path:
+                    check_tile(row, tile_digest(path))
                     tile = _split(MapMirror.load(path).snapshot(), index, self.manifest.edge_blocks)
                 self.loads += 1
             self._tiles[index] = tile

@@ -164,10 +164,14 @@ class MapReader:
 
     Args:
         manifest: What it says of itself, checked.
+
+    Attributes:
+        digest: SHA-256 of the manifest as it stands in the file: that of the map, as it holds those of all chunks.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, manifest: MapManifest) -> None:
         self.manifest = manifest
+        self.digest = archive.comment.removeprefix(_COMMENT).decode("ascii")
         self._path = path
         self._archive = archive
 

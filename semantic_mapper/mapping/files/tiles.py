@@ -38,7 +38,7 @@ from semantic_mapper.types import Bool, Float64, Int64
 
 TILES_NAME = "tiles.json"
 TILES_FORMAT = "semantic-mapper tiles"
-TILES_VERSION = 1
+TILES_VERSION = 2  # 1 had no digests
 EDGE_BLOCKS = 25  # 4 m at 2 cm voxels: about 5000 blocks of a furnished building, 0.2 GB of memory with 13 classes
 MEMORY_MB = 1000  # of a map that is cut; what is used longest ago goes to disk (``voxel_map.memory_mb``)
 _MAX_MANIFEST_BYTES = 64 << 20
@@ -89,12 +89,14 @@ class TileRow(Config, frozen=True):
     Args:
         index: Its blocks have coordinates from ``index * edge_blocks`` on.
         file: Name below the folder of the manifest.
+        digest: Of its file (``MapReader.digest``); empty where there is none, as all blocks are of the border.
         blocks: Inside the tile; its file holds those of the border, too.
         surface: See there.
     """
 
     index: TileIndex
     file: Annotated[str, msgspec.Meta(pattern=r"^tiles/[0-9a-f_-]+\.npz$")]
+    digest: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64}|)\Z")]
     blocks: NotNegative
     surface: TileSurface
 
@@ -212,6 +214,33 @@ def content_digest(header: MapManifest) -> str:
     return digest(msgspec.json.encode(header))
 
 
+def tile_digest(path: Path) -> str:
+    """Digest of a tile's file, for its row in the manifest.
+
+    Raises:
+        MapError: see ``open_map``.
+    """
+    with open_map(path) as reader:
+        return reader.digest
+
+
+def check_tile(row: TileRow, digest: str) -> None:
+    """Check that a file is the one that the manifest means: tiles are maps, and each could stand in another's place.
+
+    Args:
+        row: Of the manifest.
+        digest: Of the file.
+
+    Raises:
+        MapError: it is another one; names it.
+    """
+    if digest != row.digest:
+        raise MapError(
+            f"{row.file}: is another map than the manifest of the tiles names so: it was exchanged, or is of another "
+            "merge. `fleet merge` of the same maps into the same store makes it again"
+        )
+
+
 def load_to_cut(path: Path) -> VoxelMap:
     """A saved map in bounded memory (``MEMORY_MB``).
 
@@ -327,6 +356,7 @@ def load_tiles(manifest: TileManifest, files: Iterator[Path]) -> VoxelMap:
     whole.last_stamp_ns = manifest.last_stamp_ns
     for row, path in zip(manifest.tiles, files, strict=True):
         with open_map(path) as reader:
+            check_tile(row, reader.digest)
             for keys, values in reader.parts():
                 own = inside(keys, row.index, manifest.edge_blocks)
                 with whole.locked() as grid:
@@ -356,11 +386,17 @@ def parse_tiles(content: bytes, where: str) -> TileManifest:
     if kind != TILES_FORMAT:
         raise MapError(f"{where}: no manifest of tiles but of '{kind}'")
     if version != TILES_VERSION:
-        raise MapError(f"{where}: tiles of version {version}, this release reads version {TILES_VERSION}; merge again")
+        raise MapError(
+            f"{where}: tiles of version {version}, this release reads version {TILES_VERSION}; merge "
+            "again into another store"
+        )
     try:
         manifest = convert_config(plain, TileManifest, where)
     except ConfigError as error:
         raise MapError(f"{error}. {_MEND}") from error
+    for tile in manifest.tiles:
+        if not tile.digest:
+            raise MapError(f"{where}: has no digest of {tile.file}. {_MEND}")
     indices = [tile.index for tile in manifest.tiles]
     if indices != sorted(set(indices)):
         raise MapError(f"{where}: tiles are not in order, or come twice. {_MEND}")

@@ -163,7 +163,7 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path, manifest: TileMani
     ("change", "says"),
     [
         ((b'"format": "semantic-mapper tiles"', b'"format": "zarr"'), "no manifest of tiles but of 'zarr'"),
-        ((b'"version": 1', b'"version": 2'), "tiles of version 2"),
+        ((b'"version": 2', b'"version": 1'), "tiles of version 1"),
         ((b'"tiles/', b'"../tiles/'), "file"),
         ((b'"edge_blocks": 4', b'"edge_blocks": 0'), "edge_blocks"),
         ((b'"edge_blocks": 4', b'"edge": 4'), "edge"),

@@ -15,6 +15,7 @@ from semantic_mapper.mapping.files.tiles import (
     fuse_pieces,
     load_to_cut,
     merged_header,
+    tile_digest,
     write_piece,
     write_tiles,
 )
@@ -42,7 +43,8 @@ def make_tiles(maps: Sequence[Path], poses: Sequence[Float64], folder: Path, edg
         if blocks:
             name = f"tiles/{'_'.join(map(str, index))}.npz"
             tile.save(folder / name)
-            rows.append(TileRow(index=index, file=name, blocks=blocks, surface=surface))
+            digest = tile_digest(folder / name)
+            rows.append(TileRow(index=index, file=name, digest=digest, blocks=blocks, surface=surface))
     manifest = TileManifest(
         plan=content_digest(header),
         config=header.config,

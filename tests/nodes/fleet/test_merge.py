@@ -202,6 +202,21 @@ def test_a_lost_tile_is_named_and_made_again(maps: list[str], tmp_path: Path) ->
     assert again.manifest == report.manifest and content(tmp_path) == before
 
 
+def test_exchanged_tiles_are_named_and_made_again(maps: list[str], tmp_path: Path) -> None:
+    report = merged(maps, tmp_path)
+    before = content(tmp_path)
+    one, other = (tmp_path / row.file for row in report.manifest.tiles[:2])
+    one_bytes = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(one_bytes)
+    tiled = open_tiles(str(tmp_path))
+    for ask in (tiled.load, tiled.points, tiled.instances):
+        with pytest.raises(MapError, match=rf"tiles/({one.name}|{other.name}): is another map"):
+            ask()
+    again = merged(maps, tmp_path)
+    assert again.manifest == report.manifest and content(tmp_path) == before
+
+
 def test_tiles_are_named_by_their_manifest_as_well(maps: list[str], tmp_path: Path) -> None:
     report = merged(maps, tmp_path)
     assert holds_tiles(str(tmp_path / TILES_NAME))
