@@ -56,7 +56,7 @@ from semantic_mapper.replay.sfm.selection import LEAST_MOTION, STEP, FilmLook, l
 from semantic_mapper.replay.sfm.vertical import find_edges, vertical
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float64, Int64, PosedFrame, UInt8
+from semantic_mapper.types import CameraIntrinsics, FisheyeIntrinsics, Float64, Int64, PosedFrame, UInt8
 
 FOCAL_PRIORS = (0.85, 1.2, 0.65)  # of the longer side, in the order of trial: phones, webcams, wide lenses
 RETRY_PRIORS = (1.0, 0.85, 1.2)  # of the focal length that was given as a guess
@@ -261,7 +261,8 @@ class _Lens:
             return u, v
         lens = np.array(self.measured.distortion or (0.0,) * 4)
         K = camera_matrix(self.rectify.intrinsics)
-        flat = cv2.undistortPoints(np.array([[[u, v]]]), camera_matrix(self.measured), lens, P=K)
+        undistort = cv2.fisheye.undistortPoints if isinstance(self.measured, FisheyeIntrinsics) else cv2.undistortPoints
+        flat = undistort(np.array([[[u, v]]], np.float64), camera_matrix(self.measured), lens, P=K)
         return float(flat[0, 0, 0]), float(flat[0, 0, 1])
 
     def request(self, film: Film) -> colmap.Camera:
