@@ -38,7 +38,7 @@ TURN_PX, TURN_FOCALS = 3.0, np.geomspace(0.4, 2.0, 12)  # off a turn at most, fo
 # that goes forwards. It begins with the widest, and halves the angle twice.
 AHEAD_MAX_FORWARD, AHEAD_ANGLE_DEG = 1.0, 8.0
 MAX_POINT_SIGMAS = 2000  # points whose depths are asked for
-UNKNOWN_FOCAL = 0.1  # standard deviation of a focal length that a film does not tell: it stays as assumed
+UNKNOWN_FOCAL = 0.3  # standard deviation of a focal length that usual lenses tell better than the film: it is assumed
 
 
 class Camera(msgspec.Struct, frozen=True):
@@ -122,8 +122,8 @@ class Sigmas(msgspec.Struct, frozen=True):
     """Standard deviations of a model, by the covariance of its bundle adjustment: noise of the features alone.
 
     Args:
-        focal: Of the focal length, as a fraction of it; None where it was not free. Above ``UNKNOWN_FOCAL`` the model
-            has the one that it began with.
+        focal: Of the focal length, as a fraction of it, 1 at most; None where it was not free. Above ``UNKNOWN_FOCAL``
+            the model has the one that the attempt was given.
         position: Of the place of a camera, the largest, as a fraction of the path, with the path's beginning held.
         depth: Of the depths of points, with the cameras held: the median of their fractions.
     """
@@ -385,8 +385,7 @@ def _settle(
 ) -> Sigmas | None:
     """Adjust the model in a folder until it converges, and tell how exact it is; None where that cannot be told.
 
-    While it maps, COLMAP ends its adjustments early. A straight path fits many focal lengths nearly as well, and then
-    they end far from the best one.
+    A covariance belongs to the minimum, and while it maps, COLMAP ends its adjustments before that.
 
     Args:
         pycolmap, folder, camera, prior: What to adjust.
@@ -412,17 +411,15 @@ def _settle(
     covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
     model.update_point_3d_errors()
     noise_px = _noise_px(model)
-    of_focal = None
-    if free:
-        of_lens = None if covariance is None else covariance.get_other_params_cov(lens.params)
-        of_focal = 1.0 if of_lens is None else min(1.0, noise_px * float(np.sqrt(of_lens[0, 0])) / focal)
-        in_range = FOCAL_RANGE[0] < focal / max(camera.width, camera.height) < FOCAL_RANGE[1]
-        if of_focal > UNKNOWN_FOCAL or not in_range:
-            held = _settle(pycolmap, folder, camera, prior, free=False, assumed=True)
-            return None if held is None else msgspec.structs.replace(held, focal=max(of_focal, UNKNOWN_FOCAL))
-    model.write(folder)
     if covariance is None:
         return None
+    of_lens = covariance.get_other_params_cov(lens.params) if free else None
+    of_focal = None if of_lens is None else min(1.0, noise_px * float(np.sqrt(of_lens[0, 0])) / focal)
+    in_range = FOCAL_RANGE[0] < focal / max(camera.width, camera.height) < FOCAL_RANGE[1]
+    if of_focal is not None and (of_focal > UNKNOWN_FOCAL or not in_range):
+        held = _settle(pycolmap, folder, camera, prior, free=False, assumed=True)
+        return None if held is None else msgspec.structs.replace(held, focal=1.0 if not in_range else of_focal)
+    model.write(folder)
     return Sigmas(of_focal, noise_px * _position_sigma(model, covariance), noise_px * _depth_sigma(model, covariance))
 
 
