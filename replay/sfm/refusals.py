@@ -191,9 +191,9 @@ def doubt_baseline(ahead: bool, angle_deg: float, sigmas: Sigmas | None) -> list
     notes: list[str] = []
     if ahead or sigmas.depth > UNSURE_DEPTH or sigmas.position > UNSURE_POSITION:
         notes.append(
-            f"the camera {'goes straight ahead' if ahead else 'hardly moves sideways'}: half of the points are seen from "
-            f"less than {angle_deg:.1f} degrees apart; depths are exact to {_percent(sigmas.depth)} (median), places to "
-            f"{_percent(sigmas.position)} of the way (one standard deviation, noise of the features alone)"
+            f"the camera {'goes straight ahead' if ahead else 'hardly moves sideways'}: half of the points are seen "
+            f"from less than {angle_deg:.1f} degrees apart; depths are exact to {_percent(sigmas.depth)} (median), "
+            f"places to {_percent(sigmas.position)} of the way (one standard deviation, noise of the features alone)"
         )
     if sigmas.focal is not None and sigmas.focal > UNSURE_FOCAL:
         found = (
