@@ -203,7 +203,7 @@ def main() -> None:
     """Run the films and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--streets", type=int, nargs="*", default=[200_000, 200_001, 200_002, 200_004])
-    parser.add_argument("--rooms", type=int, nargs="*", default=[200_003, 200_007])
+    parser.add_argument("--rooms", type=int, nargs="*", default=[200_003, 200_007, 200_011])
     parser.add_argument("--lens", choices=("unknown", "guessed", "calibrated"), nargs="+", default=["unknown"])
     parser.add_argument("--frames", type=int, default=100, help="of a drive")
     parser.add_argument("--width", type=int, default=640)

@@ -23,6 +23,7 @@ REQUEST, RESULT, DATABASE, FEATURES = "request.json", "result.json", "database.d
 OVERLAP = 8  # frames before each that it is matched to
 PAIRS_AT_ONCE = 64
 ENOUGH = 0.9  # of the frames in one model: no further focal length is tried
+LEAST_FREE = 0.5  # of the frames, placed with a free focal length: it is not tried held
 SEED = 1  # pycolmap takes 0 for "another each time"
 MIN_MODEL_IMAGES = 5
 INIT_TRIALS = 40
@@ -38,7 +39,7 @@ TURN_PX, TURN_FOCALS = 3.0, np.geomspace(0.4, 2.0, 12)  # off a turn at most, fo
 # that goes forwards. It begins with the widest, and halves the angle twice.
 AHEAD_MAX_FORWARD, AHEAD_ANGLE_DEG = 1.0, 8.0
 MAX_POINT_SIGMAS = 2000  # points whose depths are asked for
-UNKNOWN_FOCAL = 0.1  # standard deviation of a focal length that a film does not tell: it stays as assumed
+UNKNOWN_FOCAL = 0.3  # standard deviation of a focal length that usual lenses tell better than the film: it is assumed
 
 
 class Camera(msgspec.Struct, frozen=True):
@@ -122,8 +123,8 @@ class Sigmas(msgspec.Struct, frozen=True):
     """Standard deviations of a model, by the covariance of its bundle adjustment: noise of the features alone.
 
     Args:
-        focal: Of the focal length, as a fraction of it; None where it was not free. Above ``UNKNOWN_FOCAL`` the model
-            has the one that it began with.
+        focal: Of the focal length, as a fraction of it, 1 at most; None where it was not free. Above ``UNKNOWN_FOCAL``
+            the model has the one that the attempt was given.
         position: Of the place of a camera, the largest, as a fraction of the path, with the path's beginning held.
         depth: Of the depths of points, with the cameras held: the median of their fractions.
     """
@@ -199,13 +200,16 @@ def main(folder: Path) -> None:
 def _attempts(pycolmap: Any, folder: Path, camera: Camera, count: int, *, turns: bool) -> list[Attempt]:
     """Until one has placed most frames; a camera that turns on the spot gets none that begins straight ahead.
 
-    Straight ahead, the focal length is tried free, and held: two frames of a straight way fit any.
+    Straight ahead, the focal length is tried free. It is held only where that places next to nothing: two frames of a
+    way without any turn fit all of them, and a wrong one that is held bends the path.
     """
     attempts: list[Attempt] = []
     for number, prior in enumerate(camera.focal_priors if camera.fixed is None else (camera.fixed[0],)):
         known = camera.about and number == 0
-        ways = [(False, known)] if turns else [(False, known), (True, known), (True, True)]
-        for ahead, held in dict.fromkeys(ways) if camera.fixed is None else ways[:2]:
+        for ahead, held in dict.fromkeys(((False, known), (True, known), (True, camera.fixed is None))):
+            placed = max((a.models[0].images for a in attempts if a.models), default=0)
+            if ahead and (turns or (held and not known and placed >= LEAST_FREE * count)):
+                continue
             models = _map(pycolmap, folder, len(attempts), camera, prior, count, held=held, ahead=ahead)
             if known:
                 models = [_freed(pycolmap, folder, model, prior) for model in models]
@@ -385,8 +389,7 @@ def _settle(
 ) -> Sigmas | None:
     """Adjust the model in a folder until it converges, and tell how exact it is; None where that cannot be told.
 
-    While it maps, COLMAP ends its adjustments early. A straight path fits many focal lengths nearly as well, and then
-    they end far from the best one.
+    A covariance belongs to the minimum, and while it maps, COLMAP ends its adjustments before that.
 
     Args:
         pycolmap, folder, camera, prior: What to adjust.
@@ -412,17 +415,15 @@ def _settle(
     covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
     model.update_point_3d_errors()
     noise_px = _noise_px(model)
-    of_focal = None
-    if free:
-        of_lens = None if covariance is None else covariance.get_other_params_cov(lens.params)
-        of_focal = 1.0 if of_lens is None else min(1.0, noise_px * float(np.sqrt(of_lens[0, 0])) / focal)
-        in_range = FOCAL_RANGE[0] < focal / max(camera.width, camera.height) < FOCAL_RANGE[1]
-        if of_focal > UNKNOWN_FOCAL or not in_range:
-            held = _settle(pycolmap, folder, camera, prior, free=False, assumed=True)
-            return None if held is None else msgspec.structs.replace(held, focal=max(of_focal, UNKNOWN_FOCAL))
-    model.write(folder)
     if covariance is None:
         return None
+    of_lens = covariance.get_other_params_cov(lens.params) if free else None
+    of_focal = None if of_lens is None else min(1.0, noise_px * float(np.sqrt(of_lens[0, 0])) / focal)
+    in_range = FOCAL_RANGE[0] < focal / max(camera.width, camera.height) < FOCAL_RANGE[1]
+    if of_focal is not None and (of_focal > UNKNOWN_FOCAL or not in_range):
+        held = _settle(pycolmap, folder, camera, prior, free=False, assumed=True)
+        return None if held is None else msgspec.structs.replace(held, focal=1.0 if not in_range else of_focal)
+    model.write(folder)
     return Sigmas(of_focal, noise_px * _position_sigma(model, covariance), noise_px * _depth_sigma(model, covariance))
 
 

@@ -186,18 +186,16 @@ def doubt_baseline(ahead: bool, angle_deg: float, sigmas: Sigmas | None) -> list
         angle_deg: Between the rays to a point, the median.
         sigmas: Of the model.
     """
+    if sigmas is None:
+        return ["how exact the poses are cannot be told: their adjustment is degenerate"]
     notes: list[str] = []
-    weak = ahead or sigmas is None or sigmas.depth > UNSURE_DEPTH or sigmas.position > UNSURE_POSITION
-    if weak:
-        how = "how exact the poses are cannot be told"
-        if sigmas is not None:
-            depth, position = _percent(sigmas.depth), _percent(sigmas.position)
-            how = f"depths are exact to {depth} (median), places to {position} of the way"
+    if ahead or sigmas.depth > UNSURE_DEPTH or sigmas.position > UNSURE_POSITION:
         notes.append(
-            f"the camera {'goes straight ahead' if ahead else 'hardly changes its side'}: half of the points are seen "
-            f"from less than {angle_deg:.1f} degrees apart; {how} (one standard deviation, noise of the features alone)"
+            f"the camera {'goes straight ahead' if ahead else 'hardly moves sideways'}: half of the points are seen "
+            f"from less than {angle_deg:.1f} degrees apart; depths are exact to {_percent(sigmas.depth)} (median), "
+            f"places to {_percent(sigmas.position)} of the way (one standard deviation, noise of the features alone)"
         )
-    if sigmas is not None and sigmas.focal is not None and sigmas.focal > UNSURE_FOCAL:
+    if sigmas.focal is not None and sigmas.focal > UNSURE_FOCAL:
         found = (
             f"is assumed: by the film alone it is exact to {_percent(sigmas.focal)}"
             if sigmas.focal > UNKNOWN_FOCAL
