@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -486,7 +487,7 @@ _NEUTRAL_WORDS = ("", "none", "identity", "opencv", "pinhole", "perspective", "m
 
 
 def read_plain_json(file: Path, limit: int, kind: type[Any] = dict) -> Any:
-    """JSON of another program, as plain data: a ``dict`` or ``list``.
+    """JSON of another program, as plain data: a ``dict`` or ``list``. Numbers that are none (NaN) are None.
 
     Raises:
         ImportSourceError: missing, no JSON, or larger than ``limit`` bytes.
@@ -494,7 +495,16 @@ def read_plain_json(file: Path, limit: int, kind: type[Any] = dict) -> Any:
     try:
         return read_json(file, kind, limit)
     except ConfigError as error:
-        raise ImportSourceError(str(error)) from error
+        if type(error.__cause__) is not msgspec.DecodeError:
+            raise ImportSourceError(str(error)) from error
+        refused = ImportSourceError(str(error))
+    try:  # Python's programs write NaN, which is no JSON
+        plain = json.loads(decode_text(read_regular(file, limit)), parse_constant=lambda _: None)
+    except (ConfigError, OSError, ValueError, RecursionError) as error:
+        raise refused from error
+    if not isinstance(plain, kind):
+        raise refused
+    return plain
 
 
 def convert_known(plain: Mapping[str, Any], kind: type[StructT], where: str) -> StructT:

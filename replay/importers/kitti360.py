@@ -176,7 +176,8 @@ class Kitti360Recording:
         if index >= len(stamps):
             file = self._drive_folder / camera / "timestamps.txt"
             raise BadFrameError(file, f"has {len(stamps)} rows and so no time for image {index}")
-        return stamps[index]
+        line, text = stamps[index]
+        return _time_ns(text, self._drive_folder / camera / "timestamps.txt", line)
 
     def _read_poses(self) -> dict[int, tuple[int, Float64]]:
         poses: dict[int, tuple[int, Float64]] = {}
@@ -203,14 +204,14 @@ class Kitti360Recording:
             self.notices.append(f"{self._poses_file}: {counted(len(bad), 'row')} left out, no pose: {bad[0]}")
         return poses
 
-    def _read_stamps(self, frame_hz: float | None) -> dict[str, list[int]]:
+    def _read_stamps(self, frame_hz: float | None) -> dict[str, list[tuple[int, str]]]:
         files = {name: self._drive_folder / name / "timestamps.txt" for name in self._cameras}
         missing = [str(file) for file in files.values() if not file.exists()]
         if missing or frame_hz is not None:
             why = f"{missing[0]} is missing" if missing else "a rate is given"
             self.notices.append(f"{why}: stamps are made up at {frame_hz or NOMINAL_HZ:g} frames a second")
             return {}
-        return {name: [_time_ns(text, file, n) for n, text in read_lines(file)] for name, file in files.items()}
+        return {name: read_lines(file) for name, file in files.items()}
 
 
 def find_drive(folder: Path) -> tuple[Path, str]:
@@ -357,4 +358,4 @@ def _time_ns(text: str, file: Path, line: int) -> int:
         whole = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
         return int(whole.timestamp()) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
     except ValueError as error:
-        raise ImportSourceError(f"{file}, line {line}: expected a date and a time: {error}") from error
+        raise BadFrameError(file, f"line {line}: expected a date and a time: {error}") from error

@@ -111,7 +111,12 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     root = _root(folder, file, names)
     used = {shot.camera for shot in model.shots.values()}
     cameras = {n: _intrinsics(c, f"{file}, camera '{n}'") for n, c in model.cameras.items() if n in used}
-    pictures = [_picture(root, name, model.shots[name], cameras, file) for name in names]
+    left_out = [name for name in names if model.shots[name].camera not in cameras]
+    pictures = [_picture(root, name, model.shots[name], cameras) for name in names if name not in left_out]
+    if not pictures:
+        raise ImportSourceError(
+            f"{file}: '{left_out[0]}' has camera '{model.shots[left_out[0]].camera}', which is missing"
+        )
     poses = np.stack([picture.T_world_camera for picture in pictures])
     reference = model.reference_lla or _reference_beside(file)
     if reference is None or not (reference.latitude or reference.longitude):
@@ -128,6 +133,10 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     unposed = [
         path for path in sorted(root.iterdir()) if path.suffix.lower() in PICTURES and path.name not in model.shots
     ]
+    if left_out:
+        opened.notices.append(
+            f"{counted(len(left_out), 'picture')} left out, whose camera is missing; the first: {left_out[0]}"
+        )
     if unposed:
         opened.notices.append(
             f"{counted(len(unposed), 'picture')} in {root} without a pose; the first: {unposed[0].name}"
@@ -162,9 +171,7 @@ def _root(folder: Path, file: Path, names: list[str]) -> Path:
     raise ImportSourceError(f"{folder}: the pictures are missing; '{names[0]}' is not in {roots[0]}")
 
 
-def _picture(root: Path, name: str, shot: _Shot, cameras: dict[str, CameraIntrinsics], file: Path) -> PosedPicture:
-    if shot.camera not in cameras:
-        raise ImportSourceError(f"{file}: '{name}' has camera '{shot.camera}', which is missing")
+def _picture(root: Path, name: str, shot: _Shot, cameras: dict[str, CameraIntrinsics]) -> PosedPicture:
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3] = cv2.Rodrigues(np.array(shot.rotation))[0]
     T_camera_world[:3, 3] = shot.translation

@@ -101,22 +101,27 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     for name in _OTHER_AXES:
         if getattr(found, name):
             raise ImportSourceError(f"{file}: '{name}' means poses in other axes than OpenGL's, which are not read")
-    frames = [convert_known(frame, _Frame, f"{file}, frame {n}") for n, frame in enumerate(found.frames)]
-    notices = unknown_notice(file, [*unknown_keys([plain], _Transforms, _NEUTRAL), *unknown_keys(found.frames, _Frame)])
-    size = _common_size(folder, found, frames)
-    pictures: list[PosedPicture] = []
     left_out: list[str] = []
-    for number, frame in enumerate(frames):
+    frames: list[tuple[int, _Frame]] = []
+    for number, frame in enumerate(found.frames):
+        try:
+            frames.append((number, convert_known(frame, _Frame, f"{file}, frame {number}")))
+        except ImportSourceError as error:
+            left_out.append(str(error))
+    notices = unknown_notice(file, [*unknown_keys([plain], _Transforms, _NEUTRAL), *unknown_keys(found.frames, _Frame)])
+    size = _common_size(folder, found, [frame for _, frame in frames])
+    pictures: list[PosedPicture] = []
+    for number, frame in frames:
         try:
             pictures.append(_picture(folder, found, frame, size, f"{file}, frame {number} ('{frame.file_path[:80]}')"))
         except BadFrameError as error:
             left_out.append(str(error))
     if left_out:
-        notices.append(f"{counted(len(left_out), 'frame')} of {len(frames)} left out; the first: {left_out[0]}")
+        notices.append(f"{counted(len(left_out), 'frame')} of {len(found.frames)} left out; the first: {left_out[0]}")
     if not pictures and left_out:
         raise ImportSourceError(f"{folder}: holds no posed picture: {left_out[0]}")
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
-    scale, measured, said = _depth_scale(file, found, frames, pictures, options)
+    scale, measured, said = _depth_scale(file, found, [frame for _, frame in frames], pictures, options)
     opened = PosedPictures("transforms", folder, pictures, options, depth_scale=scale, metric=measured)
     opened.notices += [*notices, *said]
     return opened
