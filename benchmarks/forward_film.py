@@ -60,12 +60,13 @@ def street_drive(seed: int, count: int, width: int) -> Walk:
 
     def pictures() -> Iterator[UInt8]:
         for n, pose in enumerate(poses):
-            yield _take(street.scene, k, pose, float(light[n]), seed + n)
+            yield take(street.scene, k, pose, float(light[n]), seed + n)
 
     return Walk(pictures(), poses, STREET_HZ, k.fx, (k.width, k.height))
 
 
-def _take(scene: Scene, k: CameraIntrinsics, pose: Float64, gain: float, seed: int) -> UInt8:
+def take(scene: Scene, k: CameraIntrinsics, pose: Float64, gain: float, seed: int) -> UInt8:
+    """A picture (H, W, 3) RGB with noise, of light times ``gain``."""
     n, centre = _FINER, (_FINER - 1) / 2
     finer = CameraIntrinsics(n * k.fx, n * k.fy, n * k.cx + centre, n * k.cy + centre, n * k.width, n * k.height)
     light = light_seen(scene, finer, pose, *cast_view(scene, finer, pose))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.drone_pictures import DIAGONAL_35MM, rows_over, save_picture
-from benchmarks.forward_film import compare, pinhole, street_drive
+from benchmarks.forward_film import compare, pinhole, street_drive, take
 from benchmarks.video import write_film
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.errors import ConfigError, ImportSourceError
@@ -22,6 +22,7 @@ from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, impo
 from semantic_mapper.replay.sfm.refusals import FilmError
 from semantic_mapper.replay.sfm.scale import Mark, MarkedDistance, ScaleHint
 from semantic_mapper.scenes.aerial.views import aerial_camera, cached_town, render_town
+from semantic_mapper.scenes.streets.views import cached_street
 from semantic_mapper.types import Float64
 from tests.nodes.support import run
 
@@ -200,9 +201,10 @@ def test_a_camera_that_turns_on_the_spot_is_refused(tmp_path: Path) -> None:
 def test_a_camera_that_stands_and_looks_around_is_refused(tmp_path: Path) -> None:
     from semantic_mapper.scenes.camera import pose_of
 
-    start = films.walk(1)[0][:3, 3]
-    poses = np.stack([pose_of(start, 0.35 * np.sin(n / 6), 0.03 * np.sin(n / 3) - 0.1) for n in range(60)])
-    film = films.write_film(tmp_path / "a.mp4", films.take(poses))
+    scene = cached_street(200_000).scene
+    poses = [pose_of(np.array([10, -1.5, 1.55]), 0.35 * np.sin(n / 6), 0.03 * np.sin(n / 3)) for n in range(70)]
+    pictures = [take(scene, pinhole(640), pose, 1.5, n) for n, pose in enumerate(poses)]
+    film = films.write_film(tmp_path / "a.mp4", pictures, 10.0)
     with pytest.raises(FilmError) as caught:
         import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
     assert caught.value.reason == "turning"
