@@ -464,7 +464,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         ConfigError: file missing, no regular file, larger than ``MAX_FILE_BYTES``, or not TOML.
     """
     try:
-        return tomllib.loads(decode_text(_read(path)))
+        return tomllib.loads(_read(path).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # of TOML, UTF-8, and whole numbers of thousands of digits
         if isinstance(error, ConfigError):
             raise

@@ -108,7 +108,7 @@ def test_a_board_that_is_unplugged_while_one_looks_does_not_count(tmp_path: Path
     [
         ({"widht": 640}, "did you mean `width`"),
         ({"width": 650}, "multiple of 16"),
-        ({"fps": 0}, "> 0"),
+        ({"fps": 0}, ">= 0.01"),
         ({"rgb": "RGB"}, "'RGB' is not valid"),
         ({"odometry": True, "depth": False}, "odometry needs the stereo pair"),
         ({"left": "CAM_C"}, "left and right are the same"),
