@@ -171,7 +171,7 @@ def test_a_calibrated_film_gets_its_scale_from_two_marked_points_or_a_height(
 def test_a_calibration_that_the_pictures_contradict_is_refused(tmp_path: Path, walked: tuple[Path, Float64]) -> None:
     wrong = dataclasses.replace(films.CAMERA, fx=0.475 * films.CAMERA.fx, fy=0.475 * films.CAMERA.fy)
     save_calibration(tmp_path / "wrong.toml", wrong, None, {})
-    with pytest.raises(FilmError, match=r"is 129 px of the film, and its pictures fit (19|2\d)\d px") as caught:
+    with pytest.raises(FilmError, match=r"is 129 px of the film, and its pictures fit (1[89]|2\d)\d px") as caught:
         import_film(walked[0], tmp_path / "a.mcap", FilmOptions(tmp_path / "wrong.toml"), quiet)
     assert caught.value.reason == "calibration" and not list(tmp_path.glob("*.mcap*"))
 
@@ -226,7 +226,8 @@ def test_a_drive_straight_ahead_is_reconstructed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_scenes_are_refused_with_their_times(tmp_path: Path) -> None:
-    parts = [films.take(films.walk(40, seed=seed), seed=seed) for seed in (films.SEED, 100_011)]
+    lengths = {films.SEED: 60, 100_011: 40}  # about as many picks of each: of unequal scenes the larger one is mapped
+    parts = [films.take(films.walk(count, seed=seed), seed=seed) for seed, count in lengths.items()]
     film = films.write_film(tmp_path / "a.mp4", [*parts[0], *parts[1]])
     with pytest.raises(FilmError, match="cut it") as caught:
         import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
