@@ -19,11 +19,11 @@ import numpy as np
 
 from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_json, read_toml
 from semantic_mapper.drivers.calibration_yaml import read_calibration_yaml
-from semantic_mapper.drivers.lens import rectify_maps
+from semantic_mapper.drivers.lens import lens_intrinsics, rectify_maps
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.types import CameraIntrinsics, FisheyeIntrinsics, Float32, Float64, UInt8
+from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float32, Float64, UInt8
 
 PlaneT = TypeVar("PlaneT", Float32, UInt8)
 Row = tuple[float, float, float, float]
@@ -181,10 +181,13 @@ def _toml_value(value: str | float) -> str:
 
 
 def _intrinsics(file: CalibrationFile, path: Path) -> CameraIntrinsics:
-    kind = FisheyeIntrinsics if file.fisheye else CameraIntrinsics
     try:
-        return kind(file.fx, file.fy, file.cx, file.cy, file.width, file.height, file.distortion)
-    except FrameError as error:
+        if not file.fisheye and len(file.distortion) in COEFFICIENTS:
+            return CameraIntrinsics(file.fx, file.fy, file.cx, file.cy, file.width, file.height, file.distortion)
+        model = "fisheye" if file.fisheye else "opencv"
+        k = (file.fx, file.fy, file.cx, file.cy)
+        return lens_intrinsics(model, file.distortion, k, (file.width, file.height))
+    except (ConfigError, FrameError) as error:
         raise ConfigError(f"{path}: {error}") from error
 
 

@@ -42,8 +42,8 @@ class _CameraInfo(msgspec.Struct):
     image_width: _Side
     image_height: _Side
     camera_matrix: _Nines
-    distortion_model: str
     distortion_coefficients: _Numbers
+    distortion_model: str = ""
 
 
 class _CameraInfoMessage(msgspec.Struct):
@@ -53,12 +53,15 @@ class _CameraInfoMessage(msgspec.Struct):
     height: _Side
     k: _Nine
     d: list[float]
-    distortion_model: str
+    distortion_model: str = ""
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: dict[str, Any] = {}
 
 
 class _KalibrCamera(msgspec.Struct):
     camera_model: str
-    intrinsics: Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
+    intrinsics: list[float]
     distortion_model: str
     distortion_coeffs: list[float]
     resolution: tuple[_Side, _Side]
@@ -79,6 +82,8 @@ def read_calibration_yaml(path: Path) -> CameraIntrinsics:
         lowered = {key.lower(): value for key, value in plain.items()}  # ROS 1 writes K and D
         if "k" in lowered:
             message = msgspec.convert(lowered, _CameraInfoMessage)
+            if message.binning_x > 1 or message.binning_y > 1 or any(message.roi.values()):
+                raise ConfigError("tells of binning or a region of interest, which is not read: calibrate it whole")
             return _from_matrix(message.k, message.distortion_model, message.d, (message.width, message.height))
         return _kalibr(plain)
     except (msgspec.ValidationError, ConfigError, FrameError) as error:
@@ -100,6 +105,8 @@ def _kalibr(plain: Mapping[str, Any]) -> CameraIntrinsics:
         raise ConfigError(
             f"camera_model '{camera.camera_model}' is not read, only pinhole: calibrate with pinhole-equi"
         )
+    if len(camera.intrinsics) != 4:
+        raise ConfigError(f"intrinsics has {len(camera.intrinsics)} numbers, not fx fy cx cy")
     fx, fy, cx, cy = camera.intrinsics
     return lens_intrinsics(camera.distortion_model, camera.distortion_coeffs, (fx, fy, cx, cy), camera.resolution)
 
@@ -110,7 +117,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         text = read_regular(path, MAX_FILE_BYTES).decode("utf-8-sig")
         if any(isinstance(event, AliasEvent) for event in yaml.parse(text)):  # of these, a short file makes a long one
             raise ConfigError("has aliases (*), which no calibration needs")
-        plain: Any = yaml.load(text)
+        documents: list[Any] = [document for document in yaml.load_all(text) if document is not None]
+        if any(document != documents[0] for document in documents):  # `ros2 topic echo` prints many, which are one
+            raise ConfigError("holds several calibrations; keep the one that is meant")
+        plain = documents[0] if documents else None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (YAMLError, ValueError, RecursionError) as error:  # ValueError: ConfigError, UTF-8, endless numbers

@@ -27,6 +27,11 @@ MAX_HALF_VIEW = np.radians(65.0)  # to each side of what a fisheye's image is cu
 _THETAS = np.linspace(0.0, np.pi, 4096)
 
 
+def is_fisheye_model(model: str) -> bool:
+    """Whether a name is that of OpenCV's fisheye."""
+    return _plain(model) in _FISHEYE
+
+
 def lens_intrinsics(
     model: str, coefficients: Sequence[float], k: tuple[float, float, float, float], size: tuple[int, int]
 ) -> CameraIntrinsics:
@@ -42,10 +47,12 @@ def lens_intrinsics(
         ConfigError: a model that is neither OpenCV's pinhole nor its fisheye, or more coefficients than it has.
         FrameError: see ``CameraIntrinsics``.
     """
-    name = model.strip().lower().replace("-", "_")
+    name = _plain(model)
     values = [float(value) for value in coefficients]
     while values and values[-1] == 0:
         values.pop()
+    if name in ("", "none") and values:
+        raise ConfigError(f"a lens has coefficients {tuple(values)} and no model: name it, such as plumb_bob")
     if name in _ZERO_IS_PINHOLE and not values:
         return CameraIntrinsics(*k, *size)
     if name in _PINHOLE and len(values) <= COEFFICIENTS[-1]:
@@ -59,6 +66,10 @@ def lens_intrinsics(
         f"lens model '{model}' is not undone, only OpenCV's pinhole (plumb_bob, radtan, rational_polynomial) and "
         "fisheye (equidistant): undistort the images first, or calibrate with one of these"
     )
+
+
+def _plain(model: str) -> str:
+    return model.strip().lower().replace("-", "_")
 
 
 def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:

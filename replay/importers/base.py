@@ -101,13 +101,14 @@ class DepthScale:
         units_per_m: Units per metre.
         given_in: The file that gives it; None: assumed, since the recording does not say.
         convention: Whose convention was assumed, for people.
-        float_units_per_m: Units per metre of numbers that are not whole (NumPy's files).
+        float_units_per_m: Units per metre of numbers with a point (NumPy's files); None = metres, or as whole numbers
+            where half of them are above 100.
     """
 
     units_per_m: float
     given_in: Path | None = None
     convention: str = ""
-    float_units_per_m: float = 1.0
+    float_units_per_m: float | None = None
 
     def __str__(self) -> str:
         """For people."""
@@ -234,8 +235,15 @@ def read_depth(file: Path, scale: DepthScale, size: tuple[int, int] | None) -> F
     values = _read_npy(file)
     if size is not None and values.shape != size:
         raise _wrong_size(file, "depth", (values.shape[0], values.shape[1]), size)
-    whole = values.dtype.kind in "iu"
-    return metres(values.astype(np.float64) / (scale.units_per_m if whole else scale.float_units_per_m))
+    units = scale.units_per_m if values.dtype.kind in "iu" else scale.float_units_per_m
+    if units is None:
+        measured = metres(values)
+        far = (measured > 0).any() and np.median(measured[measured > 0]) > _MOST_METRES
+        units = scale.units_per_m if far else 1.0
+    return metres(values.astype(np.float64) / units)
+
+
+_MOST_METRES = 100.0  # depth with a larger median is in the unit of whole numbers
 
 
 def metres(values: NDArray[np.generic]) -> Float32:
@@ -472,18 +480,21 @@ def inside(folder: Path, name: str) -> Path:
         raise ImportSourceError(
             f"{folder}: names '{name[:80]}', which lies outside of it; move the file into the folder, or link it there"
         )
+    if "\\" in name and not (folder / name).exists():  # as Windows' programs part folders
+        return inside(folder, name.replace("\\", "/"))
     return folder / name
 
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 # Words and short names of keys that say what numbers mean: lens, axes, units, time.
 _TELLING = re.compile(
-    r"fish|lens|distort|camera_?(model|type)|projection|^[kpsbdc]_?\d+$|ftheta|focal|fov|skew|aspect|crop|roi|binning|shutter"
+    r"fish|lens|distort|equirect|latlong|ortho|panoram|spheric|^model$|principal|camera_?(model|type)|projection|^[kpsbdc]_?\d+$|ftheta|focal|fov|skew|aspect|crop|roi|binning|shutter"
     r"|ax[ei]s|convention|coordinate|handed|orient|rotat|flip|mirror|^up$|from_|unit|scale|metric|millimet|inch|feet|depth"
     r"|time|stamp|clock|fps|offset|delay|latency",
     re.IGNORECASE,
 )
-_NEUTRAL_WORDS = ("", "none", "identity", "opencv", "pinhole", "perspective", "m", "meter", "meters", "metre", "metres")
+_AXES = re.compile(r"ax[ei]s|convention|coordinate|handed", re.IGNORECASE)
+_NEUTRAL_WORDS = ("", "none", "identity", "pinhole", "perspective", "m", "meter", "meters", "metre", "metres")
 
 
 def read_plain_json(file: Path, limit: int, kind: type[Any] = dict) -> Any:
@@ -533,7 +544,7 @@ def unknown_keys(
     found: dict[str, None] = {}
     for table in tables:
         for key in table.keys() - read:
-            if key not in found and _TELLING.search(key) and not _is_neutral(key, table[key]):
+            if key not in found and _tells(key, table[key]):
                 found[key] = None
     return sorted(found)
 
@@ -549,11 +560,32 @@ def unknown_notice(file: Path, keys: Sequence[str]) -> list[str]:
     ]
 
 
+def _tells(key: str, value: Any) -> bool:
+    if isinstance(value, Mapping):
+        within = cast("Mapping[str, Any]", value)
+        return any(
+            _tells(name, item) or (_TELLING.search(key) and not _is_neutral(name, item))
+            for name, item in within.items()
+        )
+    return _TELLING.search(key) is not None and not _is_neutral(key, value)
+
+
+def refuse_keys(table: Mapping[str, Any], names: re.Pattern[str], where: str) -> None:
+    """Refuse keys that nothing here reads and that change what other numbers mean.
+
+    Raises:
+        ImportSourceError: one of them is there and not neutral.
+    """
+    for key, value in table.items():
+        if names.fullmatch(key) and not _is_neutral(key, value):
+            raise ImportSourceError(f"{where}: '{key[:40]}' is not read; undistort the images first, and leave it out")
+
+
 def _is_neutral(key: str, value: Any) -> bool:
     if value is None or value is False:
         return True
     if isinstance(value, str):
-        return value.strip().lower() in _NEUTRAL_WORDS
+        return value.strip().lower() in _NEUTRAL_WORDS and not _AXES.search(key)
     if isinstance(value, Mapping):
         return all(_is_neutral(key, item) for item in cast("Mapping[str, Any]", value).values())
     if isinstance(value, list):

@@ -66,6 +66,10 @@ class _Intrinsics(msgspec.Struct):
     cy: float
     distortion: tuple[float, ...] = ()  # OpenCV's coefficients
     fisheye: bool = False  # of its fisheye model
+    camera_model: str | None = None  # the lens, by its name, however the key is called
+    distortion_model: str | None = None
+    lens_model: str | None = None
+    model: str | None = None
     depth_scale: Annotated[float, Meta(gt=0, le=1e6)] | None = None  # units per metre; None = the format's convention
     scale: str = ""  # "unknown" where poses are not in metres
 
@@ -205,9 +209,8 @@ class FolderRecording:
             self.notices.append(f"no timestamps.txt: stamps are made up at {frame_hz:g} frames a second")
             return [round(i * 1e9 / frame_hz) for i in range(count)]
         try:
-            stamps = [
-                int(t) if t.strip().isdigit() else seconds_to_ns(t.replace(",", ".")) for _, t in read_lines(file)
-            ]
+            rows = [text.strip().replace(",", ".") for _, text in read_lines(file)]
+            stamps = [int(row) for row in rows] if all(map(str.isdigit, rows)) else [seconds_to_ns(row) for row in rows]
         except ValueError as error:
             raise ImportSourceError(f"{file}: {error}") from error
         if any(not 0 <= stamp <= MAX_STAMP_NS for stamp in stamps):
@@ -297,7 +300,8 @@ def read_intrinsics(file: Path, notices: list[str]) -> tuple[CameraIntrinsics, D
         i = convert_known(plain, _Intrinsics, str(file))
         notices += unknown_notice(file, unknown_keys([plain], _Intrinsics))
         scale = DepthScale(i.depth_scale, file) if i.depth_scale is not None else None
-        model = "fisheye" if i.fisheye else "opencv"
+        named = i.camera_model or i.distortion_model or i.lens_model or i.model or "opencv"
+        model = "fisheye" if i.fisheye else named
         lens = lens_intrinsics(model, i.distortion, (i.fx, i.fy, i.cx, i.cy), (i.width, i.height))
         return lens, scale, i.scale != SCALE_UNKNOWN
     except (ConfigError, FrameError) as error:

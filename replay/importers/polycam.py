@@ -8,6 +8,7 @@ capture in microseconds. ``t_ij`` is camera to world, in OpenGL's camera axes an
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,14 @@ from semantic_mapper.replay.importers.base import (
     numbered_files,
     read_plain_json,
     read_rgb,
+    refuse_keys,
     unknown_keys,
     unknown_notice,
 )
 from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
 from semantic_mapper.types import CameraIntrinsics, Float64
 
+_LENS = re.compile(r"[kp]_?\d|distort\w*|is_fisheye")
 _KNOWN = ("timestamp", "center_depth")  # the time is that of the files' names
 DEPTH_SCALE = DepthScale(1000.0, convention="Polycam's millimetres")
 
@@ -51,8 +54,8 @@ class _Camera(msgspec.Struct):
     t_21: float
     t_22: float
     t_23: float
-    width: int | None = None  # not in corrected_cameras since 2025
-    height: int | None = None
+    width: float | None = None  # not in corrected_cameras since 2025
+    height: float | None = None
 
 
 def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -77,6 +80,7 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
         try:
             plain = read_plain_json(camera, 1 << 20)
             unknown.update(unknown_keys([plain], _Camera, _KNOWN))
+            refuse_keys(plain, _LENS, str(camera))
             intrinsics, T_world_camera = _camera(plain, camera, file)
         except ImportSourceError as error:
             left_out.append(str(error))
@@ -98,13 +102,13 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
 def _camera(plain: dict[str, Any], file: Path, picture: Path) -> tuple[CameraIntrinsics, Float64]:
     c = convert_known(plain, _Camera, str(file))
     width, height = c.width, c.height
-    if width is None or height is None:
+    if not width or not height:
         rgb, _ = read_rgb(picture)
         height, width = rgb.shape[:2]
     rows = [[getattr(c, f"t_{i}{j}") for j in range(4)] for i in range(3)]
     T_world_gl = np.array([*rows, [0.0, 0.0, 0.0, 1.0]], np.float64)
     try:
-        intrinsics = CameraIntrinsics(c.fx, c.fy, c.cx - 0.5, c.cy - 0.5, width, height)
+        intrinsics = CameraIntrinsics(c.fx, c.fy, c.cx - 0.5, c.cy - 0.5, int(width), int(height))
     except FrameError as error:
         raise ImportSourceError(f"{file}: {error}") from error
     return intrinsics, T_Z_UP_Y_UP @ T_world_gl @ GL_AXES

@@ -9,6 +9,7 @@ The depth of this export is OpenEXR, which is not read: frames come without dept
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -42,8 +43,8 @@ class _Metadata(msgspec.Struct, rename={"per_frame_k": "perFrameIntrinsicCoeffs"
     h: Annotated[int, Meta(ge=1, le=1 << 14)]
     poses: list[list[float] | None]
     K: Annotated[list[float], Meta(min_length=9, max_length=9)] | None = None
-    per_frame_k: list[list[float]] | None = None
-    frame_times: list[float] | None = None
+    per_frame_k: list[list[float | None] | None] = []
+    frame_times: list[float | None] = []
     fps: Annotated[float, Meta(gt=0, le=1000)] = 60.0
 
 
@@ -60,14 +61,6 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     images = numbered_files(folder / "rgb", (".jpg", ".jpeg", ".png"), notices)
     if not images:
         raise ImportSourceError(f"{folder / 'rgb'}: no pictures; export as 'EXR + RGB'")
-    for name, series in (
-        ("perFrameIntrinsicCoeffs", found.per_frame_k),
-        ("frameTimestamps", found.frame_times),
-    ):
-        if series and len(series) != len(found.poses):
-            raise ImportSourceError(
-                f"{file}: {name} has {len(series)} entries, poses has {len(found.poses)}; export again"
-            )
     pictures: list[PosedPicture] = []
     left_out: list[str] = []
     for number, image in images.items():
@@ -82,6 +75,9 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     missing = len(found.poses) - len(images)
     if missing > 0:
         notices.append(f"{counted(missing, 'pose')} without a picture in {folder / 'rgb'}")
+    if any(a.stamp_ns > b.stamp_ns for a, b in pairwise(pictures)):  # type: ignore[operator]
+        notices.append(f"{file}: frameTimestamps go back; pictures are sorted by them")
+        pictures.sort(key=lambda picture: picture.stamp_ns or 0)
     scale = DepthScale(1000.0, convention="no depth image is read")
     opened = PosedPictures("record3d", folder, pictures, options, depth_scale=scale, metric=True)
     opened.notices += notices
@@ -96,13 +92,16 @@ def _picture(found: _Metadata, number: int, image: Path) -> PosedPicture:
     if row.shape != (7,) or not np.isfinite(row).all() or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
         raise ValueError("its pose is missing, or no unit quaternion qx qy qz qw and position")
     T = T_Z_UP_Y_UP @ pose_matrix(row[4:], row[:4]) @ GL_AXES
-    k = found.per_frame_k[number][:4] if found.per_frame_k else None
-    if k is None and found.K is not None:
+    own = found.per_frame_k[number] if number < len(found.per_frame_k) else None
+    k = [value for value in (own or ())[:4] if value and value > 0]
+    if len(k) < 4 and found.K is not None:
         k = [found.K[0], found.K[4], found.K[6], found.K[7]]
-    if k is None or len(k) != 4:
+    if len(k) < 4:
         raise ValueError("it has no intrinsics: neither K nor 4 numbers of perFrameIntrinsicCoeffs")
     fx, fy, cx, cy = k
-    seconds = found.frame_times[number] - found.frame_times[0] if found.frame_times else number / found.fps
+    times = [time for time in found.frame_times if time is not None]
+    told = found.frame_times[number] if number < len(found.frame_times) else None
+    seconds = number / found.fps if told is None else told - min(times)
     return PosedPicture(
         image, CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, found.w, found.h), T, stamp_ns=round(seconds * 1e9)
     )

@@ -15,7 +15,7 @@ from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.files import open_regular
 
 BagKind = Literal["bag", "db3", "mcap", "zstd"]
-_SUFFIXES = (".mcap", ".db3", ".zstd")  # of the files in a folder of ROS 2
+_SUFFIXES = (".mcap", ".db3", ".zstd", ".zst")  # of the files in a folder of ROS 2
 _HEAD_BYTES = 1 << 15
 _ROS2_SCHEMAS = ("ros2msg", "ros2idl")
 
@@ -77,7 +77,7 @@ def _holds_ros2(path: Path, head: bytes) -> bool:
 
 def storage_files(folder: Path) -> list[Path]:
     """Files of a folder that may be parts of a bag of ROS 2."""
-    return sorted(f for f in folder.iterdir() if f.suffix in _SUFFIXES) if folder.is_dir() else []
+    return sorted(f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
 
 
 def is_bag(src: Path) -> bool:

@@ -99,7 +99,7 @@ def compressed_color_image(message: Any) -> tuple[UInt8, EncodedImage]:
     return rgb, EncodedImage(encoding, data)
 
 
-def depth_image(message: Any) -> Float32:
+def depth_image(message: Any, units_per_m: float = UNITS_PER_M) -> Float32:
     """Depth (H, W) in metres of a ``sensor_msgs/Image``, 0 where nothing was measured.
 
     Raises:
@@ -110,10 +110,10 @@ def depth_image(message: Any) -> Float32:
         raise CodecError(f"depth images of encoding '{message.encoding}' are not read, only {known}")
     kind = DEPTH_ENCODINGS[message.encoding]
     values = _rows(message, kind.itemsize).view(kind.newbyteorder(">") if message.is_bigendian else kind)
-    return _metres(values)
+    return _metres(values, units_per_m)
 
 
-def compressed_depth_image(message: Any) -> Float32:
+def compressed_depth_image(message: Any, units_per_m: float = UNITS_PER_M) -> Float32:
     """Depth (H, W) in metres of a ``sensor_msgs/CompressedImage`` of transport compressedDepth, or a 16-bit PNG.
 
     Raises:
@@ -137,7 +137,7 @@ def compressed_depth_image(message: Any) -> Float32:
         raise CodecError(f"the depth image of format '{message.format}' is damaged, or no PNG of 16 bits")
     values = np.asarray(image, np.uint16)
     if quantised is None:
-        return _metres(values)
+        return _metres(values, units_per_m)
     a, b = quantised
     with np.errstate(divide="ignore", invalid="ignore"):
         return _metres(np.where(values > 0, a / (values.astype(np.float32) - b), 0).astype(np.float32))
@@ -156,7 +156,9 @@ def intrinsics(info: Any, K: NDArray[np.float64], D: NDArray[np.float64], *, rec
         ImportSourceError: not calibrated, a lens model that is not OpenCV's, skew, binning or a region of interest.
     """
     where = "its camera_info"
-    if info.binning_x > 1 or info.binning_y > 1 or info.roi.x_offset or info.roi.y_offset:
+    roi = info.roi
+    cut = 0 < roi.width < info.width or 0 < roi.height < info.height
+    if info.binning_x > 1 or info.binning_y > 1 or roi.x_offset or roi.y_offset or cut:
         raise ImportSourceError(f"{where} tells of binning or a region of interest, which is not read: record it whole")
     fx, cx, fy, cy = (float(K[i]) for i in ((0, 2, 5, 6) if rectified else (0, 2, 4, 5)))
     if K[1] or (not rectified and K[3]):
@@ -187,7 +189,7 @@ def _rows(message: Any, bytes_a_pixel: int) -> UInt8:
     return np.ascontiguousarray(message.data[: height * step].reshape(height, step)[:, :used])
 
 
-def _metres(values: NDArray[np.generic]) -> Float32:
+def _metres(values: NDArray[np.generic], units_per_m: float = UNITS_PER_M) -> Float32:
     if values.dtype.kind == "u":
-        return depth_from_uint16(values.astype(np.uint16), UNITS_PER_M)
+        return depth_from_uint16(values.astype(np.uint16), units_per_m)
     return metres(values)

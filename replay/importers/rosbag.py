@@ -11,6 +11,7 @@ removed where the camera's calibration tells of it and its images are not rectif
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -91,7 +92,7 @@ class _Topic:
     @property
     def rectified(self) -> bool:
         """Whether its images have no lens distortion any more."""
-        return "rect" in self.base.rsplit("/", 1)[-1]
+        return re.search(r"(^|_)rect(_|$)|rectified", self.base.rsplit("/", 1)[-1]) is not None
 
     @property
     def base(self) -> str:
@@ -126,6 +127,9 @@ class RosbagRecording:
             raise ImportSourceError(f"no topic has the role '{unknown[0]}'; the roles are {', '.join(ROLES)}")
         self._bag = _Bag(src)
         color, depth = self._find_images()
+        self._refuse_no_poses(color)
+        if depth is not None and (units := self._bag.depth_units(depth.name)):
+            self.depth_scale = DepthScale(units, src)
         infos = {color.name: self._info_topic(color, options.topics.get("info", ""))}
         depth_info = options.topics.get("depth_info", "")
         if depth is not None and (depth_info or self._has_info(depth)):
@@ -230,7 +234,7 @@ class RosbagRecording:
         try:
             message = self._bag.message(topic.name, self._depth, index)
             read = ros_images.depth_image if topic.raw else ros_images.compressed_depth_image
-            depth_m = read(message)
+            depth_m = read(message, self.depth_scale.units_per_m)
         except CodecError as error:
             raise BadFrameError(where, str(error)) from error
         k = self._depth_intrinsics
@@ -338,13 +342,16 @@ class RosbagRecording:
                 f"{self._bag.src}: several topics tell poses: {', '.join(found[:LISTED])}; name one: "
                 f"--topic pose={found[0]}"
             )
-        if not found and not self._bag.topics(*_TF):
+        return found[0] if found else ""
+
+    def _refuse_no_poses(self, color: _Topic) -> None:
+        """Raises: ImportSourceError: nothing in the bag tells poses."""
+        if not self._bag.topics(*_NAMED_POSES, *_POSES, *_TF):
             raise ImportSourceError(
                 f"{self._bag.src}: has no poses: neither tf nor a topic of "
                 f"{', '.join(t.replace('/msg/', '/') for t in (*_NAMED_POSES, *_POSES))}; it has {self._bag.listing()}"
-                + (_VIEWER if self._color_topic.name.startswith(_REALSENSE_VIEWER) else "")
+                + (_VIEWER if color.name.startswith(_REALSENSE_VIEWER) else "")
             )
-        return found[0] if found else ""
 
     def _read_all(self, infos: set[str]) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
         """One pass over the bag: stamps of images and transforms; returns calibrations and poses by topic."""
@@ -381,7 +388,7 @@ class RosbagRecording:
             found = [self._bag.intrinsics(info, rectified=topic.rectified) for info in good or infos[:1]]
         except ImportSourceError as error:
             raise ImportSourceError(f"{self._bag.src}: {topic.name}: {error}") from error
-        if len(set(found)) > 1:
+        if any(k.distortion != found[0].distortion or not _one_lens(found[0], k) for k in found):
             raise ImportSourceError(
                 f"{self._bag.src}: the calibration of {topic.name} changes ({found[0]}, then {found[-1]}): the lens "
                 "has zoomed or the size was switched; cut the bag where it does"
@@ -483,7 +490,9 @@ class RosbagRecording:
                 a, b = (self._bag.intrinsics(i, rectified=False) for i in (own, info))
             except ImportSourceError:  # of a lens that is not undone: another camera's
                 continue
-            if "depth" not in other.lower() and (a.width, a.height) == (b.width, b.height) and not _one_lens(a, b):
+            comparable = "depth" not in other.lower() and same_view((a.width, a.height), (b.width, b.height))
+            bent_otherwise = a.distorted and b.distorted and a.distortion != b.distortion
+            if comparable and (bent_otherwise or not _one_lens(a, b)):
                 raise ImportSourceError(
                     f"{self._bag.src}: {name} and {other} give the camera frame '{color.frame}' two calibrations ({a}, "
                     f"{b}); name the true one: --topic info={name} or --topic info={other}"
@@ -502,7 +511,8 @@ class RosbagRecording:
     def _is_scaled(self, own: CameraIntrinsics) -> bool:
         """Whether depth is colour's view at its size, for rounding of the calibration."""
         k = self._measured
-        return (own.width, own.height) == (k.width, k.height) and _one_lens(k, own) and self._topics_share_frame()
+        same = (own.width, own.height, own.distortion) == (k.width, k.height, k.distortion)
+        return same and _one_lens(k, own) and self._topics_share_frame()
 
     def _topics_share_frame(self) -> bool:
         return self._depth_topic is not None and self._depth_topic.frame == self._color_topic.frame
@@ -629,7 +639,10 @@ class _Bag:
                 _, _, message = next(self.messages({name}), ("", 0, None))
                 if message is not None:
                     encoding = str(getattr(message, field))
-                    found.append(_Topic(name, kind == _RAW, encoding, frame_name(message.header.frame_id)))
+                    # The RealSense Viewer gives all cameras one frame, "0", although they stand apart.
+                    viewer = name.startswith(_REALSENSE_VIEWER)
+                    frame = name.rsplit("/", 2)[0] if viewer else frame_name(message.header.frame_id)
+                    found.append(_Topic(name, kind == _RAW, encoding, frame))
         return found
 
     def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any]]:
@@ -672,10 +685,18 @@ class _Bag:
         rectified = rectified and bool(np.any(P) or np.any(D))  # a pinhole camera's driver may leave P empty
         return ros_images.intrinsics(info, P if rectified else K, D, rectified=rectified)
 
+    def depth_units(self, depth: str) -> float | None:
+        """Units per metre of depth that the RealSense Viewer has recorded; None of other bags."""
+        name = f"{depth.rsplit('/', 3)[0]}/option/Depth_Units/value"
+        if not depth.startswith(_REALSENSE_VIEWER) or name not in self.topics("std_msgs/msg/Float32"):
+            return None
+        metres = float(next(self.messages({name}))[2].data)
+        return 1 / metres if metres > 0 else None
+
     def is_calibrated(self, info: Any) -> bool:
         """Whether a ``sensor_msgs/CameraInfo`` says anything: cameras send some before they know."""
         K, _, P = self._matrices(info)
-        return bool(np.any(K) or np.any(P))
+        return bool((np.any(K) or np.any(P)) and np.isfinite(K).all() and np.isfinite(P).all())
 
     def rectification(self, info: Any) -> tuple[Float64, Float64]:
         """R (3, 3) and P (12,) of a ``sensor_msgs/CameraInfo``."""

@@ -15,6 +15,7 @@ them.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -22,7 +23,7 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from semantic_mapper.drivers.lens import lens_intrinsics
+from semantic_mapper.drivers.lens import is_fisheye_model, lens_intrinsics
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.files import numeric_order
 from semantic_mapper.plain_text import counted
@@ -32,9 +33,9 @@ from semantic_mapper.replay.importers.base import (
     ImportOptions,
     convert_known,
     inside,
-    read_depth,
     read_plain_json,
     read_rgb,
+    refuse_keys,
     unknown_keys,
     unknown_notice,
 )
@@ -48,13 +49,16 @@ _NEUTRAL = (  # they turn or fit the world, or are of training
     "applied_transform", "aabb_scale", "orientation_override", "auto_scale_poses_override", "enable_depth_loading",
 )  # fmt: skip
 _OTHER_AXES = ("from_mitsuba", "from_na")  # instant-ngp's flags for poses of another convention
-_MILLIMETRES = 100.0  # depth as numbers with a point and this median is no longer in metres
+_OTHER_LENS = re.compile(r"latlong|equirectangular|orthographic|ftheta\w*|distortion_params")  # instant-ngp, nerfstudio
+_AXES = re.compile(r"(camera_|world_)?(coordinate_system|coordinate_convention|convention|axes)", re.IGNORECASE)
 
 
 class _Lens(msgspec.Struct, kw_only=True):
     """Of a frame, or of all of them."""
 
     camera_model: str | None = None
+    lens_model: str | None = None
+    distortion_model: str | None = None
     is_fisheye: bool | None = None
     camera_angle_x: float | None = None
     camera_angle_y: float | None = None
@@ -101,20 +105,31 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     for name in _OTHER_AXES:
         if getattr(found, name):
             raise ImportSourceError(f"{file}: '{name}' means poses in other axes than OpenGL's, which are not read")
+    refuse_keys(plain, _OTHER_LENS, str(file))
+    axes = _camera_axes(plain, file)
     left_out: list[str] = []
     frames: list[tuple[int, _Frame]] = []
     for number, frame in enumerate(found.frames):
         try:
+            refuse_keys(frame, _OTHER_LENS, f"{file}, frame {number}")
             frames.append((number, convert_known(frame, _Frame, f"{file}, frame {number}")))
         except ImportSourceError as error:
             left_out.append(str(error))
-    notices = unknown_notice(file, [*unknown_keys([plain], _Transforms, _NEUTRAL), *unknown_keys(found.frames, _Frame)])
+    notices = unknown_notice(
+        file,
+        [
+            *unknown_keys([{k: v for k, v in plain.items() if not _AXES.fullmatch(k)}], _Transforms, _NEUTRAL),
+            *unknown_keys(found.frames, _Frame),
+        ],
+    )
     size = _common_size(folder, found, [frame for _, frame in frames])
     pictures: list[PosedPicture] = []
     for number, frame in frames:
         try:
-            pictures.append(_picture(folder, found, frame, size, f"{file}, frame {number} ('{frame.file_path[:80]}')"))
-        except BadFrameError as error:
+            pictures.append(
+                _picture(folder, found, frame, size, axes, f"{file}, frame {number} ('{frame.file_path[:80]}')")
+            )
+        except ImportSourceError as error:
             left_out.append(str(error))
     if left_out:
         notices.append(f"{counted(len(left_out), 'frame')} of {len(found.frames)} left out; the first: {left_out[0]}")
@@ -156,10 +171,11 @@ def _depth_scale(
         scale = DepthScale(
             1000.0, convention="nerfstudio's millimetres; another unit belongs into depth_unit_scale_factor"
         )
-        numpy = next((depth for depth in there if depth.suffix == ".npy"), None)
-        if numpy is not None and not options.without_depth:
-            scale, sentence = _numpy_scale(numpy, scale)
-            said.append(sentence)
+        if any(depth.suffix == ".npy" for depth in there) and not options.without_depth:
+            said.append(
+                "depth of NumPy's files with a point is taken as metres, or as millimetres where half of it is above "
+                "100; depth_unit_scale_factor says otherwise"
+            )
     measured = bool(there) and not options.without_depth
     if measured and options.scale is not None:
         said.append(
@@ -169,19 +185,19 @@ def _depth_scale(
     return scale, measured, said
 
 
-def _numpy_scale(file: Path, scale: DepthScale) -> tuple[DepthScale, str]:
-    """The unit of depth as NumPy's numbers with a point, which the file does not tell: metres or millimetres."""
-    try:
-        depth = read_depth(file, scale, None)
-    except BadFrameError:  # reported when its turn comes
-        depth = np.zeros((1, 1), np.float32)
-    median = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
-    units, name = (1000.0, "millimetres") if median > _MILLIMETRES else (1.0, "metres")
-    sentence = f"depth of NumPy's files is taken as {name} (half of the first is below {median:.4g}); "
-    return (
-        DepthScale(scale.units_per_m, convention=scale.convention, float_units_per_m=units),
-        sentence + "depth_unit_scale_factor says otherwise",
-    )
+def _camera_axes(plain: Mapping[str, Any], file: Path) -> Float64:
+    """``T_given_cv`` (4, 4): OpenGL's axes, unless a key says OpenCV's.
+
+    Raises:
+        ImportSourceError: a key names other axes.
+    """
+    for key, value in plain.items():
+        if isinstance(value, str) and _AXES.fullmatch(key):
+            if value.strip().lower() in ("opencv", "colmap"):
+                return np.eye(4)
+            if value.strip().lower() not in ("opengl", "blender", "nerf", "nerfstudio", "arkit", ""):
+                raise ImportSourceError(f"{file}: '{key}' is '{value[:40]}'; camera axes of OpenGL and OpenCV are read")
+    return GL_AXES
 
 
 def _common_size(folder: Path, found: _Transforms, frames: Sequence[_Frame]) -> tuple[int, int] | None:
@@ -203,13 +219,13 @@ def _image(folder: Path, frame: _Frame) -> Path:
 
 
 def _picture(
-    folder: Path, all_frames: _Transforms, frame: _Frame, size: tuple[int, int] | None, where: str
+    folder: Path, all_frames: _Transforms, frame: _Frame, size: tuple[int, int] | None, axes: Float64, where: str
 ) -> PosedPicture:
     image = _image(folder, frame)
     T_world_gl = _matrix(frame.transform_matrix, image)
     depth = frame.depth_file_path or frame.depth_path
     lens = _intrinsics(all_frames, frame, size, where)
-    return PosedPicture(image, lens, T_world_gl @ GL_AXES, None if not depth else inside(folder, depth))
+    return PosedPicture(image, lens, T_world_gl @ axes, None if not depth else inside(folder, depth))
 
 
 def _matrix(rows: list[list[float]] | None, image: Path) -> Float64:
@@ -233,16 +249,20 @@ def _intrinsics(all_frames: _Lens, frame: _Lens, size: tuple[int, int] | None, w
         if size is None:
             raise ImportSourceError(f"{where}: has no w and h, and no picture that tells them")
         width, height = size
-    fx = values["fl_x"] or _focal(values["camera_angle_x"], width)
-    fy = values["fl_y"] or _focal(values["camera_angle_y"], height)
+    own_fx, own_fy = (
+        frame.fl_x or _focal(frame.camera_angle_x, width),
+        frame.fl_y or _focal(frame.camera_angle_y, height),
+    )
+    fx = own_fx or all_frames.fl_x or _focal(all_frames.camera_angle_x, width)
+    fy = own_fy or (None if own_fx else all_frames.fl_y or _focal(all_frames.camera_angle_y, height))
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
         raise ImportSourceError(f"{where}: has no focal length: fl_x, or camera_angle_x")
     cx = width / 2 if values["cx"] is None else values["cx"]
     cy = height / 2 if values["cy"] is None else values["cy"]
     k1, k2, k3, k4, p1, p2 = (values[name] or 0.0 for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = values["camera_model"] or "OPENCV"
-    if values["is_fisheye"] or model.upper() == "OPENCV_FISHEYE":
+    model = values["camera_model"] or values["lens_model"] or values["distortion_model"] or "OPENCV"
+    if values["is_fisheye"] or is_fisheye_model(model):
         model, lens, left = "OPENCV_FISHEYE", (k1, k2, k3, k4), {"p1": p1, "p2": p2}
     else:
         lens, left = (k1, k2, p1, p2, k3), {"k4": k4}

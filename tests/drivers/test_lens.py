@@ -47,6 +47,7 @@ def test_a_fisheye_without_coefficients_is_one_all_the_same() -> None:
     [
         ("inverse_brown_conrady", (0.1,), "'inverse_brown_conrady' is not undone"),
         ("omni", (), "'omni' is not undone"),
+        ("", (0.1,), "no model"),
         ("equidistant", (0.1,) * 5, "with 5 coefficients"),
     ],
 )
@@ -106,6 +107,7 @@ KALIBR = """cam0:
         (ROS.format(model="equidistant", count=4, lens="[0.06, -0.02, 0.008, -0.002]"), FISHEYE),
         (ECHOED, CameraIntrinsics(*K, *SIZE, (0.1, 0, 0, 0))),
         (ECHOED.replace("d: [", "D: [").replace("k: [", "K: ["), CameraIntrinsics(*K, *SIZE, (0.1, 0, 0, 0))),
+        (ECHOED + "---\n", CameraIntrinsics(*K, *SIZE, (0.1, 0, 0, 0))),
         (KALIBR, FISHEYE),
     ],
 )
@@ -123,6 +125,8 @@ def test_calibrations_of_ros_and_kalibr_are_read(tmp_path: Path, text: str, lens
         (KALIBR.replace("intrinsics: [", "intrinsics: {"), "not valid YAML.*fx fy cx cy"),
         ("a: &a [1]\nb: *a\n", "aliases"),
         ("- 1\n", "no calibration"),
+        (ECHOED + "binning_x: 2\n", "binning"),
+        (ECHOED + "---\n" + ECHOED.replace("150", "151"), "several calibrations"),
     ],
 )
 def test_what_is_wrong_with_a_yaml_calibration_is_told(tmp_path: Path, text: str, says: str) -> None:

@@ -73,7 +73,7 @@ def test_keys_that_tell_of_lens_axes_unit_or_time_and_are_not_read_are_named(tmp
     report, _ = imported(folder)
     assert "'rolling_shutter' is not read" in said(report)
     assert "aabb_scale" not in said(report) and "crop" not in said(report)
-    tables = [{"unit": "metres", "axes": "opencv", "flip_y": True, "pose_rotation": np.eye(3).tolist(), "lens": [0.0]}]
+    tables = [{"unit": "metres", "flip_y": True, "pose_rotation": np.eye(3).tolist(), "lens": [0.0]}]
     assert unknown_keys(tables, _Transforms) == ["flip_y"]
 
 
@@ -419,3 +419,80 @@ def test_a_map_that_cannot_be_trusted_has_an_exit_code_of_its_own(
             got = error.code
         assert got == code
     assert "x forward" in json.loads((tmp_path / "run" / "summary.json").read_text())["pose_check"]["warning"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"equirectangular": True}, "'equirectangular' is not read"),
+        ({"ftheta_p1": 0.1}, "'ftheta_p1' is not read"),
+        ({"distortion_params": [0.1, 0, 0, 0]}, "'distortion_params' is not read"),
+        ({"coordinate_system": "unity"}, "'coordinate_system' is 'unity'"),
+        ({"lens_model": "omni"}, "'omni' is not undone"),
+    ],
+)
+def test_lenses_and_axes_of_other_kinds_are_refused_by_name(tmp_path: Path, keys: dict[str, Any], says: str) -> None:
+    with pytest.raises(ImportSourceError, match=says):
+        imported(make_transforms(tmp_path / "nerf", **keys))
+
+
+def test_axes_that_are_told_are_used_and_nested_lenses_named(tmp_path: Path) -> None:
+    plain = imported(make_transforms(tmp_path / "gl"))[1][0]
+    folder = make_transforms(tmp_path / "cv", coordinate_system="opencv", camera={"k1": 0.1, "name": "front"})
+    report, frames = imported(folder)
+    turned_back = np.diag((1.0, -1.0, -1.0, 1.0))
+    assert np.allclose(frames[0].T_world_camera @ turned_back, plain.T_world_camera)
+    assert "'camera' is not read" in said(report)
+
+
+def test_what_a_frame_tells_comes_before_what_all_tell(tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "nerf")
+    found = json.loads((folder / "transforms.json").read_text())
+    found["frames"][0]["camera_angle_x"] = 2 * np.arctan(W / 2 / 40)
+    found["frames"][1]["fl_x"] = "wide"
+    (folder / "transforms.json").write_text(json.dumps(found))
+    report, frames = imported(folder)
+    assert [round(frame.intrinsics.fx) for frame in frames] == [40, 50] and "1 frame of 3 left out" in said(report)
+
+
+def test_the_model_of_a_lens_in_intrinsics_json_is_used(tmp_path: Path) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    change_json(folder / "intrinsics.json", distortion=[0.1], distortion_model="equidistant")
+    fisheye = imported(folder)[1][0].intrinsics
+    change_json(folder / "intrinsics.json", distortion_model="plumb_bob")
+    assert imported(folder)[1][0].intrinsics != fisheye
+    change_json(folder / "intrinsics.json", distortion_model="omni")
+    with pytest.raises(ImportSourceError, match="'omni' is not undone"):
+        imported(folder)
+
+
+def test_whole_seconds_among_others_are_seconds(tmp_path: Path) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    (folder / "timestamps.txt").write_text("1\n1.5\n2\n2,5\n3e0\n4\n")
+    assert [frame.stamp_ns for frame in imported(folder)[1]] == [10**9 * n // 2 for n in (2, 3, 4, 5, 6, 8)]
+
+
+def test_record3d_falls_back_to_k_and_its_times_are_sorted(tmp_path: Path) -> None:
+    own = [[50.0, 51.0, 30.0, 25.0], None, [0.0, 0.0, 0.0, 0.0]]
+    folder = make_record3d(tmp_path / "phone", perFrameIntrinsicCoeffs=own, frameTimestamps=[7.5, 7.0, None])
+    report, frames = imported(folder)
+    assert len(frames) == 3 and sorted(frame.intrinsics.fy for frame in frames) == [50.0, 50.0, 51.0]
+    assert "frameTimestamps go back" in said(report)
+
+
+def test_parts_of_a_bag_are_joined_however_their_suffix_is_written(tmp_path: Path) -> None:
+    src = make(tmp_path, "mcap")
+    (src / "metadata.yaml").unlink()
+    (file,) = src.iterdir()
+    file.rename(src / "part.MCAP")
+    assert imported(src)[0].frames == 6
+
+
+def test_windows_paths_are_found_and_lead_nowhere_else(tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "nerf")
+    text = (folder / "transforms.json").read_text().replace("images/", "images\\\\")
+    (folder / "transforms.json").write_text(text)
+    assert imported(folder)[0].frames == 3
+    (folder / "transforms.json").write_text(text.replace("images", ".."))
+    with pytest.raises(ImportSourceError, match="outside of it"):
+        imported(folder)
