@@ -59,6 +59,18 @@ def refuse_company(task: Task) -> Outcome:
     return Outcome(task.url, "done")
 
 
+def need_company(task: Task) -> Outcome:
+    """Fail where no other task comes while this one runs."""
+    folder = Path(task.tags["traces"])
+    (folder / f"came.{task.url}").touch()
+    deadline = time.monotonic() + 120
+    while len(list(folder.glob("came.*"))) < 2:
+        if time.monotonic() > deadline:
+            raise LogError("alone")
+        time.sleep(0.05)
+    return Outcome(task.url, "done")
+
+
 def fill_disk(task: Task) -> Outcome:
     """There is no room on this machine."""
     raise DiskError("the disk is full")
