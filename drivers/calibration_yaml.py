@@ -1,8 +1,9 @@
-"""Calibrations that other programs write as YAML: ROS's camera_info (camera_calibration, ``ros2 topic echo``) and
-Kalibr's camera chain."""
+"""Calibrations that other programs write as YAML: ROS's camera_info (camera_calibration, ``ros2 topic echo``), the same
+keys in OpenCV's FileStorage, and Kalibr's camera chain."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -115,6 +116,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     yaml = YAML(typ="safe", pure=True)
     try:
         text = read_regular(path, MAX_FILE_BYTES).decode("utf-8-sig")
+        text, of_opencv = re.subn(r"\A%YAML:1\.0\s*|!!opencv-matrix", "", text)  # as OpenCV's FileStorage writes it
         if any(isinstance(event, AliasEvent) for event in yaml.parse(text)):  # of these, a short file makes a long one
             raise ConfigError("has aliases (*), which no calibration needs")
         documents: list[Any] = [document for document in yaml.load_all(text) if document is not None]
@@ -129,4 +131,5 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise ConfigError(f"{path}: holds no calibration; {WANTED}")
     check_values(plain, str(path))
-    return {str(key): value for key, value in cast("dict[Any, Any]", plain).items()}
+    values = {str(key): value for key, value in cast("dict[Any, Any]", plain).items()}
+    return {"distortion_model": "opencv", **values} if of_opencv else values

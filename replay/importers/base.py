@@ -6,6 +6,8 @@ import io
 import json
 import math
 import re
+import zipfile
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
@@ -67,6 +69,8 @@ class ImportOptions:
 
 
 PICTURES = (".jpg", ".jpeg", ".png")
+NUMPY = (".npy", ".npz")
+DEPTHS = (".png", *NUMPY)
 MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses
 
 
@@ -223,16 +227,16 @@ def read_depth(file: Path, scale: DepthScale, size: tuple[int, int] | None) -> F
     """Depth image (H, W) in metres.
 
     Args:
-        file: 16-bit PNG, or NumPy's file.
+        file: 16-bit PNG, or NumPy's file of one matrix.
         scale: Of its numbers.
         size: (height, width) that it must have; None = any.
 
     Raises:
         BadFrameError: missing, damaged, not 16-bit, or of another size.
     """
-    if file.suffix.lower() != ".npy":
+    if file.suffix.lower() not in NUMPY:
         return depth_from_uint16(read_plane(file, "uint16", size, "depth").astype(np.uint16), scale.units_per_m)
-    values = _read_npy(file)
+    values = _read_numpy(file)
     if size is not None and values.shape != size:
         raise _wrong_size(file, "depth", (values.shape[0], values.shape[1]), size)
     units = scale.units_per_m if values.dtype.kind in "iu" else scale.float_units_per_m
@@ -253,13 +257,27 @@ def metres(values: NDArray[np.generic]) -> Float32:
     return depth_m
 
 
-def _read_npy(file: Path) -> NDArray[np.generic]:
+def numpy_notice(files: Iterable[Path], scale: DepthScale) -> list[str]:
+    """A sentence on the unit of depth in NumPy's files, where nothing tells it; none where there are none."""
+    if scale.float_units_per_m is not None or not any(file.suffix.lower() in NUMPY for file in files):
+        return []
+    return [
+        "depth with a point in NumPy's files is taken as metres, or in the unit of whole numbers "
+        f"({scale.units_per_m:g} per metre) where half of an image is above {_MOST_METRES:g}"
+    ]
+
+
+def _read_numpy(file: Path) -> NDArray[np.generic]:
     try:
-        values = np.asarray(np.load(io.BytesIO(read_bytes(file)), allow_pickle=False))
+        loaded = np.load(io.BytesIO(read_bytes(file)), allow_pickle=False)
+        arrays = [loaded[name] for name in loaded.files] if isinstance(loaded, np.lib.npyio.NpzFile) else [loaded]
     except OSError as error:
         raise BadFrameError(file, f"the depth image cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise BadFrameError(file, f"is no file of NumPy that holds numbers: {error}; save it again") from error
+    if len(arrays) != 1:
+        raise BadFrameError(file, f"holds {len(arrays)} arrays; save the depth image alone")
+    values = np.asarray(arrays[0])
     if values.ndim == 3 and 1 in (values.shape[0], values.shape[2]):
         values = values.squeeze(0 if values.shape[0] == 1 else 2)
     if values.ndim != 2 or values.dtype.kind not in "iuf":
@@ -374,6 +392,8 @@ def read_matrix(file: Path) -> Float64:
 def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) -> dict[int, Path]:
     """Files named by a number ("000017.jpg", "17.png", "frame-000017.color.jpg") by that number, in its order.
 
+    Of several numbers the first one counts, unless the last one tells more files apart ("cam0_000017.png").
+
     Args:
         folder: Of the files; none are found where it is missing.
         suffixes: What their names end with, in small letters.
@@ -381,13 +401,14 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) 
     """
     found: dict[int, Path] = {}
     left_out: list[str] = []
-    files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes) if folder.is_dir() else ()
-    for file in sorted(files):
-        number = re.search(r"\d{1,18}", file.name)
-        if number is None or int(number[0]) in found:
+    files = [file for file in folder.iterdir() if file.suffix.lower() in suffixes] if folder.is_dir() else []
+    numbers = {file: [int(n) for n in re.findall(r"\d{1,18}", file.stem)] for file in sorted(files)}
+    which = max((0, -1), key=lambda place: len({of[place] for of in numbers.values() if of}))
+    for file, of in numbers.items():
+        if not of or of[which] in found:
             left_out.append(file.name)
         else:
-            found[int(number[0])] = file
+            found[of[which]] = file
     if left_out:
         notices.append(
             f"{folder}: {counted(len(left_out), 'file')} without a number, or with that of another file, left out; the "
@@ -396,9 +417,24 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) 
     return dict(sorted(found.items()))
 
 
+def depth_files(folder: Path, options: ImportOptions, scale: DepthScale, notices: list[str]) -> dict[int, Path]:
+    """Depth images of a folder by their numbers; none where depth is left out.
+
+    Args:
+        folder: Of the images.
+        options: Of the import.
+        scale: Of the images.
+        notices: Gets sentences on files that are left out, and on a unit that is assumed.
+    """
+    found = {} if options.without_depth else numbered_files(folder, DEPTHS, notices)
+    notices += numpy_notice(found.values(), scale)
+    return found
+
+
 def split_row(text: str) -> list[str]:
-    """Words of a row: between spaces, tabs, commas or semicolons. A comma may be a decimal one where semicolons, or
-    spaces, part the words."""
+    """Words of a row: between spaces, tabs, commas or semicolons, in brackets or without. A comma may be a decimal one
+    where semicolons, or spaces, part the words."""
+    text = text.strip().strip("[]()")
     if ";" in text:
         return [word.strip().replace(",", ".") for word in text.strip().strip(";").split(";")]
     words = text.split()

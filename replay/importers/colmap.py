@@ -33,6 +33,8 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     if not any(found[root]):
         name = model.images[0].name
         raise ImportSourceError(f"{folder}: the pictures of the model are missing; '{name}' is not in {roots[0]}")
+    if model.left_out:
+        notices.append(f"{counted(len(model.left_out), 'image')} left out; the first: {model.left_out[0]}")
     names = {inside(root, image.name) for image in model.images}
     unposed = [path for path in sorted(root.rglob("*")) if path.suffix.lower() in PICTURES and path not in names]
     if root != folder and unposed:

@@ -13,6 +13,7 @@ with its one-sigma spread in ``depth_sigma/NNNNNN.png``: they come back with tha
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -36,6 +37,7 @@ from semantic_mapper.replay.importers.base import (
     Skipped,
     check_frame_pose,
     convert_known,
+    depth_files,
     image_size_must_be,
     numbered_files,
     read_depth_if_there,
@@ -126,9 +128,7 @@ class FolderRecording:
                 f"{folder}: images are numbered up to {max(self._color)}, poses.txt has {len(self._rows)} rows; row i "
                 "belongs to image i, counted from 0"
             )
-        self._depth = numbered_files(folder / "depth", (".png", ".npy"), self.notices)
-        if options.without_depth:
-            self._depth = {}
+        self._depth = depth_files(folder / "depth", options, self.depth_scale, self.notices)
         self._computed_depth = not options.without_depth
         labels = self._read_label_set()
         self._has_label = labels is not None and any((folder / name).is_dir() for name in ("label", PSEUDO_LABEL))
@@ -153,6 +153,9 @@ class FolderRecording:
         number = self._numbers[number]
         file = self._color.get(number, self._folder / "color" / f"{number:06d}.jpg")
         pose = self._pose(number)
+        stamp_ns = self._stamps[number]
+        if stamp_ns is None:
+            raise BadFrameError(self._folder / "timestamps.txt", f"row {number + 1} is no time")
         rgb, encoded = read_rgb(file)
         image_size_must_be(rgb, self._measured, file)
         size = (self._measured.height, self._measured.width)
@@ -173,7 +176,7 @@ class FolderRecording:
                 label_error = Skipped(error.file, error.reason, number, label_only=True)
         nearest, bent = self._rectify.nearest, self._measured.distorted
         frame = PosedFrame(
-            stamp_ns=self._stamps[number],
+            stamp_ns=stamp_ns,
             seq=number,
             camera_id=self._camera_id,
             rgb=self._rectify(np.ascontiguousarray(rgb[..., ::-1])) if bent else rgb,
@@ -202,30 +205,38 @@ class FolderRecording:
             raise BadFrameError(file, f"line {line}: expected 16 numbers (4x4, row by row), got {values.size}")
         return check_frame_pose(values.reshape(4, 4), file, line)
 
-    def _read_stamps(self, frame_hz: float) -> list[int]:
+    def _read_stamps(self, frame_hz: float) -> list[int | None]:
+        """Of each frame; None = its row is no time."""
         file = self._folder / "timestamps.txt"
         count = self._numbers[-1] + 1
         if not file.exists():
             self.notices.append(f"no timestamps.txt: stamps are made up at {frame_hz:g} frames a second")
             return [round(i * 1e9 / frame_hz) for i in range(count)]
-        try:
-            rows = [text.strip().replace(",", ".") for _, text in read_lines(file)]
-            stamps = [int(row) for row in rows] if all(map(str.isdigit, rows)) else [seconds_to_ns(row) for row in rows]
-        except ValueError as error:
-            raise ImportSourceError(f"{file}: {error}") from error
-        if any(not 0 <= stamp <= MAX_STAMP_NS for stamp in stamps):
-            raise ImportSourceError(f"{file}: a stamp is not from 0 to {MAX_STAMP_NS} ns; write capture times")
-        if len(stamps) < count:
-            raise ImportSourceError(f"{file}: needs a stamp for each of {count} frames, has {len(stamps)} rows")
-        back = next((n for n, (a, b) in enumerate(pairwise(stamps[:count]), 2) if b <= a), 0)
+        rows = [text.strip().replace(",", ".") for _, text in read_lines(file)]
+        if len(rows) < count:
+            raise ImportSourceError(f"{file}: needs a stamp for each of {count} frames, has {len(rows)} rows")
+        whole = not any(re.fullmatch(r"\d*\.\d*|[\d.]+[eE][-+]?\d+", row) for row in rows)
+        stamps: list[int | None] = []
+        broken: list[str] = []
+        for number, row in enumerate(rows[:count], 1):
+            try:
+                stamps.append(_whole_ns(row) if whole else seconds_to_ns(row))
+            except ValueError as error:
+                stamps.append(None)
+                broken.append(f"row {number}: {error}")
+        if 2 * len(broken) >= count:
+            raise ImportSourceError(f"{file}: {broken[0]}")
+        good = [(number, stamp) for number, stamp in enumerate(stamps, 1) if stamp is not None]
+        back = next((n for (_, a), (n, b) in pairwise(good) if b <= a), 0)
         if back:
             raise ImportSourceError(
                 f"{file}: row {back} is not later than the row before it; frames need rising stamps: sort the images, "
                 "or mend the stamps"
             )
-        if count > 1 and (stamps[count - 1] - stamps[0]) / (count - 1) < LEAST_PERIOD_NS:
+        (first, first_ns), (last, last_ns) = good[0], good[-1]
+        if last > first and (last_ns - first_ns) / (last - first) < LEAST_PERIOD_NS:
             raise ImportSourceError(
-                f"{file}: frames are {(stamps[count - 1] - stamps[0]) / (count - 1):g} ns apart; whole numbers are "
+                f"{file}: frames are {(last_ns - first_ns) / (last - first):g} ns apart; whole numbers are "
                 "nanoseconds: write seconds with a point (1.0), or convert milliseconds"
             )
         return stamps
@@ -237,6 +248,13 @@ class FolderRecording:
                 self.notices.append("label/ is left out: labels.json, which names its classes, is missing")
             return None
         return read_label_set(file, self.notices)
+
+
+def _whole_ns(row: str) -> int:
+    """Raises: ValueError: no whole number, or too large for a stamp."""
+    if not row.isdecimal() or int(row) > MAX_STAMP_NS:
+        raise ValueError(f"'{row[:40]}' is not a time from 0 to {MAX_STAMP_NS} ns; write capture times")
+    return int(row)
 
 
 def read_label_set(file: Path, notices: list[str] | None = None) -> LabelSet:

@@ -8,8 +8,9 @@ metres. Without, the model is placed as one of COLMAP.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import cv2
 import msgspec
@@ -24,6 +25,7 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
     PICTURES,
     ImportOptions,
+    convert_known,
     inside,
     read_plain_json,
     unknown_keys,
@@ -33,7 +35,7 @@ from semantic_mapper.replay.importers.placed import PlacedModel, place_model
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
-from semantic_mapper.types import CameraIntrinsics, Float64
+from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
 
 FILE, REFERENCE = "reconstruction.json", "reference_lla.json"
 MAX_BYTES = 1 << 31
@@ -66,6 +68,7 @@ class _Shot(msgspec.Struct):
     rotation: Vector
     translation: Vector
     camera: str
+    capture_time: float | None = None  # seconds; 0 = not known
 
 
 class _Reference(msgspec.Struct):
@@ -75,8 +78,8 @@ class _Reference(msgspec.Struct):
 
 
 class _Model(msgspec.Struct):
-    cameras: dict[str, _Camera]
-    shots: dict[str, _Shot]
+    cameras: dict[str, dict[str, Any]]
+    shots: dict[str, dict[str, Any]]
     reference_lla: _Reference | None = None
 
 
@@ -102,21 +105,30 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     file = find_opensfm(folder)
     if file is None:
         raise ImportSourceError(f"{folder}: no {FILE} in it, or below opensfm/")
-    models = _read(file, list[_Model])
+    models = [convert_known(model, _Model, str(file)) for model in read_plain_json(file, MAX_BYTES, list)]
     number = max(range(len(models)), key=lambda n: len(models[n].shots), default=-1)
     if number < 0 or not models[number].shots:
         raise ImportSourceError(f"{file}: holds no posed picture")
     model = models[number]
     names = sorted(model.shots, key=numeric_order)
     root = _root(folder, file, names)
-    used = {shot.camera for shot in model.shots.values()}
-    cameras = {n: _intrinsics(c, f"{file}, camera '{n}'") for n, c in model.cameras.items() if n in used}
-    left_out = [name for name in names if model.shots[name].camera not in cameras]
-    pictures = [_picture(root, name, model.shots[name], cameras) for name in names if name not in left_out]
+    cameras: dict[str, CameraIntrinsics | str] = {}
+    for camera, values in model.cameras.items():
+        try:
+            where = f"{file}, camera '{camera}'"
+            cameras[camera] = _intrinsics(convert_known(values, _Camera, where), where)
+        except ImportSourceError as error:
+            cameras[camera] = str(error)
+    pictures: list[PosedPicture] = []
+    left_out: list[str] = []
+    for name in names:
+        try:
+            shot = convert_known(model.shots[name], _Shot, f"{file}, shot '{name}'")
+            pictures.append(_picture(root, name, shot, cameras, file))
+        except ImportSourceError as error:
+            left_out.append(str(error))
     if not pictures:
-        raise ImportSourceError(
-            f"{file}: '{left_out[0]}' has camera '{model.shots[left_out[0]].camera}', which is missing"
-        )
+        raise ImportSourceError(left_out[0])
     poses = np.stack([picture.T_world_camera for picture in pictures])
     reference = model.reference_lla or _reference_beside(file)
     if reference is None or not (reference.latitude or reference.longitude):
@@ -128,15 +140,12 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         said = ["scale, up and north are those that OpenSfM found by GPS"]
         placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin)})
     opened = placed.pictures("opensfm", folder, pictures, options)
-    plain = read_plain_json(file, MAX_BYTES, list)[number]["cameras"].values()
-    opened.notices += unknown_notice(file, unknown_keys(plain, _Camera))
+    opened.notices += unknown_notice(file, unknown_keys(model.cameras.values(), _Camera))
     unposed = [
         path for path in sorted(root.iterdir()) if path.suffix.lower() in PICTURES and path.name not in model.shots
     ]
     if left_out:
-        opened.notices.append(
-            f"{counted(len(left_out), 'picture')} left out, whose camera is missing; the first: {left_out[0]}"
-        )
+        opened.notices.append(f"{counted(len(left_out), 'picture')} left out; the first: {left_out[0]}")
     if unposed:
         opened.notices.append(
             f"{counted(len(unposed), 'picture')} in {root} without a pose; the first: {unposed[0].name}"
@@ -171,11 +180,18 @@ def _root(folder: Path, file: Path, names: list[str]) -> Path:
     raise ImportSourceError(f"{folder}: the pictures are missing; '{names[0]}' is not in {roots[0]}")
 
 
-def _picture(root: Path, name: str, shot: _Shot, cameras: dict[str, CameraIntrinsics]) -> PosedPicture:
+def _picture(
+    root: Path, name: str, shot: _Shot, cameras: Mapping[str, CameraIntrinsics | str], file: Path
+) -> PosedPicture:
+    camera = cameras.get(shot.camera, f"{file}, shot '{name}': its camera '{shot.camera}' is missing")
+    if isinstance(camera, str):
+        raise ImportSourceError(camera)
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3] = cv2.Rodrigues(np.array(shot.rotation))[0]
     T_camera_world[:3, 3] = shot.translation
-    return PosedPicture(inside(root, name), cameras[shot.camera], invert_pose(T_camera_world))
+    time_s = shot.capture_time if shot.capture_time and 0 < shot.capture_time < MAX_STAMP_NS / 1e9 else None
+    stamp_ns = None if time_s is None else round(time_s * 1e9)
+    return PosedPicture(inside(root, name), camera, invert_pose(T_camera_world), stamp_ns=stamp_ns)
 
 
 def _intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:

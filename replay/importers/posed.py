@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -12,12 +13,14 @@ import numpy as np
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
     LoadedFrame,
     check_frame_pose,
+    numpy_notice,
     read_depth,
     read_plane,
     read_rgb,
@@ -26,6 +29,7 @@ from semantic_mapper.replay.importers.base import (
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
+SHIFT_NS = 1_000_000  # between pictures of one time
 DEFAULT_HZ = 2.0  # at which pictures without times count as taken
 T_Z_UP_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of ARKit's worlds
 GL_AXES = np.diag((1.0, -1.0, -1.0, 1.0))  # T_gl_cv: OpenGL's cameras look along -z, with y up
@@ -57,7 +61,7 @@ class PosedPictures:
 
     Args:
         source: What it is, for people.
-        pictures: In their order.
+        pictures: In their order; where each has a time, in that of the times.
         options: See ``ImportOptions``; ``scale`` makes metres of a collection's own unit.
         depth_scale: Of its depth images.
         metric: Whether its lengths are metres.
@@ -79,9 +83,9 @@ class PosedPictures:
         if not pictures:
             raise ImportSourceError(f"{folder}: holds no posed picture")
         self.notices: list[str] = []
-        self._pictures = _once_each(pictures, self.notices)
         self._options = options
         self._hz = options.frame_hz or DEFAULT_HZ
+        self._pictures, self._stamps_ns = _in_time(_once_each(pictures, self.notices), self._hz, self.notices)
         self._factor = options.scale or 1.0
         self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
         self.depth_scale = depth_scale
@@ -94,6 +98,8 @@ class PosedPictures:
         missing = [] if options.without_depth else [file for file in named if not file.exists()]
         if missing:
             self.notices.append(f"{len(missing)} of {len(named)} depth images are missing; the first: {missing[0]}")
+        if not options.without_depth:
+            self.notices += numpy_notice(named, depth_scale)
         first = self._rectifier(self._pictures[0].intrinsics, self._pictures[0].file)
         self.info = StreamInfo(
             source=f"{source} {folder.resolve().name}",
@@ -127,7 +133,7 @@ class PosedPictures:
         pose = picture.T_world_camera.copy()
         pose[:3, 3] *= self._factor
         frame = PosedFrame(
-            stamp_ns=round(number * 1e9 / self._hz) if picture.stamp_ns is None else picture.stamp_ns,
+            stamp_ns=self._stamps_ns[number],
             seq=number,
             camera_id=self._options.camera_id,
             rgb=rectifier(np.ascontiguousarray(rgb[..., ::-1])) if changed else rgb,
@@ -175,3 +181,24 @@ def _once_each(pictures: Sequence[PosedPicture], notices: list[str]) -> list[Pos
             f"{len(pictures) - len(kept)} pictures are there twice; of each the first pose counts; the first: {again}"
         )
     return kept
+
+
+def _in_time(pictures: Sequence[PosedPicture], hz: float, notices: list[str]) -> tuple[list[PosedPicture], list[int]]:
+    """The pictures in the order of their times and their stamps, which are made up where not each has a time."""
+    timed = [(picture.stamp_ns, picture) for picture in pictures if picture.stamp_ns is not None]
+    if len(timed) < len(pictures):
+        why = (
+            f"{len(pictures) - len(timed)} of {len(pictures)} pictures have no time" if timed else "there are no times"
+        )
+        notices.append(f"{why}: stamps are made up at {hz:g} frames a second")
+        return list(pictures), [round(number * 1e9 / hz) for number in range(len(pictures))]
+    if any(a > b for (a, _), (b, _) in pairwise(timed)):
+        notices.append("the times of the pictures go back; pictures are sorted by them")
+        timed.sort(key=lambda pair: pair[0])
+    stamps_ns: list[int] = []
+    for stamp_ns, _ in timed:
+        stamps_ns.append(max(stamp_ns, stamps_ns[-1] + SHIFT_NS) if stamps_ns else stamp_ns)
+    shifted = sum(mine != given for mine, (given, _) in zip(stamps_ns, timed, strict=True))
+    if shifted:
+        notices.append(f"{counted(shifted, 'picture')} with the time of another one; stamps are put behind it by 1 ms")
+    return [picture for _, picture in timed], stamps_ns

@@ -9,7 +9,6 @@ The depth of this export is OpenEXR, which is not read: frames come without dept
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -63,9 +62,9 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
         raise ImportSourceError(f"{folder / 'rgb'}: no pictures; export as 'EXR + RGB'")
     pictures: list[PosedPicture] = []
     left_out: list[str] = []
-    for number, image in images.items():
+    for (number, image), seconds in zip(images.items(), _seconds(found, list(images)), strict=True):
         try:
-            pictures.append(_picture(found, number, image))
+            pictures.append(_picture(found, number, image, seconds))
         except ValueError as error:  # FrameError, too
             left_out.append(f"{image}: {error}")
     if left_out:
@@ -75,9 +74,6 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     missing = len(found.poses) - len(images)
     if missing > 0:
         notices.append(f"{counted(missing, 'pose')} without a picture in {folder / 'rgb'}")
-    if any(a.stamp_ns > b.stamp_ns for a, b in pairwise(pictures)):  # type: ignore[operator]
-        notices.append(f"{file}: frameTimestamps go back; pictures are sorted by them")
-        pictures.sort(key=lambda picture: picture.stamp_ns or 0)
     scale = DepthScale(1000.0, convention="no depth image is read")
     opened = PosedPictures("record3d", folder, pictures, options, depth_scale=scale, metric=True)
     opened.notices += notices
@@ -86,7 +82,16 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     return opened
 
 
-def _picture(found: _Metadata, number: int, image: Path) -> PosedPicture:
+def _seconds(found: _Metadata, numbers: list[int]) -> list[float]:
+    """Time of each picture, from 0; one that is missing lies between its neighbours."""
+    told = [(number, time) for number, time in enumerate(found.frame_times) if time is not None]
+    if not told:
+        return [number / found.fps for number in numbers]
+    known, times = np.array(told, np.float64).T
+    return (np.interp(np.array(numbers, np.float64), known, times) - times.min()).tolist()
+
+
+def _picture(found: _Metadata, number: int, image: Path, seconds: float) -> PosedPicture:
     """Raises: ValueError: the picture has no pose, or intrinsics."""
     row = np.array(found.poses[number] if number < len(found.poses) else None, np.float64)
     if row.shape != (7,) or not np.isfinite(row).all() or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
@@ -99,9 +104,6 @@ def _picture(found: _Metadata, number: int, image: Path) -> PosedPicture:
     if len(k) < 4:
         raise ValueError("it has no intrinsics: neither K nor 4 numbers of perFrameIntrinsicCoeffs")
     fx, fy, cx, cy = k
-    times = [time for time in found.frame_times if time is not None]
-    told = found.frame_times[number] if number < len(found.frame_times) else None
-    seconds = number / found.fps if told is None else told - min(times)
     return PosedPicture(
         image, CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, found.w, found.h), T, stamp_ns=round(seconds * 1e9)
     )

@@ -28,6 +28,7 @@ from semantic_mapper.replay.importers.base import (
     LoadedFrame,
     Skipped,
     check_frame_pose,
+    depth_files,
     image_size_must_be,
     numbered_files,
     read_depth_if_there,
@@ -76,11 +77,10 @@ class ReplicaRecording:
         self._camera_id = options.camera_id
         self._hz = options.frame_hz or RENDER_HZ
         self._color = list(numbered_files(folder / "rgb", (".png",), self.notices).items())
-        self._depth = numbered_files(folder / "depth", (".png", ".npy"), self.notices)
+        self._depth = depth_files(folder / "depth", options, self.depth_scale, self.notices)
         self._labels = numbered_files(folder / "semantic_class", (".png",), self.notices)
-        self._without_depth = options.without_depth
         self._rows = read_lines(folder / _TRAJECTORY)
-        self._check_counts()
+        self._check_counts(options)
         self._intrinsics = self._find_intrinsics()
         labels = self._read_label_set() if self._labels else None
         self.info = StreamInfo(
@@ -104,8 +104,7 @@ class ReplicaRecording:
         rgb, encoded = read_rgb(file)
         image_size_must_be(rgb, self._intrinsics, file)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth_file = None if self._without_depth else self._depth.get(name)
-        depth = read_depth_if_there(depth_file, DEPTH_SCALE, size)
+        depth = read_depth_if_there(self._depth.get(name), DEPTH_SCALE, size)
         label, label_error = None, None
         if self.info.label_set is not None:
             label_file = self._labels.get(name, self._folder / "semantic_class" / f"semantic_class_{name}.png")
@@ -125,10 +124,10 @@ class ReplicaRecording:
         )
         return LoadedFrame(frame, encoded, label_error)
 
-    def _check_counts(self) -> None:
+    def _check_counts(self, options: ImportOptions) -> None:
         if not self._color:
             raise ImportSourceError(f"{self._folder / 'rgb'}: no images rgb_0.png, rgb_1.png, ...")
-        if not self._depth:
+        if not self._depth and not options.without_depth:
             raise ImportSourceError(f"{self._folder / 'depth'}: no images depth_0.png, depth_1.png, ...")
         last = self._color[-1][0]
         if last >= len(self._rows):

@@ -143,13 +143,16 @@ def compressed_depth_image(message: Any, units_per_m: float = UNITS_PER_M) -> Fl
         return _metres(np.where(values > 0, a / (values.astype(np.float32) - b), 0).astype(np.float32))
 
 
-def intrinsics(info: Any, K: NDArray[np.float64], D: NDArray[np.float64], *, rectified: bool) -> CameraIntrinsics:
+def intrinsics(
+    info: Any, K: NDArray[np.float64], D: NDArray[np.float64], size: tuple[int, int], *, rectified: bool
+) -> CameraIntrinsics:
     """Intrinsics of a ``sensor_msgs/CameraInfo``.
 
     Args:
         info: The message; its matrices are called differently in ROS 1 and 2, so the caller hands them in.
         K: (9,) of the raw image, or (12,) of the rectified one (P).
         D: Coefficients of the lens.
+        size: (width, height) of the images.
         rectified: The image is: its lens distortion has been removed already.
 
     Raises:
@@ -168,8 +171,8 @@ def intrinsics(info: Any, K: NDArray[np.float64], D: NDArray[np.float64], *, rec
         raise ImportSourceError(f"{where} is not calibrated ({matrix} is zero): calibrate the camera, and record again")
     try:
         if rectified:
-            return CameraIntrinsics(fx, fy, cx, cy, info.width, info.height)
-        return lens_intrinsics(info.distortion_model, D.tolist(), (fx, fy, cx, cy), (info.width, info.height))
+            return CameraIntrinsics(fx, fy, cx, cy, *size)
+        return lens_intrinsics(info.distortion_model, D.tolist(), (fx, fy, cx, cy), size)
     except ConfigError as error:
         raise ImportSourceError(
             f"{where} cannot be used: {error}; or rectify the images (image_proc), and name that topic"

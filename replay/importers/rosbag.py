@@ -136,6 +136,7 @@ class RosbagRecording:
             infos[depth.name] = self._info_topic(depth, depth_info)
         self._tree = TransformTree()
         self._stamps: dict[str, list[tuple[int, int]]] = {t.name: [] for t in (color, depth) if t is not None}
+        self._first_image: dict[str, Any] = {}  # of each of these topics
         calibrations, poses = self._read_all({*infos.values(), *self._bag.topics(_INFO)})
         self._color, self._color_topic = self._stamps[color.name], color
         self._measured = self._intrinsics(color, calibrations[infos[color.name]], infos[color.name])
@@ -363,6 +364,7 @@ class RosbagRecording:
             if name in self._stamps:
                 stamp_ns = stamp_of(message.header)
                 unstamped += not stamp_ns
+                self._first_image.setdefault(name, message)
                 self._stamps[name].append((stamp_ns or received_ns, received_ns))
             elif name in calibrations:
                 calibrations[name].append(message)
@@ -385,7 +387,8 @@ class RosbagRecording:
                 f"{name}: {counted(len(infos) - len(good), 'message')} without a calibration passed over"
             )
         try:
-            found = [self._bag.intrinsics(info, rectified=topic.rectified) for info in good or infos[:1]]
+            size = self._size(topic, infos)
+            found = [self._bag.intrinsics(info, size, rectified=topic.rectified) for info in good or infos[:1]]
         except ImportSourceError as error:
             raise ImportSourceError(f"{self._bag.src}: {topic.name}: {error}") from error
         if any(k.distortion != found[0].distortion or not _one_lens(found[0], k) for k in found):
@@ -394,6 +397,20 @@ class RosbagRecording:
                 "has zoomed or the size was switched; cut the bag where it does"
             )
         return found[0]
+
+    def _size(self, topic: _Topic, infos: list[Any]) -> tuple[int, int] | None:
+        """(width, height) of the first image, where a calibration does not tell it."""
+        image = self._first_image.get(topic.name)
+        if image is None or all(info.width and info.height for info in infos):
+            return None
+        self.notices.append(f"the camera_info of {topic.name} tells no size; that of its first image is taken")
+        if topic.raw:
+            return image.width, image.height
+        try:
+            rgb, _ = ros_images.compressed_color_image(image)
+        except CodecError:  # reported when its turn comes
+            return None
+        return rgb.shape[1], rgb.shape[0]
 
     def _link_depth(self, depth: _Topic, own: CameraIntrinsics | None) -> None:
         """How depth comes to the pixels of colour.
@@ -487,7 +504,7 @@ class RosbagRecording:
             if own is None or info is None or frame_name(info.header.frame_id) != frame_name(own.header.frame_id):
                 continue
             try:
-                a, b = (self._bag.intrinsics(i, rectified=False) for i in (own, info))
+                a, b = (self._bag.intrinsics(i, None, rectified=False) for i in (own, info))
             except ImportSourceError:  # of a lens that is not undone: another camera's
                 continue
             comparable = "depth" not in other.lower() and same_view((a.width, a.height), (b.width, b.height))
@@ -679,11 +696,12 @@ class _Bag:
             self._streams.pop(name, None)
             raise CodecError(f"cannot be read: {error}") from error
 
-    def intrinsics(self, info: Any, *, rectified: bool) -> CameraIntrinsics:
+    def intrinsics(self, info: Any, size: tuple[int, int] | None, *, rectified: bool) -> CameraIntrinsics:
         """See ``ros_images.intrinsics``."""
         K, D, P = self._matrices(info)
         rectified = rectified and bool(np.any(P) or np.any(D))  # a pinhole camera's driver may leave P empty
-        return ros_images.intrinsics(info, P if rectified else K, D, rectified=rectified)
+        size = (info.width, info.height) if (info.width and info.height) or size is None else size
+        return ros_images.intrinsics(info, P if rectified else K, D, size, rectified=rectified)
 
     def depth_units(self, depth: str) -> float | None:
         """Units per metre of depth that the RealSense Viewer has recorded; None of other bags."""

@@ -65,7 +65,7 @@ _MARKS = {
     "scannet": ("color", "depth", "pose"),
     "replica": ("rgb", "depth", "traj_w_c.txt"),
     "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
-    "polycam": ("keyframes/images", "keyframes/cameras"),
+    "polycam": ("keyframes",),
     "record3d": ("rgb", "metadata.json"),
     "transforms": ("transforms.json",),
     "colmap": ("sparse", "images"),

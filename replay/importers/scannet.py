@@ -31,6 +31,7 @@ from semantic_mapper.replay.importers.base import (
     LoadedFrame,
     Skipped,
     check_frame_pose,
+    depth_files,
     numbered_files,
     read_depth,
     read_depth_if_there,
@@ -66,15 +67,18 @@ class ScanNetRecording:
         self._camera_id = options.camera_id
         self._hz = options.frame_hz or SENSOR_HZ
         self._color = list(numbered_files(folder / "color", PICTURES, self.notices).items())
-        self._depth = numbered_files(folder / "depth", (".png", ".npy"), self.notices)
-        self._without_depth = options.without_depth
+        self._depth = depth_files(folder / "depth", options, self.depth_scale, self.notices)
         self._poses = numbered_files(folder / "pose", (".txt",), self.notices)
         names = [name for name in ("label-filt", "label") if (folder / name).is_dir()]
         self._labels = numbered_files(folder / names[0], (".png",), self.notices) if names else {}
         self._has_label = bool(self._labels)
         self._nyu40_of_raw = self._read_table()
         self._color_intrinsics = self._read_intrinsics("color", [file for _, file in self._color])
-        self._intrinsics = self._read_intrinsics("depth", list(self._depth.values()))
+        self._intrinsics = (
+            self._color_intrinsics
+            if options.without_depth
+            else self._read_intrinsics("depth", list(self._depth.values()))
+        )
         self._check_extrinsics()
         self.info = StreamInfo(
             source=f"scannet {folder.resolve().name}",
@@ -96,8 +100,7 @@ class ScanNetRecording:
         name, color_file = self._color[number]
         pose = self._pose(name)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth_file = None if self._without_depth else self._depth.get(name)
-        depth = read_depth_if_there(depth_file, self.depth_scale, size)
+        depth = read_depth_if_there(self._depth.get(name), self.depth_scale, size)
         rgb, encoded = self._rgb(color_file)
         label, label_error = None, None
         if self._has_label:

@@ -40,7 +40,7 @@ from semantic_mapper.replay.importers.base import (
     unknown_notice,
 )
 from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures
-from semantic_mapper.types import CameraIntrinsics, Float64
+from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
 
 FILE = "transforms.json"
 MAX_BYTES = 1 << 29  # hours of frames at 60 Hz
@@ -83,6 +83,7 @@ class _Frame(_Lens, kw_only=True):
     transform_matrix: list[list[float]] | None = None
     depth_file_path: str | None = None
     depth_path: str | None = None
+    timestamp: float | None = None  # in a unit that nothing tells
 
 
 class _Transforms(_Lens, kw_only=True):
@@ -124,10 +125,13 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     )
     size = _common_size(folder, found, [frame for _, frame in frames])
     pictures: list[PosedPicture] = []
+    unit_ns = _time_unit([frame.timestamp for _, frame in frames], file, notices)
     for number, frame in frames:
         try:
             pictures.append(
-                _picture(folder, found, frame, size, axes, f"{file}, frame {number} ('{frame.file_path[:80]}')")
+                _picture(
+                    folder, found, frame, size, axes, unit_ns, f"{file}, frame {number} ('{frame.file_path[:80]}')"
+                )
             )
         except ImportSourceError as error:
             left_out.append(str(error))
@@ -171,11 +175,6 @@ def _depth_scale(
         scale = DepthScale(
             1000.0, convention="nerfstudio's millimetres; another unit belongs into depth_unit_scale_factor"
         )
-        if any(depth.suffix == ".npy" for depth in there) and not options.without_depth:
-            said.append(
-                "depth of NumPy's files with a point is taken as metres, or as millimetres where half of it is above "
-                "100; depth_unit_scale_factor says otherwise"
-            )
     measured = bool(there) and not options.without_depth
     if measured and options.scale is not None:
         said.append(
@@ -218,14 +217,39 @@ def _image(folder: Path, frame: _Frame) -> Path:
     return next((p for s in _SUFFIXES if (p := named.with_name(named.name + s)).is_file()), named)
 
 
+def _time_unit(times: Sequence[float | None], file: Path, notices: list[str]) -> float:
+    """Nanoseconds of the unit of the frames' times: that of Unix times by their size, else by the usual gap."""
+    told = np.sort([time for time in times if time is not None and time >= 0])
+    if not len(told):
+        return 1e9
+    gap = float(np.median(np.diff(told))) if len(told) > 1 else 0.0
+    steps = (
+        sum(told[-1] > 1e11 * 1000**n for n in range(3))
+        if told[-1] > 1e8
+        else sum(gap > 10 * 1000**n for n in range(3))
+    )
+    name = ("seconds", "milliseconds", "microseconds", "nanoseconds")[steps]
+    rate = f", {1000**steps / gap:.3g} frames a second" if gap else ""
+    notices.append(f"{file}: 'timestamp' is read as {name}{rate}")
+    return 1e9 / 1000**steps
+
+
 def _picture(
-    folder: Path, all_frames: _Transforms, frame: _Frame, size: tuple[int, int] | None, axes: Float64, where: str
+    folder: Path,
+    all_frames: _Transforms,
+    frame: _Frame,
+    size: tuple[int, int] | None,
+    axes: Float64,
+    unit_ns: float,
+    where: str,
 ) -> PosedPicture:
     image = _image(folder, frame)
     T_world_gl = _matrix(frame.transform_matrix, image)
     depth = frame.depth_file_path or frame.depth_path
     lens = _intrinsics(all_frames, frame, size, where)
-    return PosedPicture(image, lens, T_world_gl @ axes, None if not depth else inside(folder, depth))
+    time = frame.timestamp
+    stamp_ns = round(time * unit_ns) if time is not None and 0 <= time * unit_ns < MAX_STAMP_NS else None
+    return PosedPicture(image, lens, T_world_gl @ axes, None if not depth else inside(folder, depth), stamp_ns)
 
 
 def _matrix(rows: list[list[float]] | None, image: Path) -> Float64:

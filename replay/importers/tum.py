@@ -28,6 +28,7 @@ from semantic_mapper.replay.importers.base import (
     check_frame_pose,
     image_size_must_be,
     inside,
+    numpy_notice,
     read_depth,
     read_lines,
     read_rgb,
@@ -84,6 +85,7 @@ class TumRecording:
             round(options.match_s * 1e9),
         )
         self._depth_files = [file for _, file in depth]
+        self.notices += numpy_notice(self._depth_files, self.depth_scale)
         self.info = StreamInfo(
             source=f"tum {folder.resolve().name}",
             cameras={options.camera_id: self._intrinsics},

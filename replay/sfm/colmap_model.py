@@ -66,12 +66,14 @@ class ColmapModel:
         images: In the order of their names, by the numbers in these.
         points: (3,) of each point by its id.
         errors_px: Mean reprojection error of each point, by its id.
+        left_out: Why images are left out.
     """
 
     cameras: dict[int, CameraIntrinsics]
     images: tuple[ColmapImage, ...]
     points: dict[int, Float64]
     errors_px: dict[int, float]
+    left_out: tuple[str, ...] = ()
 
 
 def find_models(folder: Path) -> list[Path]:
@@ -94,8 +96,8 @@ def read_model(folder: Path) -> ColmapModel:
     """Read the model in a folder; binary files come before text.
 
     Raises:
-        ImportSourceError: a file is missing, cut off, or holds something else; a camera that is no pinhole camera with
-            a lens of OpenCV's model.
+        ImportSourceError: a file is missing, cut off, or holds something else; no image has a pose and a camera with a
+            lens of OpenCV's models.
     """
     binary = all((folder / f"{name}.bin").exists() for name in _NAMES[:2])
     kind = "bin" if binary else "txt"
@@ -103,18 +105,33 @@ def read_model(folder: Path) -> ColmapModel:
     for file in files[:2]:
         if not file.exists():
             raise ImportSourceError(f"{file}: missing; a model has cameras, images and points3D, .bin or .txt")
-    cameras = dict(_cameras_bin(files[0]) if binary else _cameras_txt(files[0]))
-    images = sorted(
-        _images_bin(files[1]) if binary else _images_txt(files[1]), key=lambda image: numeric_order(image.name)
-    )
+    cameras: dict[int, CameraIntrinsics] = {}
+    broken: dict[int, str] = {}
+    for camera in _cameras_bin(files[0]) if binary else _cameras_txt(files[0]):
+        try:
+            cameras[camera.number] = intrinsics_of(
+                camera.model, camera.width, camera.height, camera.params, camera.where
+            )
+        except ImportSourceError as error:
+            broken[camera.number] = str(error)
+    images: list[ColmapImage] = []
+    left_out: list[str] = []
+    for row in _images_bin(files[1]) if binary else _images_txt(files[1]):
+        try:
+            if row.camera_id not in cameras:
+                missing = f"{files[1]}: image '{row.name}' has camera {row.camera_id}, which is missing"
+                raise ImportSourceError(broken.get(row.camera_id, missing))
+            images.append(_image(row, files[1]))
+        except ImportSourceError as error:
+            left_out.append(str(error))
+    if left_out and not images:
+        raise ImportSourceError(left_out[0])
+    images.sort(key=lambda image: numeric_order(image.name))
     rows = () if not files[2].exists() else _points_bin(files[2]) if binary else _points_txt(files[2])
     points, errors = {}, {}
     for number, xyz, error in rows:
         points[number], errors[number] = xyz, error
-    for image in images:
-        if image.camera_id not in cameras:
-            raise ImportSourceError(f"{files[1]}: image '{image.name}' has camera {image.camera_id}, which is missing")
-    return ColmapModel(cameras, tuple(images), points, errors)
+    return ColmapModel(cameras, tuple(images), points, errors, tuple(left_out))
 
 
 def intrinsics_of(model: str, width: int, height: int, params: list[float], where: str) -> CameraIntrinsics:
@@ -128,6 +145,12 @@ def intrinsics_of(model: str, width: int, height: int, params: list[float], wher
         raise ImportSourceError(f"{where}: camera model '{model}' with {len(params)} parameters is not known")
     one_focal = model.startswith(("SIMPLE", "RADIAL"))
     fx, fy, cx, cy, *lens = (params[0], *params) if one_focal else params
+    if model == "FOV" and not any(lens):
+        model = "PINHOLE"
+    if model == "THIN_PRISM_FISHEYE":  # k1 k2 p1 p2 k3 k4 sx1 sy1
+        k1, k2, p1, p2, k3, k4, *prism = lens
+        if not any((p1, p2, *prism)):
+            model, lens = "OPENCV_FISHEYE", [k1, k2, k3, k4]
     fisheye = model in ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
     if not fisheye and model not in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"):
         raise ImportSourceError(
@@ -189,7 +212,26 @@ _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 _TRACK = np.dtype([("image", "<i4"), ("feature", "<i4")])
 
 
-def _cameras_bin(file: Path) -> Iterator[tuple[int, CameraIntrinsics]]:
+@dataclass(frozen=True, slots=True)
+class _CameraRow:
+    number: int
+    model: str
+    width: int
+    height: int
+    params: list[float]
+    where: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ImageRow:
+    name: str
+    camera_id: int
+    pose: list[float]  # QW QX QY QZ TX TY TZ
+    xy: Float64
+    point_ids: Int64
+
+
+def _cameras_bin(file: Path) -> Iterator[_CameraRow]:
     data = _Bytes(file)
     for _ in range(data.count()):
         number, model, width, height = (int(n) for n in data.numbers("iiQQ"))
@@ -197,17 +239,17 @@ def _cameras_bin(file: Path) -> Iterator[tuple[int, CameraIntrinsics]]:
             raise ImportSourceError(f"{file}: camera {number} has model {model}, which is not known")
         name, count = MODELS[model]
         params = list(data.numbers(f"{count}d"))
-        yield number, intrinsics_of(name, width, height, params, f"{file}, camera {number}")
+        yield _CameraRow(number, name, width, height, params, f"{file}, camera {number}")
 
 
-def _images_bin(file: Path) -> Iterator[ColmapImage]:
+def _images_bin(file: Path) -> Iterator[_ImageRow]:
     data = _Bytes(file)
     for _ in range(data.count()):
         _, *pose, camera = data.numbers("i7di")
         name = data.text()
         rows = data.array(_FEATURE, data.count())
         xy = np.stack((rows["x"], rows["y"]), axis=1) - 0.5
-        yield _image(name, int(camera), pose, xy, rows["point"].astype(np.int64), f"{file}, image '{name}'")
+        yield _ImageRow(name, int(camera), pose, xy, rows["point"].astype(np.int64))
 
 
 def _points_bin(file: Path) -> Iterator[tuple[int, Float64, float]]:
@@ -218,17 +260,17 @@ def _points_bin(file: Path) -> Iterator[tuple[int, Float64, float]]:
         yield int(number), np.array((x, y, z)), float(error)
 
 
-def _cameras_txt(file: Path) -> Iterator[tuple[int, CameraIntrinsics]]:
+def _cameras_txt(file: Path) -> Iterator[_CameraRow]:
     for line, words in _lines(file):
         try:
             number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
             params = [float(word) for word in words[4:]]
         except (ValueError, IndexError) as error:
             raise _bad_line(file, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", error) from error
-        yield number, intrinsics_of(model, width, height, params, f"{file}, line {line}")
+        yield _CameraRow(number, model, width, height, params, f"{file}, line {line}")
 
 
-def _images_txt(file: Path) -> Iterator[ColmapImage]:
+def _images_txt(file: Path) -> Iterator[_ImageRow]:
     """Two lines an image; the second one, its features, may be empty."""
     rows = iter(_lines(file, empty=True))
     for line, words in rows:
@@ -247,7 +289,7 @@ def _images_txt(file: Path) -> Iterator[ColmapImage]:
         except ValueError as error:
             raise _bad_line(file, line, "X Y POINT3D_ID ...", error) from error
         points = features[:, 2].astype(np.int64)
-        yield _image(name, camera, pose, features[:, :2] - 0.5, points, f"{file}, image '{name}'")
+        yield _ImageRow(name, camera, pose, features[:, :2] - 0.5, points)
 
 
 def _points_txt(file: Path) -> Iterator[tuple[int, Float64, float]]:
@@ -258,12 +300,14 @@ def _points_txt(file: Path) -> Iterator[tuple[int, Float64, float]]:
             raise _bad_line(file, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]", error) from error
 
 
-def _image(name: str, camera: int, pose: list[float], xy: Float64, points: Int64, where: str) -> ColmapImage:
-    w, x, y, z, *t = pose
-    if not np.isfinite(pose).all() or not abs(np.linalg.norm((w, x, y, z)) - 1) < 0.1:
-        raise ImportSourceError(f"{where}: its pose is no unit quaternion QW QX QY QZ and position TX TY TZ")
+def _image(row: _ImageRow, file: Path) -> ColmapImage:
+    w, x, y, z, *t = row.pose
+    if not np.isfinite(row.pose).all() or not abs(np.linalg.norm((w, x, y, z)) - 1) < 0.1:
+        raise ImportSourceError(
+            f"{file}, image '{row.name}': its pose is no unit quaternion QW QX QY QZ and position TX TY TZ"
+        )
     T_camera_world = pose_matrix(np.array(t), np.array((x, y, z, w)))
-    return ColmapImage(name, camera, invert_pose(T_camera_world), xy, points)
+    return ColmapImage(row.name, row.camera_id, invert_pose(T_camera_world), row.xy, row.point_ids)
 
 
 def _lines(file: Path, *, empty: bool = False) -> Iterator[tuple[int, list[str]]]:

@@ -138,3 +138,15 @@ def test_what_is_wrong_with_a_yaml_calibration_is_told(tmp_path: Path, text: str
 def test_a_fisheye_calibration_is_written_and_read_back(tmp_path: Path) -> None:
     save_calibration(tmp_path / "camera.toml", FISHEYE, None, {})
     assert load_calibration(tmp_path / "camera.toml") == FISHEYE
+
+
+def test_a_calibration_of_opencv_is_read(tmp_path: Path) -> None:
+    storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 64)
+    storage.write("image_height", 48)
+    storage.write("camera_matrix", np.array([[50.0, 0, 31], [0, 51, 23], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([[0.1, 0.01, 0, 0, 0]]))
+    storage.release()
+    k = load_calibration(tmp_path / "camera.yml")
+    assert (k.fx, k.fy, k.cx, k.cy, k.width, k.height) == (50, 51, 31, 23, 64, 48)
+    assert k.distortion == (0.1, 0.01, 0.0, 0.0)

@@ -288,10 +288,10 @@ def test_what_is_wrong_with_a_reconstruction_is_told(tmp_path: Path) -> None:
     report, frames = imported(folder)
     assert len(frames) == 4 and "2 parts" in " ".join(report.notices)
     for changes, says in (
-        ({"cameras": {}}, "camera 'v2 dji', which is missing"),
+        ({"cameras": {}}, "camera 'v2 dji' is missing"),
         ({"shots": {}}, "no posed picture"),
         ({"shots": {"../a.jpg": {"rotation": [0, 0, 0], "translation": [0, 0, 0], "camera": "v2 dji"}}}, "outside"),
-        ({"shots": {"a.jpg": {"rotation": [0, 0], "translation": [0, 0, 0], "camera": "v2 dji"}}}, "rotation"),
+        ({"shots": {"DJI_0.JPG": {"rotation": [0, 0], "translation": [0, 0, 0], "camera": "v2 dji"}}}, "rotation"),
     ):
         (folder / "reconstruction.json").write_text(whole)
         change(folder, **changes)

@@ -32,6 +32,7 @@ from tests.small import tiny_frames
 from . import bags
 from . import recordings as rec
 from .bags import CAMERA, COLOR, DEPTH, DEPTH_INFO, INFO, Event, Messages
+from .test_import_gps import flight, make_opensfm
 from .test_import_posed import H, W, add_depth, imported, make_colmap, make_record3d, make_transforms
 from .test_import_rosbag import FRAMES, make
 
@@ -477,7 +478,7 @@ def test_record3d_falls_back_to_k_and_its_times_are_sorted(tmp_path: Path) -> No
     folder = make_record3d(tmp_path / "phone", perFrameIntrinsicCoeffs=own, frameTimestamps=[7.5, 7.0, None])
     report, frames = imported(folder)
     assert len(frames) == 3 and sorted(frame.intrinsics.fy for frame in frames) == [50.0, 50.0, 51.0]
-    assert "frameTimestamps go back" in said(report)
+    assert "times of the pictures go back" in said(report)
 
 
 def test_parts_of_a_bag_are_joined_however_their_suffix_is_written(tmp_path: Path) -> None:
@@ -496,3 +497,127 @@ def test_windows_paths_are_found_and_lead_nowhere_else(tmp_path: Path) -> None:
     (folder / "transforms.json").write_text(text.replace("images", ".."))
     with pytest.raises(ImportSourceError, match="outside of it"):
         imported(folder)
+
+
+@pytest.mark.parametrize(
+    ("times", "said_unit", "stamps_ms"),
+    [
+        ([1.7e9, 1.7e9 + 0.5, 1.7e9 + 1.5], "seconds, 1.33 frames", [1.7e12, 1.7e12 + 500, 1.7e12 + 1500]),
+        ([0, 33, 66], "milliseconds, 30.3 frames", [0, 33, 66]),
+        ([1_700_000_000_000_000, 1_700_000_000_500_000, 1_700_000_001_000_000], "microseconds, 2 frames", None),
+        ([5.0, 4.0, 4.0], "seconds", [4000, 4001, 5000]),
+    ],
+)
+def test_the_times_of_frames_are_used_and_their_unit_is_said(
+    tmp_path: Path, times: list[float], said_unit: str, stamps_ms: list[float] | None
+) -> None:
+    folder = make_transforms(tmp_path / "nerf")
+    found = json.loads((folder / "transforms.json").read_text())
+    for frame, time in zip(found["frames"], times, strict=True):
+        frame["timestamp"] = time
+    (folder / "transforms.json").write_text(json.dumps(found))
+    report, frames = imported(folder)
+    assert f"'timestamp' is read as {said_unit}" in said(report) and "made up" not in said(report)
+    got = [frame.stamp_ns / 1e6 for frame in frames]
+    assert got == (stamps_ms or [1.7e12, 1.7e12 + 500, 1.7e12 + 1000])
+    assert ("time of another one" in said(report)) == (times[2] == times[1])
+
+
+def test_a_time_that_is_missing_makes_all_stamps_up_and_says_so(tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "nerf")
+    found = json.loads((folder / "transforms.json").read_text())
+    found["frames"][0]["timestamp"] = 3.0
+    (folder / "transforms.json").write_text(json.dumps(found))
+    report, frames = imported(folder)
+    assert "2 of 3 pictures have no time: stamps are made up" in said(report)
+    assert [frame.stamp_ns for frame in frames] == [0, 500_000_000, 1_000_000_000]
+
+
+def test_the_capture_times_and_broken_shots_of_opensfm(tmp_path: Path) -> None:
+    folder = make_opensfm(tmp_path / "flight", flight(5))
+    file = folder / "reconstruction.json"
+    (model,) = json.loads(file.read_text())
+    for n, shot in enumerate(model["shots"].values()):
+        shot["capture_time"] = 1.7e9 + n
+    names = sorted(model["shots"])
+    model["shots"][names[1]]["rotation"] = [float("nan"), 0, 0]
+    model["shots"][names[2]]["camera"] = "another"
+    model["cameras"]["unused"] = {"width": 10, "height": 10, "projection_type": "dual"}
+    file.write_text(json.dumps([model]))
+    report, frames = imported(folder)
+    assert [frame.stamp_ns for frame in frames] == [1_700_000_000 * 10**9, 1_700_000_003 * 10**9, 1_700_000_004 * 10**9]
+    assert "2 pictures left out" in said(report) and "made up" not in said(report)
+
+
+@pytest.mark.parametrize("what", ["pose", "camera", "lens"])
+def test_a_broken_image_or_camera_of_colmap_costs_its_images_only(tmp_path: Path, what: str) -> None:
+    folder = make_colmap(tmp_path / "scan", "txt")
+    sparse = folder / "sparse" / "0"
+    lines = (sparse / "images.txt").read_text().splitlines()
+    words = lines[3].split(" ")
+    words[1 if what == "pose" else 8] = "9.0" if what == "pose" else "2"
+    lines[3] = " ".join(words)
+    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    if what == "lens":
+        with (sparse / "cameras.txt").open("a") as file:
+            file.write(f"2 FOV {W} {H} 50 50 {W / 2} {H / 2} 0.9\n")
+    report, frames = imported(folder)
+    assert len(frames) == 2 and "1 image left out" in said(report)
+    assert {"pose": "no unit quaternion", "camera": "is missing", "lens": "'FOV' is not read"}[what] in said(report)
+
+
+@pytest.mark.parametrize("row", ["FOV {} 50 50 32 24 0", "THIN_PRISM_FISHEYE {} 50 50 32 24 0.1 0 0 0 0 0.01 0 0"])
+def test_lenses_of_colmap_are_judged_by_their_values(tmp_path: Path, row: str) -> None:
+    folder = make_colmap(tmp_path / "scan", "txt")
+    (folder / "sparse" / "0" / "cameras.txt").write_text(f"1 {row.format(f'{W} {H}')}\n")
+    frames = imported(folder)[1]
+    assert len(frames) == 3 and (frames[0].intrinsics.fx == 50) == row.startswith("FOV")
+
+
+def test_one_row_of_timestamps_that_is_no_time_costs_its_frame(tmp_path: Path) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    (folder / "timestamps.txt").write_text("1.0\n1.5\nnan\n2.5\n3.0\n3.5\n")
+    report, frames = imported(folder)
+    assert [frame.stamp_ns for frame in frames] == [10**9 * n // 2 for n in (2, 3, 5, 6, 7)]
+    assert "row 3 is no time" in report.skipped[0].reason
+
+
+def test_the_number_that_tells_files_apart_counts(tmp_path: Path) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    for part in ("color", "depth"):
+        for file in list((folder / part).iterdir()):
+            file.rename(file.with_name(f"cam0_{file.name}"))
+    report, frames = imported(folder)
+    assert len(frames) == report.with_depth == 6 and "left out" not in said(report)
+
+
+def test_depth_in_npz_and_rows_in_brackets_are_read(tmp_path: Path) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    before = imported(folder)[1][1]
+    assert before.depth_m is not None
+    for file in (folder / "depth").iterdir():
+        np.savez(file.with_suffix(".npz"), depth=np.full(before.depth_m.shape, 1500, np.uint16))
+        file.unlink()
+    rows = (folder / "poses.txt").read_text().splitlines()
+    (folder / "poses.txt").write_text("\n".join(f"[{', '.join(row.split())}]" for row in rows))
+    report, frames = imported(folder)
+    assert report.with_depth == 6 and "NumPy's files is taken as metres" in said(report)
+    assert frames[1].depth_m is not None and (frames[1].depth_m == 1.5).all()
+    assert (frames[1].T_world_camera == before.T_world_camera).all()
+
+
+def test_depth_of_scannet_is_left_out_where_it_is_asked_for(tmp_path: Path) -> None:
+    folder = rec.make_scannet(tmp_path / "scene0000_00")
+    for file in (folder / "depth").iterdir():
+        file.unlink()
+    report, frames = imported(folder, topics={"depth": "none"})
+    assert frames and report.with_depth == 0
+
+
+def test_a_camera_info_without_a_size_takes_that_of_the_images(tmp_path: Path) -> None:
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        return [(topic, ns, replace(x, width=0, height=0) if topic == INFO else x) for topic, ns, x in events]
+
+    report, frames = imported(make(tmp_path, "mcap", change))
+    assert frames and "tells no size" in said(report)
+    assert frames[0].intrinsics == FRAMES[0].intrinsics

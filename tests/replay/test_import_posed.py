@@ -58,7 +58,7 @@ def make_transforms(folder: Path, form: str = "frame_{:05d}.png", count: int = 3
 def test_poses_of_transforms_json_change_axes_and_keep_their_unit(tmp_path: Path) -> None:
     report, frames = imported(make_transforms(tmp_path / "nerf"))
     assert (report.format, report.frames, report.info.scale_known) == ("transforms", 3, False)
-    assert "scale is unknown" in report.notices[0]
+    assert "stamps are made up at 2 frames a second" in report.notices[0] and "scale is unknown" in report.notices[1]
     for frame, T in zip(frames, poses(), strict=True):
         assert np.allclose(frame.T_world_camera, T, atol=1e-12)
         assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (F, 31.5, 23.5)
@@ -92,7 +92,7 @@ def add_depth(folder: Path) -> Path:
 @pytest.mark.parametrize("k1", [0.0, 0.3])
 def test_depth_of_transforms_json_is_read_and_makes_its_poses_metric(tmp_path: Path, k1: float) -> None:
     report, frames = imported(add_depth(make_transforms(tmp_path / "nerf", k1=k1)))
-    assert report.info.scale_known and report.with_depth == 3 and not report.notices
+    assert report.info.scale_known and report.with_depth == 3 and "stamps are made up" in report.notices[0]
     depth = frames[1].depth_m
     assert depth is not None and np.allclose(depth[H // 2 + 1 :], 1.501) and (depth[: H // 2 - 1] == 0).all()
 
