@@ -9,7 +9,7 @@ import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.replay import MaxFramesOption
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.process import StopRequest
 
 LISTED = 10  # frames without a label, and damages, that are shown one by one
@@ -57,6 +57,7 @@ def autolabel(
 
     Example: semantic-mapper autolabel kitchen.mcap --weights kitchen.safetensors --out labelled.mcap
     """
+    must_be_there(*log)
     output = Output.guarded()
     output.quiet = json
     from semantic_mapper.nodes.cli.log_info import autolabel_rows

@@ -9,7 +9,7 @@ import typer
 
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.replay import ConfigOption, MaxFramesOption
-from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb, warn_of_old_name
+from semantic_mapper.nodes.cli.verb import PrintJsonOption, must_be_there, results_file, verb, warn_of_old_name
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -107,6 +107,7 @@ def evaluate(
         raise typer.BadParameter("is an option of `semantic-mapper benchmark rooms`", param_hint="this")
     if baselines and seconds == 0:
         raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
+    must_be_there(*targets or ())
     baseline_s = BASELINE_SECONDS if seconds is None else seconds
     from semantic_mapper.nodes.cli.run_replay import mapper_config
 

@@ -10,7 +10,7 @@ import typer
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.label import frame_numbers
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.process import StopRequest
 
 FinetuneDepthOption = Annotated[
@@ -116,6 +116,7 @@ def finetune(
     _refuse_mixed(weights, from_scratch, kind, keyframes, frames, labels, unlabelled, variant, boxes, pseudo, uncovered)
     if strokes and kind in ("grid", "panoptic"):
         raise typer.BadParameter(f"--kind {kind} learns from no strokes", param_hint="--strokes")
+    must_be_there(log)
     output = Output.guarded()
     import msgspec
 

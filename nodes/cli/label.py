@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 
@@ -101,6 +101,7 @@ def label(
             "--teacher": teacher,
         },
     )
+    must_be_there(log)
     output = Output.guarded()
     if serve:
         return _serve(output, log, numbers, suggest, out or log.with_name(f"{log.stem}-labels"), classes, weights, port)

@@ -26,7 +26,7 @@ from semantic_mapper.nodes.cli.replay import (
     WeightsOption,
     map_exit_code,
 )
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.process import StopRequest
 
 
@@ -63,6 +63,7 @@ def map_(
     Example: semantic-mapper map film.mp4 --out runs/film
     Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
+    must_be_there(source)
     output = Output.guarded()
     from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
     from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film, recording_scale

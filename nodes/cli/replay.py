@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.verb import EXIT_UNTRUSTED, verb
+from semantic_mapper.nodes.cli.verb import EXIT_UNTRUSTED, must_be_there, verb
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.summary import dig
 
@@ -89,6 +89,7 @@ def replay(
 
     Example: semantic-mapper replay kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
     """
+    must_be_there(*log)
     output = Output.guarded()
     from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, ReplayRequest, mapper_config, replay_log
     from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table

@@ -18,7 +18,7 @@ import typer
 from rich.text import Text
 from typer.core import TyperCommand
 
-from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.nodes.cli.console import stderr_console
 from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.process import prepare_process
@@ -108,6 +108,17 @@ def results_file(out: Path | None, json: Path | None) -> tuple[Path | None, bool
     if out is not None and out.is_file() and out.suffix != ".json":
         raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
     return out, print_json
+
+
+def must_be_there(*recordings: Path) -> None:
+    """Refuse what is missing at once, before the packages that read it are loaded.
+
+    Raises:
+        LogError: one of them is missing.
+    """
+    for path in recordings:
+        if not path.exists():
+            raise LogError(f"{path}: cannot be read: no such file or folder")
 
 
 def warn_of_old_name(old: str, new: str) -> None:
