@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +93,17 @@ def test_an_untrusted_network_leaves_the_smoothed_votes(noisy: TrainingMap) -> N
     torch.testing.assert_close(found[:, :-3], expected[:, :-3])
 
 
-def test_training_repeats_bit_for_bit(noisy: TrainingMap) -> None:
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Several threads add gradients in an order that changes."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_training_on_one_thread_repeats_bit_for_bit(noisy: TrainingMap) -> None:
     config = NesfTrainConfig(steps=3, field=NesfConfig(width=2), labelled_voxels=200)
     one, other = (train_nesf(config, ROOMS, [noisy], [noisy]).model.state_dict() for _ in range(2))
     assert all((one[name] == other[name]).all() for name in one)
