@@ -179,7 +179,7 @@ def contents(store: Path) -> dict[str, tuple[Mapping[str, Any], str]]:
 def _check_files(store: Path, result: TaskResult) -> None:
     folder = store / result.folder
     sizes = {p.relative_to(folder).as_posix(): p.stat().st_size for p in folder.rglob("*") if p.is_file()}
-    if sizes != result.files:
+    if sizes != {name: file.bytes for name, file in result.files.items()}:
         raise RuntimeError(f"{store}: the files of {result.log} are not those that its result names")
 
 

@@ -373,8 +373,8 @@ def _thumbnail(store: Store, row: Mapping[str, Any]) -> Picture | None:
     if not name:
         return None
     try:
-        data = store.read(name)
-    except StoreError as error:
+        data = store.read_result_file(row["folder"], row["thumbnail"])
+    except (ConfigError, StoreError) as error:
         _log.warning("thumbnail_missing", log=row["log"], error=str(error))
         return None
     pixels = None

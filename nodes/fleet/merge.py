@@ -53,7 +53,7 @@ from semantic_mapper.mapping.files.tiles import (
 )
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.nodes.fleet.cluster import Cluster
-from semantic_mapper.nodes.fleet.store import Store, open_store
+from semantic_mapper.nodes.fleet.store import Store, check_result_file, open_store
 from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url
 from semantic_mapper.queries.tiles import describe_tile
 from semantic_mapper.types import Float64
@@ -440,6 +440,8 @@ def _caught(function: Callable[..., _R], job: tuple[Any, ...]) -> tuple[_R | Non
 
 def _read_facts(url: str, name: str) -> MapFacts:
     with _local(url) as path, open_map(path) as reader:
+        with path.open("rb") as file:
+            check_result_file(url, hashlib.file_digest(file, "sha256").hexdigest())
         places = frozenset(
             hashlib.sha256(f"{p.camera_id} {p.stamp_ns} ".encode() + p.descriptors.tobytes()).digest()
             for p in reader.places()

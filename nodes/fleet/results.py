@@ -80,6 +80,18 @@ class Findings(msgspec.Struct, frozen=True):
     report: str = ""
 
 
+class ResultFile(msgspec.Struct, frozen=True):
+    """A file of a result.
+
+    Args:
+        bytes: Its size.
+        sha256: Of its content.
+    """
+
+    bytes: int
+    sha256: str
+
+
 class TaskResult(msgspec.Struct, frozen=True):
     """``result.json`` of a task; that it is there says that the task is done.
 
@@ -96,7 +108,7 @@ class TaskResult(msgspec.Struct, frozen=True):
         version: Of the code, for people: version and git revision.
         code: Digest of the code.
         findings: What was found.
-        files: Bytes of each file by its name below ``folder``.
+        files: Size and digest of each file by its name below ``folder``.
         folder: Of the files, below the store: "results/KEY/ATTEMPT".
         attempts: How many it took.
         seconds: Of the attempt, without queueing.
@@ -116,7 +128,7 @@ class TaskResult(msgspec.Struct, frozen=True):
     version: str
     code: str
     findings: Findings
-    files: dict[str, int]
+    files: dict[str, ResultFile]
     folder: str
     attempts: int
     seconds: float

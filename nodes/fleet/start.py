@@ -12,7 +12,7 @@ from semantic_mapper.fields.nesf import SHIPPED, SMOOTHING, load_nesf
 from semantic_mapper.nodes.fleet.code_version import code_digest
 from semantic_mapper.nodes.fleet.operations import changed_settings, read_settings
 from semantic_mapper.nodes.fleet.scratch import task_folder
-from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.store import Store, check_result_file
 from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url
 from semantic_mapper.nodes.fleet.worker import Task, file_digest, stored_weights
 
@@ -79,6 +79,7 @@ def _find_weights(operation: str, store: Store, weights: str | None) -> tuple[st
             except WeightsError as error:
                 raise WeightsError(str(error).replace(str(local), shown(weights))) from error
             digest = file_digest(local)
+            check_result_file(weights, digest)
             place = stored_weights(digest, name)
             if not store.exists(place):
                 store.upload(local, place)

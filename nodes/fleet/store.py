@@ -8,7 +8,9 @@ half a result. Nothing is locked, so nothing is left locked by what was killed.
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
+import re
 import secrets
 import shutil
 import socket
@@ -28,13 +30,15 @@ from semantic_mapper.nodes.fleet.results import (
     decode_result,
     encode_document,
 )
-from semantic_mapper.nodes.fleet.urls import TRIES, persistently, shown, split_store_url
+from semantic_mapper.nodes.fleet.urls import TRIES, persistently, shown, split_store_url, split_url
 
 STORE_FORMAT = "semantic-mapper-fleet"
 STORE_VERSION = 1
 RESULT_FILE = "result.json"
 _MARK = "fleet.json"
 _AT_ONCE = 256  # documents that are read together; bounds memory
+
+_OF_RESULT = re.compile(r"(?P<task>.*/results/(?P<key>[0-9a-f]{40}))/(?P<attempt>[^/]+)/(?P<name>[^?#]+)", re.DOTALL)
 
 _T = TypeVar("_T")
 
@@ -236,21 +240,42 @@ class Store:
         """Of a task; None where it is not done.
 
         Raises:
-            ConfigError: it is damaged.
+            ConfigError: it is damaged, or of another task.
         """
         name = f"results/{key}/{RESULT_FILE}"
         data = self._read_or_none(name)
-        return None if data is None else decode_result(data, f"{self.shown}/{name}")
+        return None if data is None else _result_of(key, data, f"{self.shown}/{name}")
+
+    def read_result_file(self, folder: str, name: str) -> bytes:
+        """All bytes of a file of a result.
+
+        Args:
+            folder: Of the result, "results/KEY/ATTEMPT".
+            name: Below it.
+
+        Raises:
+            ConfigError: the result is damaged, or of another task.
+            StoreError: file or result is missing, the file is not what the result names, or the store cannot be
+                reached.
+        """
+        data = self.read(f"{folder}/{name}")
+        result = self.result(folder.split("/")[1] if "/" in folder else "")
+        _check_file(result, folder, name, hashlib.sha256(data).hexdigest(), f"{self.shown}/{folder}/{name}")
+        return data
 
     def keys(self) -> list[str]:
         """Of all tasks that were begun, sorted; ``results`` leaves out those that are not done."""
         return self.names("results")
 
     def results(self, keys: Iterable[str] | None = None) -> Iterator[TaskResult]:
-        """Of all tasks that are done, or of those among ``keys``; a bounded number is in memory."""
+        """Of all tasks that are done, or of those among ``keys``; a bounded number is in memory.
+
+        Raises:
+            ConfigError: one is damaged, or of another task.
+        """
         names = (f"results/{key}/{RESULT_FILE}" for key in (self.keys() if keys is None else keys))
         for name, data in self.read_many(names):
-            yield decode_result(data, f"{self.shown}/{name}")
+            yield _result_of(name.split("/")[1], data, f"{self.shown}/{name}")
 
     def commit(self, result: TaskResult) -> bool:
         """Make a result count; False where another attempt has been quicker, and this one's files are removed."""
@@ -315,6 +340,51 @@ def _link(draft: Path, target: Path) -> None:
 def _move(file: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.move(file, target)
+
+
+def _result_of(key: str, data: bytes, where: str) -> TaskResult:
+    result = decode_result(data, where)
+    if result.key != key or not result.folder.startswith(f"results/{key}/"):
+        raise ConfigError(
+            f"{where}: is the result of another task ({result.key}, {result.log}); delete it, and `fleet run` does the "
+            "task again"
+        )
+    return result
+
+
+def _check_file(result: TaskResult | None, folder: str, name: str, digest: str, where: str) -> None:
+    if result is None:
+        raise StoreError(f"{where}: its result is missing; `fleet run` does the task again")
+    file = result.files.get(name) if result.folder == folder else None
+    if file is None or file.sha256 != digest:
+        raise StoreError(
+            f"{where}: is damaged, or not the file that {RESULT_FILE} names; delete that, and `fleet run` does "
+            "the task again"
+        )
+
+
+def check_result_file(url: str, digest: str) -> None:
+    """Check a file that was read against its result, where it is one of a store: "STORE/results/KEY/ATTEMPT/NAME".
+
+    Args:
+        url: Path or URL of the file.
+        digest: SHA-256 of what was read.
+
+    Raises:
+        ConfigError: the result is damaged, or of another task.
+        StoreError: it is not the file that the result names, or the store cannot be reached.
+    """
+    fs, path = split_url(url)
+    match = _OF_RESULT.fullmatch(path)
+    if match is None:
+        return
+    where = shown(url)
+    try:
+        data = persistently(lambda: fs.cat_file(f"{match['task']}/{RESULT_FILE}"), where)
+    except FileNotFoundError:
+        return
+    result = _result_of(match["key"], data, where)
+    _check_file(result, f"results/{match['key']}/{match['attempt']}", match["name"], digest, where)
 
 
 def open_store(url: str) -> Store:

@@ -21,9 +21,9 @@ from semantic_mapper.config import convert_config
 from semantic_mapper.errors import FleetError, LogError, SemanticMapperError, StoreError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.code_version import code_digest, code_version
-from semantic_mapper.nodes.fleet.results import Findings, TaskResult
+from semantic_mapper.nodes.fleet.results import Findings, ResultFile, TaskResult
 from semantic_mapper.nodes.fleet.scratch import DiskError, scratch_root, task_folder
-from semantic_mapper.nodes.fleet.store import Store, open_store
+from semantic_mapper.nodes.fleet.store import Store, check_result_file, open_store
 from semantic_mapper.nodes.fleet.urls import persistently, shown, split_url, unstripped
 
 CHUNK_BYTES = 8 << 20  # of a download; a cut connection costs no more
@@ -178,11 +178,11 @@ def _make_result(
 ) -> Literal["done", "exists"]:
     """Put files and result into the store; after an error nothing of them stays."""
     attempt = f"results/{key}/{secrets.token_hex(6)}"
-    files: dict[str, int] = {}
+    files: dict[str, ResultFile] = {}
     try:
         for path in sorted(p for p in out.rglob("*") if p.is_file()):
             name = path.relative_to(out).as_posix()
-            files[name] = path.stat().st_size
+            files[name] = ResultFile(path.stat().st_size, file_digest(path))
             store.take(path, f"{attempt}/{name}")
     except StoreError:
         store.remove(attempt, folder=True)
@@ -269,14 +269,24 @@ def _fetch(url: str, files: list[_File], folder: Path, *, local: bool) -> tuple[
     """The log as a local file or folder, and the digest of its content."""
     if local:
         path = Path(split_url(url)[1])
-        digests = [file_digest(Path(split_url(file.url)[1])) for file in files]
+        digests = [_checked_digest(file, Path(split_url(file.url)[1])) for file in files]
         return path, _joined(digests)
     target = folder / "log"
     target.mkdir()
     paths = [target / _file_name(file.url) for file in files]
-    fetched = [(path, _download(file, path)) for file, path in zip(files, paths, strict=True)]
-    path = target if len(fetched) > 1 else fetched[0][0]
-    return path, _joined([digest for _, digest in fetched])
+    digests = [_download(file, path) for file, path in zip(files, paths, strict=True)]
+    return target if len(paths) > 1 else paths[0], _joined(digests)
+
+
+def _checked_digest(file: _File, path: Path) -> str:
+    """SHA-256 of a file that was read; maps of another operation's results are those that it has made.
+
+    Raises:
+        StoreError: this one is not.
+    """
+    digest = file_digest(path)
+    check_result_file(file.url, digest)
+    return digest
 
 
 def _file_name(url: str) -> str:
@@ -298,13 +308,14 @@ def _download(file: _File, target: Path) -> str:
     fs, path = split_url(file.url)
     if "http" in fs.protocol:  # servers that know no ranges
         persistently(lambda: fs.get_file(path, str(target)), shown(file.url))
-        return file_digest(target)
+        return _checked_digest(file, target)
     digest = hashlib.sha256()
     with target.open("wb") as out:
         for start in range(0, file.size, CHUNK_BYTES):
             data = persistently(lambda: _chunk(fs, path, start, file.size), shown(file.url))  # noqa: B023
             digest.update(data)
             out.write(data)
+    check_result_file(file.url, digest.hexdigest())
     return digest.hexdigest()
 
 

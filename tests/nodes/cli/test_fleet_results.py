@@ -218,6 +218,16 @@ def test_worst_logs_of_eval_have_the_pictures_of_replay(tmp_path: Path) -> None:
     assert both.count("data:image/jpeg") == 6 and "Pictures are of replay with the same weights." in both
 
 
+def test_an_exchanged_picture_is_not_shown(tmp_path: Path) -> None:
+    store = store_of(tmp_path / "store", [])
+    made = [with_files(store, made_up(number)) for number in range(2)]
+    for result in made:
+        assert store.commit(result)
+    store.write(f"{made[0].folder}/overview.png", store.read(f"{made[1].folder}/overview.png"))
+    page = fleet_report.write_fleet_report(store, tmp_path / "page").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg") == 1
+
+
 def test_worst_logs_are_those_with_most_of_a_metric_of_which_less_is_better(tmp_path: Path) -> None:
     results = []
     for number in range(3):

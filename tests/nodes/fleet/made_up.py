@@ -11,7 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.nodes.fleet.results import ClassRow, EventRow, Findings, SegmentRow, TaskResult
+from semantic_mapper.nodes.fleet.results import ClassRow, EventRow, Findings, ResultFile, SegmentRow, TaskResult
 from semantic_mapper.nodes.fleet.store import Store
 
 NAMES = ("wall", "floor", "chair", "lamp")
@@ -98,5 +98,6 @@ def with_files(store: Store, result: TaskResult) -> TaskResult:
     store.write(f"{result.folder}/overview.png", png)
     store.write(f"{result.folder}/report.html", page)
     findings = msgspec.structs.replace(result.findings, thumbnail="overview.png", report="report.html")
-    files = {"overview.png": len(png), "report.html": len(page)}
+    contents = {"overview.png": png, "report.html": page}
+    files = {n: ResultFile(len(data), hashlib.sha256(data).hexdigest()) for n, data in contents.items()}
     return msgspec.structs.replace(result, findings=findings, files=files)

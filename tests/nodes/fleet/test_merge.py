@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import random
@@ -19,7 +20,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ConfigError, FleetError, MapError
+from semantic_mapper.errors import ConfigError, FleetError, MapError, StoreError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import Place, make_place
@@ -30,12 +31,14 @@ from semantic_mapper.nodes.cli.saved_maps import holds_tiles
 from semantic_mapper.nodes.fleet import merge as merge_module
 from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.fleet.merge import Alignment, MergeReport, map_names, merge_maps, read_poses, run_on_ray
+from semantic_mapper.nodes.fleet.results import ResultFile
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.tile_reading import open_tiles
 from semantic_mapper.types import Float64
 from tests.mapping.files.test_merge import fuse_views, turned
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_voxel_map import same
+from tests.nodes.fleet.made_up import made_up
 from tests.nodes.support import run
 
 _R = TypeVar("_R")
@@ -235,6 +238,17 @@ def test_maps_that_cannot_be_merged_are_refused_before_anything_is_written(maps:
     with pytest.raises(MapError, match="no such map file"):
         merged([*maps, str(tmp_path / "none.npz")], tmp_path / "store")
     assert sorted(os.listdir(tmp_path / "store")) == ["fleet.json"]
+
+
+def test_an_exchanged_map_of_a_fleet_is_refused(maps: list[str], tmp_path: Path) -> None:
+    results = Store(str(tmp_path / "results of a fleet"), create=True)
+    made = made_up(0)
+    data = Path(maps[0], "map.npz").read_bytes()
+    file = ResultFile(len(data), hashlib.sha256(data).hexdigest())
+    results.commit(msgspec.structs.replace(made, files={"map.npz": file}))
+    results.write(f"{made.folder}/map.npz", Path(maps[1], "map.npz").read_bytes())
+    with pytest.raises(StoreError, match="is damaged, or not the file"):
+        merged([f"{results.url}/{made.folder}", maps[2]], tmp_path / "store", poses={})
 
 
 def test_maps_of_the_same_frames_are_refused_by_name(maps: list[str], tmp_path: Path) -> None:

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+import hashlib
 import threading
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from semantic_mapper.errors import ConfigError, StoreError
-from semantic_mapper.nodes.fleet.results import Failure, decode_result, encode_document, without_costs
-from semantic_mapper.nodes.fleet.store import Store, open_store
+from semantic_mapper.nodes.fleet.results import Failure, ResultFile, decode_result, encode_document, without_costs
+from semantic_mapper.nodes.fleet.store import Store, check_result_file, open_store
 from tests.nodes.fleet.documents import made_result
 
 
@@ -135,6 +137,36 @@ def test_a_damaged_result_says_what_to_do(store: Store) -> None:
     store.write("results/k/result.json", b"{")
     with pytest.raises(ConfigError, match="delete it"):
         store.result("k")
+
+
+def test_a_result_of_another_task_is_refused(store: Store) -> None:
+    for changed in ({}, {"key": "other"}):
+        data = encode_document(replace(made_result("k"), **changed))
+        store.write("results/other/result.json", data)
+        with pytest.raises(ConfigError, match=r"results/other/result.json: is the result of another task .*delete it"):
+            store.result("other")
+        with pytest.raises(ConfigError, match="another task"):
+            list(store.results())
+
+
+def test_an_exchanged_file_of_a_result_is_refused(store: Store) -> None:
+    key, good, bad = "a" * 40, b"right", b"wrong"
+    files = {"map.npz": ResultFile(len(good), hashlib.sha256(good).hexdigest())}
+    made = made_result(key, files=files)
+    store.write(f"{made.folder}/map.npz", good)
+    with pytest.raises(StoreError, match="its result is missing"):
+        store.read_result_file(made.folder, "map.npz")
+    store.commit(made)
+    url = f"{store.url}/{made.folder}/map.npz"
+    assert store.read_result_file(made.folder, "map.npz") == good
+    check_result_file(url, files["map.npz"].sha256)
+    check_result_file("/logs/results/kitchen/run/map.npz", "of a file of no store")
+    store.write(f"{made.folder}/map.npz", bad)
+    with pytest.raises(StoreError, match="is damaged, or not the file"):
+        store.read_result_file(made.folder, "map.npz")
+    for other in (url, url.replace("/one/", "/two/")):
+        with pytest.raises(StoreError, match="is damaged, or not the file"):
+            check_result_file(other, hashlib.sha256(bad).hexdigest())
 
 
 def test_quarantine_can_be_left_again(store: Store) -> None:
