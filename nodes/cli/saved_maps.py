@@ -54,7 +54,7 @@ def holds_tiles(source: str) -> bool:
     """Whether a map in tiles is meant, as `fleet merge` writes it: a folder with their manifest, this, or a URL."""
     scheme, found, _ = source.partition("://")
     path = Path(source)
-    return scheme not in SOCKETS if found else path.name == TILES_NAME or (path / TILES_NAME).is_file()
+    return scheme not in SOCKETS if scheme and found else path.name == TILES_NAME or (path / TILES_NAME).is_file()
 
 
 def refuse_overwriting(out: Path, *sources: Path) -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from semantic_mapper.backoff import backoff_s
 from semantic_mapper.errors import ConfigError, DependencyError, FleetError, StoreError
@@ -17,6 +18,8 @@ from semantic_mapper.redaction import CHAIN, HIDDEN, NAMING_SCHEMES, user_length
 TRIES = 8
 FIRST_PAUSE_S, MAX_PAUSE_S = 0.5, 15.0
 
+# Of addresses with a host and perhaps a port; a bucket is neither.
+_HOST_SCHEMES = ("http", "https", "ftp", "sftp", "ssh", "smb", "hdfs", "webhdfs")
 _SCHEME = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*)://(.*)", re.DOTALL)
 _log = get_logger(__name__)
 _T = TypeVar("_T")
@@ -31,7 +34,7 @@ def split_url(url: str) -> tuple[Any, str]:
     """The fsspec file system of a path or URL, and the path in it, without a slash at its end.
 
     Raises:
-        ConfigError: an unknown scheme.
+        ConfigError: an unknown scheme, or no host or port that can be.
         FleetError: a password in the URL.
         DependencyError: the extra ``fleet``, or the package for this scheme, is missing.
     """
@@ -40,6 +43,7 @@ def split_url(url: str) -> tuple[Any, str]:
     except ModuleNotFoundError as error:
         raise DependencyError(f'a fleet needs more packages ({error}): pip install "semantic-mapper[fleet]"') from error
     refuse_credentials(url)
+    _check_hosts(url)
     if not is_url(url) or url.startswith("file://"):
         url = str(Path(url.removeprefix("file://")).absolute())
     try:
@@ -91,6 +95,25 @@ def refuse_credentials(url: str) -> None:
                 "in its environment (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, GOOGLE_APPLICATION_CREDENTIALS), in "
                 "~/.aws, or in fsspec's configuration (~/.config/fsspec)"
             )
+
+
+def _check_hosts(url: str) -> None:
+    """Check host and port: packages raise whatever they like for them, or try again and again.
+
+    Raises:
+        ConfigError: there is none of the two that can be.
+    """
+    for part in url.split(CHAIN):
+        if _split(part)[0].lower() not in _HOST_SCHEMES:
+            continue
+        try:
+            address = urlsplit(part)
+            host, _ = address.hostname or "", address.port
+            host.encode("idna")
+        except ValueError as error:
+            raise ConfigError(f"{shown(url)}: is no address ({error}); write SCHEME://HOST:PORT/PATH") from error
+        if not host or re.search(r"\s", host):
+            raise ConfigError(f"{shown(url)}: names no host; write SCHEME://HOST:PORT/PATH")
 
 
 def _shown_part(url: str) -> str:

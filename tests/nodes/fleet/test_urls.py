@@ -70,6 +70,22 @@ def test_an_unknown_scheme_is_a_clear_error() -> None:
         split_url("gopher://host/x")
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://[",
+        "http://127.0.0.1:99999/x",
+        "http://[::1]:0x/x",
+        "http:///x",
+        "http://a..b/x",
+        "zip://a::ftp://h:x/a.zip",
+    ],
+)
+def test_an_address_that_cannot_be_is_refused_before_it_is_requested(url: str) -> None:
+    with pytest.raises(ConfigError, match=r"write SCHEME://HOST:PORT/PATH"):
+        split_url(url)
+
+
 def test_what_fails_is_tried_again() -> None:
     calls = []
 
