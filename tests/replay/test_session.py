@@ -46,6 +46,13 @@ def run(weights, frames, rerun=None, depth="auto", **options):
     return session
 
 
+def test_results_of_an_earlier_map_go(tmp_path):
+    for name in ("eval.json", "eval.html", "compare.png", "report.html", "room.mcap"):
+        (tmp_path / name).touch()
+    artifacts.clear_results(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["room.mcap"]
+
+
 def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     session = run(weights, tiny_frames(), rerun=tmp_path / "run.rrd")
     summary = session.finish(tmp_path / "out")
