@@ -74,7 +74,8 @@ def read_boxes(path: Path) -> BoxFile:
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} is neither JSON nor XML: {error}") from error
+        reason = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
+        raise ConfigError(f"{path} is neither JSON nor XML: {reason}") from error
     listed, read, merge = _listed(data, path)
     good: list[tuple[int, Primitive]] = []
     bad: list[BadBox] = []

@@ -134,7 +134,8 @@ def _options(
     """Posed camera frames in, live semantic 3D map out.
 
     Start with `semantic-mapper demo`. Each verb explains itself: `semantic-mapper replay --help`. Results go to
-    stdout, messages to stderr. Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage, 130 Ctrl-C.
+    stdout, messages to stderr. Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage, 3 a map that
+    cannot be trusted (`map`, `replay`), 130 Ctrl-C.
     """
     Settings.verbose = verbose
 

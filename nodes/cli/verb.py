@@ -1,7 +1,7 @@
 """What all verbs of the command line share: process set-up, one clear line for an error, exit codes.
 
-0 done; 1 failed; 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM (what was done so far is written where a verb says
-so); 1 too where a result is negative (``doctor`` finds something missing).
+0 done; 1 failed; 2 wrong usage; 3 a map that cannot be trusted; 130 after Ctrl-C, 143 after SIGTERM (what was done so
+far is written where a verb says so); 1 too where a result is negative (``doctor`` finds something missing).
 """
 
 from __future__ import annotations
@@ -110,15 +110,17 @@ def results_file(out: Path | None, json: Path | None) -> tuple[Path | None, bool
     return out, print_json
 
 
-def must_be_there(*recordings: Path) -> None:
+def must_be_there(*paths: Path) -> None:
     """Refuse what is missing at once, before the packages that read it are loaded.
 
     Raises:
-        LogError: one of them is missing.
+        LogError: one of them is missing, or neither a file nor a folder.
     """
-    for path in recordings:
+    for path in paths:
         if not path.exists():
             raise LogError(f"{path}: cannot be read: no such file or folder")
+        if not path.is_file() and not path.is_dir():
+            raise LogError(f"{path}: cannot be read: it is no regular file; copy its content to one")
 
 
 def warn_of_old_name(old: str, new: str) -> None:

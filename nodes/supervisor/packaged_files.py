@@ -25,7 +25,7 @@ def find_launch(path: Path) -> Path:
         path: Of a file, or a bare name ("replay" or "replay.toml").
 
     Raises:
-        ConfigError: neither is there; lists those of the package.
+        ConfigError: it is a folder, or neither is there; lists those of the package.
     """
     if path.exists() and not path.is_dir():
         return path
@@ -33,5 +33,7 @@ def find_launch(path: Path) -> Path:
     name = path.name.removesuffix(".toml")
     if path.parent == Path() and name in files and name != UNIT:
         return files[name]
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a folder; name a launch file in it")
     names = ", ".join(name for name in files if name != UNIT)
     raise ConfigError(f"{path}: no such file; launch files that come with the package: {names}")

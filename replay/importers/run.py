@@ -100,6 +100,8 @@ def detect_format(src: Path) -> str:
         return "rosbag"
     if src.is_file():
         raise ImportSourceError(f"{src}: {_what_file(src)}")
+    if not src.is_dir():
+        raise ImportSourceError(f"{src}: is neither a file nor a folder; copy its content to one")
     for name in _MARKS:
         if name not in _NOT_ENOUGH and not _lacks(src, name):
             return name

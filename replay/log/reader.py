@@ -109,6 +109,9 @@ class LogReader:
         except LogError:
             self._file.close()
             raise
+        except OSError as error:  # of a failing disk, or of a file that is none
+            self._file.close()
+            raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
 
     def __len__(self) -> int:
         """Frames in the log, those included that turn out to be damaged when they are read."""

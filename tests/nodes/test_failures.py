@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,23 @@ def test_python_s_own_errors_of_names_and_numbers_are_one_line() -> None:
     assert "4,300 digits" in failure_message(raised_by(lambda: str(10**5000)))
     assert failure_message(raised_by(lambda: Path("/none/at/all").stat())) == "/none/at/all: No such file or directory"
     assert failure_message(raised_by(lambda: int("nine"))) == "", "a bug keeps its traceback"
+
+
+def test_what_is_no_file_is_refused_by_its_name(tmp_path: Path) -> None:
+    (folder := tmp_path / "dir.toml").mkdir()
+    os.mkfifo(pipe := tmp_path / "pipe")
+    (big := tmp_path / "big.json").write_text('{"boxes": [{"id": ' + "9" * 5000 + "}]}", encoding="utf-8")
+    for words, said in (
+        (("up", folder), f"{folder}: is a folder; name a launch file in it"),
+        (("info", "/proc/self/mem"), "/proc/self/mem: cannot be read: Input/output error"),
+        (("map", pipe, "--out", tmp_path / "o"), f"{pipe}: cannot be read: it is no regular file"),
+        (("import", pipe, tmp_path / "o.mcap"), f"{pipe}: is neither a file nor a folder"),
+        (("query", "://", "info"), "://: no endpoint; endpoints read"),
+        (("boxes", big, "list"), "value has 5000 digits"),
+    ):
+        code, shown = run_here(*map(str, words))
+        assert code == 1 and said in " ".join(shown.split()), shown
+        assert "sys.set_int" not in shown
 
 
 @pytest.mark.parametrize(

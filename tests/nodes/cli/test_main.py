@@ -28,6 +28,8 @@ def test_help_lists_all_verbs() -> None:
     done = run("--help")
     assert done.returncode == 0
     assert all(f"  {verb} " in done.stdout for verb in VERBS)
+    codes = " ".join(done.stdout.split()).partition("Exit codes: ")[2].partition(".")[0]
+    assert [word for word in codes.replace(",", " ").split() if word.isdigit()] == ["0", "1", "2", "3", "130"]
 
 
 def test_version_is_that_of_the_package() -> None:
