@@ -45,6 +45,22 @@ class Source(Protocol):
         ...
 
 
+def check_places(texts: Sequence[str]) -> None:
+    """Check that files and folders among the sources are there, before the packages that read them are loaded.
+
+    Raises:
+        ConfigError: one is not, or has no name for a camera.
+    """
+    for text in texts:
+        _, place = _split(text, alone=len(texts) == 1)
+        kind, colon, _ = place.partition(":")
+        if not (colon and kind in _ADDRESSES) and not Path(place).is_file() and not Path(place).is_dir():
+            raise ConfigError(
+                f"{place}: neither a folder of pictures, a log (.mcap) or video that is there, nor a camera as "
+                f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper cameras` lists them)"
+            )
+
+
 def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
     """Sources as ``[NAME=]PLACE``, see ``calibrate``.
 
@@ -118,11 +134,7 @@ def _camera_source(name: str, place: str, size: str) -> Source:
         live = kind != "opencv" or "://" in address
         camera = open_camera(kind, config, name, place)
         return _Camera(camera, live=live, known=kind in _KEEPS_INTRINSICS)
-    if not Path(place).is_file():
-        raise ConfigError(
-            f"{place}: neither a folder of pictures, a log (.mcap) or video that is there, nor a camera as "
-            f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper cameras` lists them)"
-        )
+    check_places([place])
     plain = {"source": place, "uncalibrated": True, "pace": "fast"}
     return _Camera(open_camera("opencv", plain, name, place), live=False, known=False)
 

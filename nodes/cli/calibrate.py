@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -66,6 +64,10 @@ def calibrate(
     Example: semantic-mapper calibrate left=pictures/left right=pictures/right
     """
     output = Output.guarded()
+    from semantic_mapper.nodes.calibration.sources import check_places
+    from semantic_mapper.nodes.cli.outputs import folder_for_results
+
+    check_places(sources or ())
     from semantic_mapper.nodes.calibration.report import report, report_json, write_files, write_stereo
 
     settings = board_settings(config, square_mm)
@@ -75,7 +77,7 @@ def calibrate(
             return
     if not sources:
         raise typer.BadParameter("name a camera, video, log or folder; or --board FILE.png to print a board")
-    with _folder_for_results(out):
+    with folder_for_results(out):
         if stereo:
             name, found, gathered = _calibrate_stereo(sources, settings, size, seconds)
             files = write_stereo(out, name, found, settings)
@@ -129,26 +131,6 @@ def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
             f"{path}: {b.columns} x {b.rows} squares of {1000 * b.square_m:g} mm; print it at 100 %, on "
             "something flat, and measure a square"
         )
-
-
-@contextmanager
-def _folder_for_results(out: Path) -> Iterator[None]:
-    """Make the folder, and remove it again where nothing comes into it.
-
-    Raises:
-        ConfigError: it cannot be made or written to.
-    """
-    from semantic_mapper.nodes.cli.outputs import prepare_folder
-
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        prepare_folder(out)
-        yield
-    except BaseException:
-        for folder in made:
-            with suppress(OSError):  # something is in it
-                folder.rmdir()
-        raise
 
 
 def _calibrate(

@@ -113,8 +113,10 @@ def run(
     """
     output = Output.guarded()
     output.quiet = json
+    from semantic_mapper.nodes.fleet.inputs import check_inputs, find_inputs
+
+    check_inputs(logs)
     from semantic_mapper.nodes.fleet.cluster import connected
-    from semantic_mapper.nodes.fleet.inputs import find_inputs
     from semantic_mapper.nodes.fleet.operations import OPERATIONS, read_settings
     from semantic_mapper.nodes.fleet.runner import FleetRun, Resources
     from semantic_mapper.nodes.fleet.start import make_template

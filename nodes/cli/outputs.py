@@ -6,7 +6,7 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import structlog
@@ -58,13 +58,40 @@ def free_name(path: Path) -> Path:
 
 
 @contextmanager
+def folder_for_results(out: Path) -> Iterator[None]:
+    """Make the folder, and remove it again where an error leaves it empty.
+
+    Raises:
+        ConfigError: it cannot be made or written to.
+    """
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        prepare_folder(out)
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # something is in it
+                folder.rmdir()
+        raise
+
+
+@contextmanager
 def hold_folder(out: Path) -> Iterator[None]:
     """Make the folder for results, and keep other runs out of it for as long as this one lasts.
+
+    Where an error leaves a new folder empty, it is removed again.
 
     Raises:
         ConfigError: it cannot be made or written to, or another run writes its results there.
     """
-    prepare_folder(out)
+    with folder_for_results(out), _lock(out):
+        for left in remove_stale(out):
+            _log.info("unfinished_file_removed", path=str(left))
+        yield
+
+
+@contextmanager
+def _lock(out: Path) -> Iterator[None]:
     folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
@@ -75,8 +102,6 @@ def hold_folder(out: Path) -> Iterator[None]:
             ) from None
         except OSError as error:  # file systems without locks
             _log.warning("folder_not_held", folder=str(out), reason=error.strerror)
-        for left in remove_stale(out):
-            _log.info("unfinished_file_removed", path=str(left))
         yield
     finally:
         os.close(folder)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, must_be_there, verb
 
 _NAMED = 10  # frames that cannot be read
 
@@ -31,13 +31,16 @@ def relocalize(
     Example: semantic-mapper relocalize runs/yesterday today.mcap
     """
     output = Output.guarded()
+    from semantic_mapper.nodes.cli.saved_maps import map_path
+
+    map_file = map_path(saved)
+    must_be_there(log)
     from semantic_mapper.errors import MapError
     from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.nodes.cli.saved_maps import map_path
     from semantic_mapper.replay.log.sequence import open_log
     from semantic_mapper.replay.relocalize import relocalize_frames
 
-    voxel_map = VoxelMap.load(map_path(saved))
+    voxel_map = VoxelMap.load(map_file)
     if not len(voxel_map.places):
         raise MapError(
             f"{saved}: has nothing to find oneself by: it was made without depth, by an older release, or with "

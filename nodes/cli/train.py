@@ -11,7 +11,7 @@ import typer
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.fleet_run import TrustedOption
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.process import StopRequest
 
 
@@ -56,6 +56,7 @@ def train(
     Example: semantic-mapper train --config recipes/cpu-2h.toml --out runs/rooms --half
     Example: semantic-mapper train --config recipes/nesf-rooms.toml --out runs/nesf
     """
+    must_be_there(*(path for path in (config,) if path is not None))
     output = Output.guarded()
     from semantic_mapper.config import convert_config, load_config, to_plain
     from semantic_mapper.errors import ConfigError

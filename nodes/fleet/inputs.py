@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_
 MANIFEST_SUFFIXES = (".csv", ".parquet")
 LOG_COLUMN = "log"
 MAX_MANIFEST_BYTES = 1 << 28
+_GLOB = re.compile(r"[*?[]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,17 @@ class LogInput:
 
     url: str
     tags: dict[str, str] = field(default_factory=dict[str, str])
+
+
+def check_inputs(arguments: Sequence[str]) -> None:
+    """Check that local files and folders are there, before the packages that read them are loaded.
+
+    Raises:
+        ConfigError: one is missing.
+    """
+    for argument in arguments:
+        if not is_url(argument) and not _GLOB.search(argument) and not os.path.exists(argument):
+            raise ConfigError(f"{argument}: no such log; give a path, a URL, a glob or a manifest")
 
 
 def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
@@ -67,9 +80,8 @@ def _expand(argument: str, suffix: str) -> Iterator[LogInput]:
     if not is_url(argument) and os.path.exists(path):  # letters of globs may stand in names
         yield LogInput(path)
         return
-    if not any(letter in path for letter in "*?[") or argument.startswith(("http://", "https://")):
-        if not is_url(argument):
-            raise ConfigError(f"{argument}: no such log; give a path, a URL, a glob or a manifest")
+    if not _GLOB.search(path) or argument.startswith(("http://", "https://")):
+        check_inputs([argument])
         yield LogInput(argument)
         return
     folders = argument.endswith("/")

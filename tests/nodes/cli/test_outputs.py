@@ -8,7 +8,7 @@ import pytest
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.outputs import free_name, hold_folder
-from tests.nodes.support import REPLAY_LAUNCH, error_line, run
+from tests.nodes.support import REPLAY_LAUNCH, error_line, run, run_here
 
 
 def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path: Path) -> None:
@@ -22,6 +22,23 @@ def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path
     assert not any(out.iterdir())
     with hold_folder(out), pytest.raises(ConfigError, match="--out"), hold_folder(out):
         pass
+
+
+def test_a_refused_run_leaves_no_empty_folder(tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"no log")
+    (tmp_path / "pictures").mkdir()
+    for words in (("replay", tmp_path / "bad.mcap"), ("map", tmp_path / "bad.mcap"), ("map", tmp_path / "pictures")):
+        code, said = run_here(*words, "--out", tmp_path / "runs" / "out")
+        assert code == 1
+        assert words[1].name in said
+        assert not (tmp_path / "runs").exists()
+
+
+def test_a_stopped_run_keeps_what_it_has_written(tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError), hold_folder(tmp_path / "out"):  # noqa: PT012
+        (tmp_path / "out" / "map.npz").touch()
+        (tmp_path / "out" / "map.npz").touch(exist_ok=False)
+    assert (tmp_path / "out" / "map.npz").exists()
 
 
 def test_a_free_name_is_one_where_nothing_is(tmp_path: Path) -> None:

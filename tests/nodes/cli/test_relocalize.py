@@ -18,7 +18,8 @@ from tests.nodes.support import error_line, run
 
 def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:
     small_map().save(tmp_path / "map.npz")
-    done = run("relocalize", tmp_path / "map.npz", tmp_path / "none.mcap")
+    (tmp_path / "bad.mcap").touch()
+    done = run("relocalize", tmp_path / "map.npz", tmp_path / "bad.mcap")
     assert done.returncode == 1 and "has nothing to find oneself by" in error_line(done.stderr)
 
 
