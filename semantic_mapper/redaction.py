@@ -31,7 +31,8 @@ _BLANKS = rf"[^\s/:@\[]{{1,128}}:(?!{_PORT_THEN})[^\s@](?:(?!://)[^@\n]){{0,256}
 _USER = rf"(?:{_BLANKS})?(?:(?:(?!://|{_NEXT})\S)*{_AT})?"
 _URL = re.compile(
     rf"(?:(?<![\w+.])(?P<scheme>[a-zA-Z][a-zA-Z0-9+.-]{{0,31}})(?P<mark>{_COLON}(?!:){_SLASH}+(?: +(?={_PAIR}))?)"
-    rf"|(?<![\w+.])(?P<known>{_KNOWN})(?P<short>:|{_SLASH}+)(?={_PAIR}))"
+    rf"|(?<![\w+.])(?P<known>{_KNOWN})(?P<short>:)(?={_PAIR})"
+    rf"|(?<![\w+./])(?P<first>{_KNOWN})(?P<slashes>{_SLASH}+)(?={_PAIR}))"
     rf"(?P<rest>{_USER}(?:(?!{_NEXT})[^\s'\"<>()?])*(?:\?(?:(?!{_NEXT})[^\s\"<>])*)?)",
     re.IGNORECASE,
 )
@@ -116,10 +117,10 @@ def user_length(scheme: str, rest: str) -> int:
 
 
 def _shown_match(match: re.Match[str]) -> str:
-    scheme, rest = match["scheme"] or match["known"], match["rest"]
+    scheme, rest = match["scheme"] or match["known"] or match["first"], match["rest"]
     if scheme.lower() == "file":
         return match[0]
-    begin = scheme + (match["mark"] or match["short"])
+    begin = scheme + (match["mark"] or match["short"] or match["slashes"])
     after = rest[len(rest.rstrip(_TRAILING)) :]
     rest = rest[: len(rest) - len(after)]
     length = user_length(scheme, rest)

@@ -103,6 +103,8 @@ def test_messages_without_a_whole_address_do_not_show_its_secret(text: str) -> N
         "/a:b@c",
         "/data/what?/a#b@c.mcap",
         "/data/run:2026-11-27@lab/x.mcap",
+        "/data/s3/run:2026-11-27@lab/x.mcap",
+        "runs/run:2026-11-27@lab.mcap",
         "/data/run:12:30@lab/token=3/x.mcap: cannot be read",
         "runs/a b;c=1.mcap",
         "tcp://127.0.0.1:PORT; without keys",

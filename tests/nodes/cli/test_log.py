@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.importers.run import FORMATS
@@ -38,6 +39,15 @@ def _write_sequence(folder: Path, frames: tuple[PosedFrame, ...]) -> Path:
     labels = sorted({int(i) for f in frames for i in np.unique(f.label) if i})
     (folder / "labels.json").write_text(json.dumps({"classes": {str(i): f"class{i}" for i in labels}}))
     return folder
+
+
+def test_info_as_json_names_the_log_as_it_is_called(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (name := Path("run:2026-11-27@lab.mcap")).symlink_to(log)
+    done = run("info", name, "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode == 0, done.stderr
+    assert (found["log"], found["parts"]) == (str(name), [str(name)])
 
 
 def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(tmp_path: Path) -> None:
