@@ -50,7 +50,8 @@ AcceptOption = Annotated[
 def map_exit_code(summary: Mapping[str, Any], stop: StopRequest, accept_contradictions: bool) -> int:
     """Of a verb that has made a map: that of the signal that stopped it, or 3 where the map cannot be trusted."""
     untrusted = dig(summary, "pose_check.warning") and not accept_contradictions
-    return stop.exit_code or (EXIT_UNTRUSTED if untrusted else 0)
+    empty = not dig(summary, "map.surface_points")
+    return stop.exit_code or (EXIT_UNTRUSTED if untrusted or empty else 0)
 
 
 @verb

@@ -31,6 +31,7 @@ from semantic_mapper.replay.corrected_poses import correct_session, keeping_fram
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.session import MapSession, open_recording
 from semantic_mapper.replay.sfm.film_note import read_left_out
+from semantic_mapper.replay.sfm.scale import fit_to_scene
 from semantic_mapper.types import PosedFrame
 
 REPLAY_DELAY_FRAMES = 6  # that a frame waits for where its depth is computed: nobody waits for the map of a log
@@ -97,7 +98,10 @@ def replay_session(
     with hold_folder(request.out), open_log((request.log, *request.further_parts)) as log:
         for notice in log.notices:
             _log.warning("log_notice", notice=notice)
-        config = request.config if trajectory is None else keeping_frames(request.config, len(log))
+        config, fitted = fit_to_scene(request.config, log.info)
+        if fitted:
+            _log.warning("settings_fitted", to=fitted)
+        config = config if trajectory is None else keeping_frames(config, len(log))
         bundle = Mapper.load(request.weights, config)
         clear_results(request.out)
         session = MapSession(

@@ -56,7 +56,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     if fraction := dig(summary, "depth.computed_fraction"):
         lines.append(
             f"depth: computed from the pictures for {percent(fraction)} of the frames, which have no sensor depth; "
-            "expect a surface some centimetres off, and holes in plain walls"
+            "expect a surface less exact than a sensor's, and holes in plain walls"
         )
     if fraction := dig(summary, "depth.rendered_fraction"):
         lines.append(

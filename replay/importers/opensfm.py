@@ -34,7 +34,7 @@ from semantic_mapper.replay.importers.base import (
 from semantic_mapper.replay.importers.placed import PlacedModel, place_model
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
-from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
+from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth, scene_depth
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
 
 FILE, REFERENCE = "reconstruction.json", "reference_lla.json"
@@ -138,7 +138,8 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     else:
         origin = GpsPosition(reference.latitude, reference.longitude, reference.altitude)
         said = ["scale, up and north are those that OpenSfM found by GPS"]
-        placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin)})
+        far = scene_depth(_depth(file, number, pictures))
+        placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin), **far})
     opened = placed.pictures("opensfm", folder, pictures, options)
     opened.notices += unknown_notice(file, unknown_keys(model.cameras.values(), _Camera))
     unposed = [

@@ -14,7 +14,7 @@ from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.replay.importers.base import DepthScale, ImportOptions
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, place_by_gps, read_position
-from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, upright
+from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, scene_depth, upright
 from semantic_mapper.types import Float64
 
 
@@ -58,6 +58,7 @@ def place_model(
         depth: Tells the median depth of the model's points; 0 = it has none.
     """
     notices: list[str] = []
+    median = depth()
     if options.scale is None:
         try:
             fit = place_by_gps(poses, [read_position(picture.file) for picture in pictures])
@@ -67,8 +68,9 @@ def place_model(
             if fit is not None:
                 said = [f"scale, up and north: {fit}"]
                 moved = np.stack([fit.moved(pose) for pose in poses])
-                return PlacedModel(moved, True, said, {ORIGIN_KEY: str(fit.origin)})
-    median = depth() if options.scale is None else 0.0
+                return PlacedModel(moved, True, said, {ORIGIN_KEY: str(fit.origin), **scene_depth(fit.scale * median)})
     placed = upright(poses[0], camera_up(poses)) @ poses
+    if options.scale is not None:
+        return PlacedModel(placed, False, notices, scene_depth(options.scale * median))
     placed[:, :3, 3] *= UNSCALED_DEPTH_M / median if median > 0 else 1.0
     return PlacedModel(placed, False, notices)

@@ -50,6 +50,7 @@ from semantic_mapper.replay.sfm.scale import (
     marked_place,
     median_depth,
     nearest_frame,
+    scene_depth,
     upright,
 )
 from semantic_mapper.replay.sfm.selection import LEAST_MOTION, STEP, FilmLook, look_through, pick_frames
@@ -574,6 +575,7 @@ class _Import:
             metadata={
                 "poses": "structure from motion",
                 SCALE_KEY: scale or SCALE_UNKNOWN,
+                **scene_depth(median_depth(list(placed.frames.values()))),
                 "stamps": "time within the film",
             }
             | ({} if self._gps is None else {ORIGIN_KEY: str(self._gps.origin)}),

@@ -124,7 +124,7 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
             film,
             "no-matches",
             "no two of its pictures show one place from two sides far enough apart; give --calibration or "
-            f"--focal-prior where the lens is unusual, or {_HOW}",
+            f"--focal-prior where the lens is unusual, film a longer way, or {_HOW}",
         )
     if turn_fraction(outcome.pairs) >= MOST_TURNED:
         raise turning(film)
@@ -139,7 +139,7 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
             film,
             "several-scenes",
             f"falls into parts that do not hang together: {listed}; cut it into one film for each scene, or film again "
-            "without cuts and fast turns, coming back to what was seen before",
+            "a longer way, without cuts and fast turns",
         )
 
 

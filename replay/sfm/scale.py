@@ -6,19 +6,26 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import cv2
+import msgspec
 import numpy as np
 
 from semantic_mapper.bundle.floor import floor_height
+from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.replay.sfm.between import track
+from semantic_mapper.transport.messages import SCENE_DEPTH_KEY, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, Int64, UInt8
 
+StructT = TypeVar("StructT", bound=msgspec.Struct)
+
 UNSCALED_DEPTH_M = 2.0  # median depth of the points of a model whose scale nobody tells
+FAR_SCENE = 0.8  # of the range of the map: with a larger median depth, it would leave out half of the scene
 MIN_ANGLE_DEG = 2.0  # between the rays that a place is found by
 MAX_RAY_ERROR = 0.01  # a place is no further from its rays than this fraction of its distance
 MIN_RAY_FRACTION = 0.5  # of the rays that must do so
@@ -125,6 +132,36 @@ def median_depth(frames: Sequence[PlacedFrame]) -> float:
         (frame.xyz - frame.T_world_camera[:3, 3]) @ frame.T_world_camera[:3, 2] for frame in frames if len(frame.xyz)
     ]
     return float(np.median(np.concatenate(depths)))
+
+
+def scene_depth(depth: float) -> dict[str, str]:
+    """Metadata of a log whose poses come from pictures: the median depth of the points, in the unit of the poses."""
+    return {SCENE_DEPTH_KEY: f"{depth:.3g}"} if depth > 0 else {}
+
+
+def fit_to_scene(config: MapperConfig, info: StreamInfo) -> tuple[MapperConfig, str]:
+    """Settings whose ranges fit a scene that is far larger than a room, and a sentence on it; "" = as they were.
+
+    A setting that is not the default stays. The ratios are those at which models without a scale are mapped.
+    """
+    depth = float(info.metadata.get(SCENE_DEPTH_KEY, 0))
+    if depth <= FAR_SCENE * config.voxel_map.depth_max_m:
+        return config, ""
+    ratio, usual = depth / UNSCALED_DEPTH_M, MapperConfig()
+
+    def fitted(part: StructT, of_usual: StructT, *names: str) -> StructT:
+        at_default = [name for name in names if getattr(part, name) == getattr(of_usual, name)]
+        return msgspec.structs.replace(part, **{name: round(ratio * getattr(part, name), 3) for name in at_default})
+
+    voxel_map = fitted(config.voxel_map, usual.voxel_map, "voxel_size_m", "depth_max_m")
+    motion = fitted(config.depth.from_motion, usual.depth.from_motion, "near_m", "far_m")
+    said = (
+        f"half of the scene is beyond {depth:.3g} m: it is mapped up to {voxel_map.depth_max_m:g} m in voxels of "
+        f"{voxel_map.voxel_size_m:g} m, and depth is computed from {motion.near_m:g} to {motion.far_m:g} m; "
+        "voxel_map.voxel_size_m, voxel_map.depth_max_m and depth.from_motion say otherwise"
+    )
+    fitted_depth = msgspec.structs.replace(config.depth, from_motion=motion)
+    return msgspec.structs.replace(config, voxel_map=voxel_map, depth=fitted_depth), said
 
 
 def floor_under(frames: Sequence[PlacedFrame]) -> float | None:

@@ -32,6 +32,7 @@ _LEAST_DEPTH_M = 0.05
 _EXPOSURE = 0.25  # change of brightness at corners from one picture to the next, natural logarithm
 _CLIPPED = 245  # grey level from which on it tells nothing
 _STILL = 0.002  # of the width that corners move by at most in pictures that stand still
+_MOVING = 85  # percentile of the corners: most of what a camera sees that goes straight ahead hardly moves
 _MOVED_M, _MOVED_RAD = 0.15, 0.05  # that poses move by at least to contradict them
 _MISFIT = 0.02  # of the width by which corners may be off where given poses have them
 _FOCAL = 0.03  # change of the focal length, natural logarithm ...
@@ -155,7 +156,7 @@ class _CameraCheck:
             before, pose = self._anchor
             ids = before.ids[np.isin(before.ids, tracks.ids)]
             ways = tracks.pixels[tracks.rows(ids)] - before.pixels[before.rows(ids)]
-            if len(ids) >= _LEAST and np.median(np.linalg.norm(ways, axis=1)) < _STILL * self._small.width:
+            if len(ids) >= _LEAST and np.percentile(np.linalg.norm(ways, axis=1), _MOVING) < _STILL * self._small.width:
                 moved = invert_pose(pose) @ T_world_camera
                 metres, radians = np.linalg.norm(moved[:3, 3]), np.linalg.norm(rotation_vector(moved))
                 return bool(metres > _MOVED_M or radians > _MOVED_RAD)

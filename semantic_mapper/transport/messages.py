@@ -44,6 +44,7 @@ _WORD = 128
 _MAX_NUMBERS, _MAX_SENTENCES = 256, 64  # of a status
 # Metadata of a stream whose lengths are not metres, as poses from pictures alone give them; without it they are.
 SCALE_KEY, SCALE_UNKNOWN = "scale", "unknown"
+SCENE_DEPTH_KEY = "scene_depth"  # median depth of what poses from pictures were found by, in the unit of the poses
 
 
 class StreamInfo(Wire, frozen=True):
