@@ -223,6 +223,17 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
     return rgb, EncodedImage(encoding, data)
 
 
+def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
+    """(width, height) of the first picture that can be read, for files that do not tell it; None = none can."""
+    for picture in pictures:
+        try:
+            rgb, _ = read_rgb(picture)
+        except BadFrameError:  # reported when its turn comes
+            continue
+        return rgb.shape[1], rgb.shape[0]
+    return None
+
+
 def read_depth(file: Path, scale: DepthScale, size: tuple[int, int] | None) -> Float32:
     """Depth image (H, W) in metres.
 
@@ -470,6 +481,48 @@ def read_lines(file: Path) -> list[tuple[int, str]]:
     return [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
 
 
+def read_rows(file: Path, count: int, notices: list[str]) -> list[tuple[int, str]]:
+    """Rows of a file whose i-th row belongs to the i-th of ``count`` images, with their lines; the text of a row that
+    is empty or a comment is "": it counts as one, unless there are as many rows without these as images.
+
+    Args:
+        file: To read.
+        count: Of the images.
+        notices: Gets a sentence on what was passed over.
+
+    Raises:
+        ImportSourceError: missing, or not text.
+    """
+    rows = read_lines(file)
+    if len(rows) > count and rows and not any(map(_is_number, split_row(rows[0][1]))):
+        notices.append(f"{file}: line {rows[0][0]} is a header")
+        rows = rows[1:]
+    between = (rows[-1][0] - rows[0][0] + 1 - len(rows)) if rows else 0
+    if not between:
+        return rows
+    if len(rows) == count or 2 * between >= len(rows):
+        notices.append(f"{file}: {counted(between, 'line')} that are empty or a comment passed over")
+        return rows
+    texts = dict(rows)
+    return [(line, texts.get(line, "")) for line in range(rows[0][0], rows[-1][0] + 1)]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def without_picture(kind: str, numbers: Iterable[int], pictures: Iterable[int], where: Path) -> list[str]:
+    """A sentence on poses or the like whose picture is missing; none where there are none."""
+    missing = sorted({*numbers} - {*pictures})
+    if not missing:
+        return []
+    return [f"{counted(len(missing), kind)} without a picture in {where}; the first: number {missing[0]}"]
+
+
 def image_size_must_be(rgb: UInt8, intrinsics: CameraIntrinsics, file: Path) -> None:
     """Refuse an image of another size than its camera makes.
 
@@ -524,7 +577,8 @@ def inside(folder: Path, name: str) -> Path:
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 # Words and short names of keys that say what numbers mean: lens, axes, units, time.
 _TELLING = re.compile(
-    r"fish|lens|distort|equirect|latlong|ortho|panoram|spheric|^model$|principal|camera_?(model|type)|projection|^[kpsbdc]_?\d+$|ftheta|focal|fov|skew|aspect|crop|roi|binning|shutter"
+    r"fish|lens|dist|coeff|radial|tangential|polynom|^xi$|^alpha$|^[KD]$|matrix|intrinsic|extrinsic|^pp[xy]$|sensor|pixel"
+    r"|resiz|^factor$|w2c|c2w|pose_|_type$|_format$|invert|world_|^t0$|epoch|^dt$|rate$|period|readout|^fl$|equirect|latlong|ortho|panoram|spheric|^model$|principal|camera_?(model|type)|projection|^[kpsbdc]_?\d+$|ftheta|focal|fov|skew|aspect|crop|roi|binning|shutter"
     r"|ax[ei]s|convention|coordinate|handed|orient|rotat|flip|mirror|^up$|from_|unit|scale|metric|millimet|inch|feet|depth"
     r"|time|stamp|clock|fps|offset|delay|latency",
     re.IGNORECASE,

@@ -14,6 +14,7 @@ with its one-sigma spread in ``depth_sigma/NNNNNN.png``: they come back with tha
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -38,14 +39,15 @@ from semantic_mapper.replay.importers.base import (
     check_frame_pose,
     convert_known,
     depth_files,
+    first_size,
     image_size_must_be,
     numbered_files,
     read_depth_if_there,
     read_label,
-    read_lines,
     read_numbers,
     read_plain_json,
     read_rgb,
+    read_rows,
     seconds_to_ns,
     unknown_keys,
     unknown_notice,
@@ -60,13 +62,17 @@ DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs in
 
 
 class _Intrinsics(msgspec.Struct):
-    width: Annotated[int, Meta(ge=1, le=1 << 14)]
-    height: Annotated[int, Meta(ge=1, le=1 << 14)]
     fx: float
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, ...] = ()  # OpenCV's coefficients
+    width: Annotated[float, Meta(ge=1, le=1 << 14)] | None = None  # None = that of the first image
+    height: Annotated[float, Meta(ge=1, le=1 << 14)] | None = None
+    distortion: tuple[float, ...] | None = None  # OpenCV's coefficients, by the names that programs give them
+    dist_coeffs: tuple[float, ...] | None = None
+    distortion_coefficients: tuple[float, ...] | None = None
+    coeffs: tuple[float, ...] | None = None
+    D: tuple[float, ...] | None = None
     fisheye: bool = False  # of its fisheye model
     camera_model: str | None = None  # the lens, by its name, however the key is called
     distortion_model: str | None = None
@@ -99,12 +105,14 @@ class FolderRecording:
         self.notices: list[str] = []
         self._folder = folder
         self._camera_id = options.camera_id
-        given_k, given, scale_known = read_intrinsics(folder / "intrinsics.json", self.notices)
+        self._color = numbered_files(folder / "color", PICTURES, self.notices)
+        given_k, given, scale_known = read_intrinsics(
+            folder / "intrinsics.json", self.notices, list(self._color.values())
+        )
         self._measured, self._rectify = given_k, rectifier(given_k, folder / "intrinsics.json")
         self._intrinsics = self._rectify.intrinsics
         self.depth_scale = given or DEPTH_SCALE
-        self._color = numbered_files(folder / "color", PICTURES, self.notices)
-        self._rows = read_lines(folder / "poses.txt")
+        self._rows = read_rows(folder / "poses.txt", max(self._color, default=-1) + 1, self.notices)
         if not self._color:
             raise ImportSourceError(f"{folder / 'color'}: no images named by number (000000.jpg or .png)")
         if not self._rows:
@@ -212,7 +220,7 @@ class FolderRecording:
         if not file.exists():
             self.notices.append(f"no timestamps.txt: stamps are made up at {frame_hz:g} frames a second")
             return [round(i * 1e9 / frame_hz) for i in range(count)]
-        rows = [text.strip().replace(",", ".") for _, text in read_lines(file)]
+        rows = [text.strip().replace(",", ".") for _, text in read_rows(file, count, self.notices)]
         if len(rows) < count:
             raise ImportSourceError(f"{file}: needs a stamp for each of {count} frames, has {len(rows)} rows")
         whole = not any(re.fullmatch(r"\d*\.\d*|[\d.]+[eE][-+]?\d+", row) for row in rows)
@@ -303,12 +311,15 @@ def rectifier(measured: CameraIntrinsics, file: Path) -> Rectifier:
         raise ImportSourceError(f"{file}: {error}") from error
 
 
-def read_intrinsics(file: Path, notices: list[str]) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
+def read_intrinsics(
+    file: Path, notices: list[str], pictures: Sequence[Path]
+) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
     """``intrinsics.json`` -> intrinsics, the scale of depth images where given, and whether poses are in metres.
 
     Args:
         file: To read.
         notices: Gets a sentence on keys that are not read.
+        pictures: The first that can be read tells the size where the file does not.
 
     Raises:
         ImportSourceError: missing, or a value that cannot be.
@@ -317,10 +328,20 @@ def read_intrinsics(file: Path, notices: list[str]) -> tuple[CameraIntrinsics, D
         plain = read_plain_json(file, 1 << 20)
         i = convert_known(plain, _Intrinsics, str(file))
         notices += unknown_notice(file, unknown_keys([plain], _Intrinsics))
+        if i.depth_scale is not None and i.depth_scale < 1:
+            raise ImportSourceError(
+                f"{file}: depth_scale {i.depth_scale:g} is no number of units per metre; where it is metres per unit, "
+                f"write {1 / i.depth_scale:g}"
+            )
         scale = DepthScale(i.depth_scale, file) if i.depth_scale is not None else None
+        lenses = (i.distortion, i.dist_coeffs, i.distortion_coefficients, i.coeffs, i.D)
+        coefficients = next((lens for lens in lenses if lens), ())
+        size = (i.width, i.height) if i.width and i.height else first_size(pictures)
+        if size is None:
+            raise ImportSourceError(f"{file}: has no width and height, and no image that tells them")
         named = i.camera_model or i.distortion_model or i.lens_model or i.model or "opencv"
         model = "fisheye" if i.fisheye else named
-        lens = lens_intrinsics(model, i.distortion, (i.fx, i.fy, i.cx, i.cy), (i.width, i.height))
+        lens = lens_intrinsics(model, coefficients, (i.fx, i.fy, i.cx, i.cy), (int(size[0]), int(size[1])))
         return lens, scale, i.scale != SCALE_UNKNOWN
     except (ConfigError, FrameError) as error:
         raise ImportSourceError(f"{file}: {error}") from error

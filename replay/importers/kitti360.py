@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import re
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +39,10 @@ from semantic_mapper.replay.importers.base import (
     numbered_files,
     read_bytes,
     read_lines,
+    read_numbers,
     read_plane,
     read_rgb,
+    read_rows,
     split_row,
 )
 from semantic_mapper.transport.messages import StreamInfo
@@ -211,7 +214,14 @@ class Kitti360Recording:
             why = f"{missing[0]} is missing" if missing else "a rate is given"
             self.notices.append(f"{why}: stamps are made up at {frame_hz or NOMINAL_HZ:g} frames a second")
             return {}
-        return {name: read_lines(file) for name, file in files.items()}
+        stamps: dict[str, list[tuple[int, str]]] = {}
+        for name, file in files.items():
+            stamps[name] = read_rows(file, max(self._files[name]) + 1, self.notices)
+            # Of one form, so that their order is that of time.
+            texts = [text.strip() for _, text in stamps[name] if text]
+            if any(a >= b for a, b in pairwise(texts)):
+                self.notices.append(f"{file}: stamps go back, or are there twice")
+        return stamps
 
 
 def find_drive(folder: Path) -> tuple[Path, str]:
@@ -250,6 +260,8 @@ def rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> 
         raise ImportSourceError(f"{file}: needs 'P_rect_{which}:' with 12 numbers and 'S_rect_{which}:' with 2")
     matrix = np.array(P, np.float64).reshape(3, 4)
     K = matrix[:, :3]
+    if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]):
+        raise ImportSourceError(f"{file}: P_rect_{which} has skew, which is not undone; use the file of the data set")
     try:
         intrinsics = CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(size[0]), int(size[1]))
         offset = np.linalg.solve(K, matrix[:, 3])
@@ -345,7 +357,7 @@ def _read_calibration(file: Path) -> dict[str, list[float]]:
         if not re.fullmatch(r"[PRS]_rect_0[01]", name.strip()):
             continue
         try:
-            values[name.strip()] = [float(n) for n in numbers.split()]
+            values[name.strip()] = read_numbers(numbers)
         except ValueError as error:
             raise ImportSourceError(f"{file}, line {line}: {error}") from error
     return values
@@ -353,7 +365,7 @@ def _read_calibration(file: Path) -> dict[str, list[float]]:
 
 def _time_ns(text: str, file: Path, line: int) -> int:
     """``2013-05-28 08:46:02.904547200`` -> nanoseconds since 1970."""
-    seconds, _, fraction = text.strip().partition(".")
+    seconds, _, fraction = text.strip().replace("T", " ").partition(".")
     try:
         whole = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
         return int(whole.timestamp()) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))

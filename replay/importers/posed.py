@@ -29,6 +29,7 @@ from semantic_mapper.replay.importers.base import (
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
+KEPT_RECTIFIERS = 8  # of some megabytes each
 SHIFT_NS = 1_000_000  # between pictures of one time
 DEFAULT_HZ = 2.0  # at which pictures without times count as taken
 T_Z_UP_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of ARKit's worlds
@@ -164,6 +165,8 @@ class PosedPictures:
 
     def _rectifier(self, intrinsics: CameraIntrinsics, file: Path) -> Rectifier:
         if intrinsics not in self._rectifiers:
+            if len(self._rectifiers) >= KEPT_RECTIFIERS:  # cameras with a lens a picture have as many as pictures
+                self._rectifiers.pop(next(iter(self._rectifiers)))
             try:
                 self._rectifiers[intrinsics] = Rectifier(intrinsics)
             except ConfigError as error:

@@ -33,9 +33,10 @@ from semantic_mapper.replay.importers.base import (
     numbered_files,
     read_depth_if_there,
     read_label,
-    read_lines,
     read_numbers,
     read_rgb,
+    read_rows,
+    without_picture,
 )
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
@@ -79,7 +80,9 @@ class ReplicaRecording:
         self._color = list(numbered_files(folder / "rgb", (".png",), self.notices).items())
         self._depth = depth_files(folder / "depth", options, self.depth_scale, self.notices)
         self._labels = numbered_files(folder / "semantic_class", (".png",), self.notices)
-        self._rows = read_lines(folder / _TRAJECTORY)
+        numbers = dict(self._color)
+        self._rows = read_rows(folder / _TRAJECTORY, max(numbers, default=-1) + 1, self.notices)
+        self.notices += without_picture("depth image", self._depth, numbers, folder / "rgb")
         self._check_counts(options)
         self._intrinsics = self._find_intrinsics()
         labels = self._read_label_set() if self._labels else None

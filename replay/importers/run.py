@@ -82,7 +82,19 @@ _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),
     ".r3d": "is Record3D's own file; export it on the phone as 'EXR + RGB', and name the folder that comes out",
+    ".sens": "is ScanNet's packed scan; unpack it by the data set's SensReader (color, depth, pose, intrinsic), and "
+    "name the folder that comes out",
+    **dict.fromkeys((".svo", ".svo2", ".klg"), "holds no poses; record a bag, or colour and depth with poses"),
     **dict.fromkeys((".zip", ".tgz", ".gz", ".tar", ".7z"), _PACKED),
+}
+# What folders hold that are nearly a recording.
+_FOLDERS = {
+    "transforms_train.json": "has its frames in transforms_train.json, _val and _test; put those that are wanted into "
+    "one transforms.json",
+    "associations.txt": "has associations.txt, as ICL-NUIM: write its columns as rgb.txt and depth.txt ('stamp file'), "
+    "the poses as groundtruth.txt, and intrinsics.json; where fy is negative, flip y in the poses",
+    "rgbd": "is Record3D's own format, unpacked; export it on the phone as 'EXR + RGB'",
+    "database.db": "has COLMAP's database, but no model; run the mapper, and name the folder that holds sparse/",
 }
 
 _DEFAULTS = ImportOptions()
@@ -137,6 +149,9 @@ def _what_folder(src: Path) -> str:
             "read (rgb/, depth/, traj_w_c.txt). Rewrite it as a sequence folder: color/NNNNNN.jpg, depth/NNNNNN.png, "
             "poses.txt (the rows of traj.txt), intrinsics.json (of cam_params.json, depth_scale is its scale)"
         )
+    for name, advice in _FOLDERS.items():
+        if (src / name).exists():
+            return advice
     sequences = sorted(path.parent for path in src.glob("*/traj_w_c.txt"))
     if sequences:
         return f"is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}"
@@ -158,6 +173,8 @@ def _what_file(src: Path) -> str:
     """Why a file is not imported."""
     if src.suffix.lower() in _FILES:
         return _FILES[src.suffix.lower()]
+    if src.name in (mark for marks in _MARKS.values() for mark in marks):
+        return f"is a file of a recording; name its folder: {src.parent}"
     if src.suffix != LOG_SUFFIX:
         return "is a file, not the folder of a recording"
     try:

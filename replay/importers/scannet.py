@@ -38,6 +38,7 @@ from semantic_mapper.replay.importers.base import (
     read_matrix,
     read_plane,
     read_rgb,
+    without_picture,
 )
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.messages import StreamInfo
@@ -69,6 +70,8 @@ class ScanNetRecording:
         self._color = list(numbered_files(folder / "color", PICTURES, self.notices).items())
         self._depth = depth_files(folder / "depth", options, self.depth_scale, self.notices)
         self._poses = numbered_files(folder / "pose", (".txt",), self.notices)
+        numbers = dict(self._color)
+        self.notices += without_picture("pose", self._poses, numbers, folder / "color")
         names = [name for name in ("label-filt", "label") if (folder / name).is_dir()]
         self._labels = numbered_files(folder / names[0], (".png",), self.notices) if names else {}
         self._has_label = bool(self._labels)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,9 +33,9 @@ from semantic_mapper.replay.importers.base import (
     DepthScale,
     ImportOptions,
     convert_known,
+    first_size,
     inside,
     read_plain_json,
-    read_rgb,
     refuse_keys,
     unknown_keys,
     unknown_notice,
@@ -46,7 +47,7 @@ FILE = "transforms.json"
 MAX_BYTES = 1 << 29  # hours of frames at 60 Hz
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # Blender's data sets leave them out
 _NEUTRAL = (  # they turn or fit the world, or are of training
-    "applied_transform", "aabb_scale", "orientation_override", "auto_scale_poses_override", "enable_depth_loading",
+    "aabb_scale", "orientation_override", "auto_scale_poses_override", "enable_depth_loading",
 )  # fmt: skip
 _OTHER_AXES = ("from_mitsuba", "from_na")  # instant-ngp's flags for poses of another convention
 _OTHER_LENS = re.compile(r"latlong|equirectangular|orthographic|ftheta\w*|distortion_params")  # instant-ngp, nerfstudio
@@ -62,6 +63,8 @@ class _Lens(msgspec.Struct, kw_only=True):
     is_fisheye: bool | None = None
     camera_angle_x: float | None = None
     camera_angle_y: float | None = None
+    x_fov: float | None = None  # of instant-ngp, degrees
+    y_fov: float | None = None
     fl_x: float | None = None
     fl_y: float | None = None
     cx: float | None = None
@@ -83,13 +86,17 @@ class _Frame(_Lens, kw_only=True):
     transform_matrix: list[list[float]] | None = None
     depth_file_path: str | None = None
     depth_path: str | None = None
-    timestamp: float | None = None  # in a unit that nothing tells
+    timestamp: float | str | None = None  # in a unit that nothing tells
 
 
 class _Transforms(_Lens, kw_only=True):
     frames: list[dict[str, Any]]
     depth_unit_scale_factor: float | None = None
     integer_depth_scale: float | None = None
+    applied_scale: float | None = None  # of nerfstudio: what poses were multiplied by
+    applied_transform: list[list[float]] | None = None  # what they were moved by
+    units: str | None = None  # of the poses
+    unit: str | None = None
     from_mitsuba: bool | None = None
     from_na: bool | None = None
 
@@ -125,7 +132,8 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     )
     size = _common_size(folder, found, [frame for _, frame in frames])
     pictures: list[PosedPicture] = []
-    unit_ns = _time_unit([frame.timestamp for _, frame in frames], file, notices)
+    unit_ns = _time_unit([_seconds(frame) for _, frame in frames], file, notices)
+    metres = _metres_per_unit(found, file, notices) if options.scale is None else None
     for number, frame in frames:
         try:
             pictures.append(
@@ -140,8 +148,18 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     if not pictures and left_out:
         raise ImportSourceError(f"{folder}: holds no posed picture: {left_out[0]}")
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
+    if metres is not None:
+        for picture in pictures:
+            picture.T_world_camera[:3, 3] *= metres
     scale, measured, said = _depth_scale(file, found, [frame for _, frame in frames], pictures, options)
-    opened = PosedPictures("transforms", folder, pictures, options, depth_scale=scale, metric=measured)
+    opened = PosedPictures(
+        "transforms",
+        folder,
+        pictures,
+        options,
+        depth_scale=scale,
+        metric=measured or _UNITS.get(_unit(found)) is not None,
+    )
     opened.notices += [*notices, *said]
     return opened
 
@@ -203,13 +221,11 @@ def _common_size(folder: Path, found: _Transforms, frames: Sequence[_Frame]) -> 
     """(width, height) of the first picture that can be read, for files that do not tell it; None = none."""
     if found.w is not None and found.h is not None:
         return None
+    inside_folder: list[Path] = []
     for frame in frames:
-        try:
-            rgb, _ = read_rgb(_image(folder, frame))
-            return rgb.shape[1], rgb.shape[0]
-        except (BadFrameError, ImportSourceError):  # reported when its turn comes
-            continue
-    return None
+        with suppress(ImportSourceError):  # reported when its turn comes
+            inside_folder.append(_image(folder, frame))
+    return first_size(inside_folder)
 
 
 def _image(folder: Path, frame: _Frame) -> Path:
@@ -217,17 +233,59 @@ def _image(folder: Path, frame: _Frame) -> Path:
     return next((p for s in _SUFFIXES if (p := named.with_name(named.name + s)).is_file()), named)
 
 
+_UNITS = {
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 0.01),
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 0.001),
+}
+_BELIEVABLE_S = (1e-3, 10.0)  # between two frames
+
+
+def _unit(found: _Transforms) -> str:
+    return (found.units or found.unit or "").strip().lower()
+
+
+def _metres_per_unit(found: _Transforms, file: Path, notices: list[str]) -> float | None:
+    """What makes translations those that they were before a program has scaled them, in metres; None = nothing.
+
+    Raises:
+        ImportSourceError: a unit that is not known, or a scale that cannot be.
+    """
+    unit, scale = _unit(found), found.applied_scale or 1.0
+    if unit and unit not in _UNITS:
+        raise ImportSourceError(f"{file}: the unit '{unit[:40]}' is not known, only m, cm and mm; convert the poses")
+    if found.applied_transform is not None:
+        A = np.array(found.applied_transform, np.float64)
+        if A.shape not in ((3, 4), (4, 4)) or not np.linalg.det(A[:3, :3]) > 1e-9:
+            raise ImportSourceError(f"{file}: applied_transform is no rotation with a scale")
+        scale *= float(np.cbrt(np.linalg.det(A[:3, :3])))
+    if not 1e-6 < scale < 1e6:
+        raise ImportSourceError(f"{file}: a scale of {scale:g} (applied_scale, applied_transform) cannot be")
+    factor = _UNITS.get(unit, 1.0) / scale
+    if abs(factor - 1) < 1e-6:
+        return None
+    notices.append(f"{file}: positions are multiplied by {factor:g}, as units, applied_scale and applied_transform say")
+    return factor
+
+
+def _seconds(frame: _Frame) -> float | None:
+    """A frame's time in its unit; None = none that can be."""
+    try:
+        time = float(frame.timestamp) if frame.timestamp is not None else math.nan
+    except ValueError:
+        return None
+    return time if 0 <= time < math.inf else None
+
+
 def _time_unit(times: Sequence[float | None], file: Path, notices: list[str]) -> float:
     """Nanoseconds of the unit of the frames' times: that of Unix times by their size, else by the usual gap."""
-    told = np.sort([time for time in times if time is not None and time >= 0])
+    told = np.sort([time for time in times if time is not None])
     if not len(told):
         return 1e9
     gap = float(np.median(np.diff(told))) if len(told) > 1 else 0.0
-    steps = (
-        sum(told[-1] > 1e11 * 1000**n for n in range(3))
-        if told[-1] > 1e8
-        else sum(gap > 10 * 1000**n for n in range(3))
-    )
+    unix = [n for n in range(4) if 1e9 <= told[-1] / 1000**n <= 4e9 and gap / 1000**n <= 1000]
+    usual = [n for n in range(4) if _BELIEVABLE_S[0] <= gap / 1000**n <= _BELIEVABLE_S[1]]
+    steps = next(iter((*unix, *usual)), 0)
     name = ("seconds", "milliseconds", "microseconds", "nanoseconds")[steps]
     rate = f", {1000**steps / gap:.3g} frames a second" if gap else ""
     notices.append(f"{file}: 'timestamp' is read as {name}{rate}")
@@ -247,7 +305,7 @@ def _picture(
     T_world_gl = _matrix(frame.transform_matrix, image)
     depth = frame.depth_file_path or frame.depth_path
     lens = _intrinsics(all_frames, frame, size, where)
-    time = frame.timestamp
+    time = _seconds(frame)
     stamp_ns = round(time * unit_ns) if time is not None and 0 <= time * unit_ns < MAX_STAMP_NS else None
     return PosedPicture(image, lens, T_world_gl @ axes, None if not depth else inside(folder, depth), stamp_ns)
 
@@ -274,11 +332,15 @@ def _intrinsics(all_frames: _Lens, frame: _Lens, size: tuple[int, int] | None, w
             raise ImportSourceError(f"{where}: has no w and h, and no picture that tells them")
         width, height = size
     own_fx, own_fy = (
-        frame.fl_x or _focal(frame.camera_angle_x, width),
-        frame.fl_y or _focal(frame.camera_angle_y, height),
+        frame.fl_x or _focal(_angle(frame.camera_angle_x, frame.x_fov), width),
+        frame.fl_y or _focal(_angle(frame.camera_angle_y, frame.y_fov), height),
     )
-    fx = own_fx or all_frames.fl_x or _focal(all_frames.camera_angle_x, width)
-    fy = own_fy or (None if own_fx else all_frames.fl_y or _focal(all_frames.camera_angle_y, height))
+    angles = (
+        _angle(all_frames.camera_angle_x, all_frames.x_fov),
+        _angle(all_frames.camera_angle_y, all_frames.y_fov),
+    )
+    fx = own_fx or all_frames.fl_x or _focal(angles[0], width)
+    fy = own_fy or (None if own_fx else all_frames.fl_y or _focal(angles[1], height))
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
         raise ImportSourceError(f"{where}: has no focal length: fl_x, or camera_angle_x")
@@ -305,6 +367,10 @@ def _intrinsics(all_frames: _Lens, frame: _Lens, size: tuple[int, int] | None, w
 
 def _fields(lens: _Lens) -> Mapping[str, Any]:
     return {name: getattr(lens, name) for name in _Lens.__struct_fields__}
+
+
+def _angle(radians: float | None, degrees: float | None) -> float | None:
+    return radians if radians is not None or degrees is None else math.radians(degrees)
 
 
 def _focal(angle: float | None, side: float) -> float | None:

@@ -127,7 +127,7 @@ class TumRecording:
     def _read_intrinsics(self) -> CameraIntrinsics:
         file = self._folder / "intrinsics.json"
         if file.exists():
-            intrinsics, given, _ = read_intrinsics(file, self.notices)
+            intrinsics, given, _ = read_intrinsics(file, self.notices, sorted((self._folder / "rgb").glob("*")))
             self.depth_scale = given or DEPTH_SCALE
             return intrinsics
         name = self._folder.resolve().name

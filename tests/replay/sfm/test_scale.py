@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
+from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.board import make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
@@ -13,14 +15,17 @@ from semantic_mapper.replay.sfm.scale import (
     MarkedDistance,
     PlacedFrame,
     ScaleHint,
+    fit_to_scene,
     floor_under,
     marked_place,
     parse_distance,
     ray_of,
+    scene_depth,
     triangulate,
     upright,
 )
 from semantic_mapper.replay.sfm.vertical import vertical
+from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 CAMERA = CameraIntrinsics(300.0, 300.0, 159.5, 119.5, 320, 240, (0.05, 0.0, 0.0, 0.0))
@@ -146,3 +151,16 @@ def test_a_marked_pixel_counts_in_its_own_frame_also_where_that_has_no_pose(rng:
     assert place == pytest.approx(true, abs=0.02)
     with pytest.raises(ImportSourceError, match="cannot be placed"):
         marked_place(Mark(0.4, 180.0, 100.0), 4, {4: pictures[4]}, poses, camera)
+
+
+def test_ranges_follow_a_scene_that_is_larger_than_a_room_and_given_settings_stay() -> None:
+    usual = MapperConfig()
+    for depth in (0.0, 3.9):
+        assert fit_to_scene(usual, StreamInfo("film", metadata=scene_depth(depth))) == (usual, "")
+    street = StreamInfo("film", metadata=scene_depth(20.0))
+    fitted, said = fit_to_scene(usual, street)
+    assert (fitted.voxel_map.voxel_size_m, fitted.voxel_map.depth_max_m) == (0.2, 50)
+    assert (fitted.depth.from_motion.near_m, fitted.depth.from_motion.far_m) == (4, 80)
+    assert "up to 50 m in voxels of 0.2 m" in said
+    given = msgspec.structs.replace(usual, voxel_map=msgspec.structs.replace(usual.voxel_map, voxel_size_m=0.1))
+    assert fit_to_scene(given, street)[0].voxel_map.voxel_size_m == 0.1
