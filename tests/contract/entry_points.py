@@ -10,7 +10,10 @@ import importlib
 import io
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +32,7 @@ import semantic_mapper.drivers.realsense.config
 import semantic_mapper.drivers.stereo.config
 import semantic_mapper.drivers.v4l2.config
 from semantic_mapper.benchmark.config import SuiteConfig
+from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig, SRayConfig, convert_config, load_config
 from semantic_mapper.drivers.calibration import CalibrationFile, load_calibration, load_mount
 from semantic_mapper.errors import SemanticMapperError
@@ -40,6 +44,7 @@ from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore, Progress
+from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import (
     CameraOptions,
     FinetunerOptions,
@@ -162,6 +167,36 @@ def run_command(*arguments: str | Path) -> Ran:
 def command_tree() -> Any:
     """The click command that holds all verbs."""
     return typer.main.get_command(cli.app)
+
+
+# Answers.
+
+
+@contextmanager
+def short_folder() -> Iterator[Path]:
+    """A folder for sockets, whose paths are short."""
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+        yield Path(folder)
+
+
+@contextmanager
+def serving(path: Path, endpoint: str) -> Iterator[MapClient]:
+    """Ask a saved map through a socket."""
+    stop = threading.Event()
+    with QueryService(endpoint, VoxelMap.load(path)) as service:
+
+        def follow() -> None:
+            while not stop.wait(0.002):
+                service.follow()
+
+        mapper = threading.Thread(target=follow)
+        mapper.start()
+        try:
+            with MapClient(endpoint) as client:
+                yield client
+        finally:
+            stop.set()
+            mapper.join()
 
 
 # Wire.

@@ -158,6 +158,20 @@ def record_files(folder: Path) -> None:
     golden.write("files", test_files.observe(folder))
 
 
+def record_weights(folder: Path) -> None:
+    """What fields of every kind make of the golden log."""
+    from tests.contract import test_weights
+
+    golden.write("weights", test_weights.observe(folder))
+
+
+def record_answers(folder: Path) -> None:
+    """Answers to all questions about the golden map."""
+    from tests.contract import test_answers
+
+    golden.write("answers", test_answers.observe(folder))
+
+
 def record_log(folder: Path) -> None:
     """What the golden log says."""
     from tests.contract import test_log
@@ -200,6 +214,8 @@ GROUPS: dict[str, Callable[[Path], None]] = {
     "kitchen": record_kitchen,
     "files": record_files,
     "log": record_log,
+    "weights": record_weights,
+    "answers": record_answers,
     "exporters": record_exporters,
     "cli": record_cli,
     "settings": record_settings,
