@@ -127,7 +127,12 @@ class Robot:
         self._camera = stack.enter_context(Publisher(self._endpoints["camera"], policy="block"))
         self._offers = stack.enter_context(Publisher(self._endpoints["offers"]))
         self._labels = stack.enter_context(Publisher(self._endpoints["labels"], policy="block"))
-        learning = {"share": args.fraction, "niceness": args.niceness, "weights": args.weights, "config": args.learning}
+        learning = {
+            "cpu_fraction": args.fraction,
+            "niceness": args.niceness,
+            "weights": args.weights,
+            "config": args.learning,
+        }
         self.finetuner = self._start(stack, "finetuner", learning)
         self._mapper = self._start(
             stack,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -95,8 +95,6 @@ class CameraOptions(Config, frozen=True):
 
 class MapperOptions(Config, frozen=True):
     """Maps the frames of a camera node."""
-
-    old_names: ClassVar = {"least_agreement": "min_map_agreement"}
 
     out: Text  # folder for the map, the picture and the summary
     input: Text | Names = "camera"  # whose frames: a node, or several
@@ -195,8 +193,6 @@ class RecorderOptions(Config, frozen=True):
 
 class FinetunerOptions(Config, frozen=True):
     """Finetunes the weights of a mapper on labelled keyframes, beside it and within a budget."""
-
-    old_names: ClassVar = {"share": "cpu_fraction"}
 
     mapper: str = "mapper"  # the node that uses the weights; its `learner` is this one
     weights: str = ""  # those that the mapper was started with, the very same file; empty = those of the package

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from semantic_mapper import __version__
-from semantic_mapper.config import with_old_names
+from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.overview import ViewStrip, draw_overview
 from semantic_mapper.evaluation.upright import camera_up
@@ -287,7 +287,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         },
         "seed": pipeline.config.seed,
         "quality": pipeline.config.quality,
-        "config": with_old_names(pipeline.config),  # as it was in force: with what the quality sets
+        "config": to_plain(pipeline.config),  # as it was in force: with what the quality sets
         "refusals": [{"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason} for r in _first_refusals(session)],
         "damaged_stretches": session.damages.first,
         "versions": versions(),

@@ -239,11 +239,10 @@ class LogReplays:
         return self._done[key]
 
     def _read_config(self, config: Settings, quality: Quality) -> MapperConfig:
-        from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml, rename_settings
+        from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml
 
         data = dict(config) if isinstance(config, Mapping) else read_toml(self._root / config) if config else {}
         where = "config of the replay" if isinstance(config, Mapping) else str(config)
-        data = rename_settings(data, MapperConfig, where)
         data |= {} if quality is None else {"quality": quality}
         mapper = convert_config(data, MapperConfig, where)
         check_quality(data, mapper.quality, where)

@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
@@ -48,8 +48,6 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Base of all configuration structs."""
 
     infinite: ClassVar[bool] = False  # whether ``inf`` is a value of its numbers
-    old_names: ClassVar[Mapping[str, str]] = {}  # of settings that were renamed -> their name now
-    old_values: ClassVar[Mapping[str, Mapping[str | bool, str]]] = {}  # by setting: values that were renamed
 
 
 class EncoderConfig(Config, frozen=True):
@@ -208,8 +206,6 @@ class PanopticConfig(GridFieldConfig, frozen=True):
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 
-    old_names: ClassVar = {"least_weight": "sample_weight_threshold"}
-
     mode: Literal["reference", "streaming"] = "streaming"
     coarse: SamplesOfTwo = 64  # reference: uniform in inverse depth
     fine: Samples = 64  # reference: drawn from the coarse weights
@@ -309,8 +305,6 @@ class VirtualViewConfig(Config, frozen=True):
 
 class RenderConfig(Config, frozen=True):
     """Resolution and chunking of the rendered view."""
-
-    old_names: ClassVar = {"share": "ray_fraction", "blind_samples": "samples_without_depth"}
 
     # Rendered rays a side, relative to the frame; upsampled to full size along image edges.
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
@@ -500,49 +494,9 @@ def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
     """
     check_values(data, where, infinite=issubclass(kind, Config) and kind.infinite)
     try:
-        return msgspec.convert(rename_settings(data, kind, where), kind)
+        return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{where}: {_shorten(_explain(str(error), kind))}") from error
-
-
-def rename_settings(data: Any, kind: Any, where: str) -> Any:
-    """Plain data with the present names of settings that it has under old ones, and one warning for each.
-
-    Raises:
-        ConfigError: a setting is there under both names.
-    """
-    if isinstance(data, list | tuple):
-        return [rename_settings(item, kind, where) for item in cast("list[Any]", data)]
-    if not isinstance(data, Mapping) or not (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
-        return data
-    types = {item.encode_name: item.type for item in msgspec.structs.fields(kind)}
-    old_names, old_values = (kind.old_names, kind.old_values) if issubclass(kind, Config) else ({}, {})
-    renamed: dict[Any, Any] = {}
-    for key, value in cast("Mapping[Any, Any]", data).items():
-        name = old_names.get(key, key)
-        if name != key and name in data:
-            if data[name] == value:  # as in summaries, which hold both
-                continue
-            raise ConfigError(f"{where}: `{key}` is the old name of `{name}`, which is there, too; give one of them")
-        new_value = old_values.get(name, {}).get(value, value) if isinstance(value, str | bool) else value
-        if (name, new_value) != (key, value):
-            _log.warning(
-                "setting_renamed", file=where, old=key, new=name, **({} if new_value == value else {"value": new_value})
-            )
-        for part in _structs(types.get(name)):
-            new_value = rename_settings(new_value, part, where)
-        renamed[name] = new_value
-    return renamed
-
-
-def with_old_names(config: Config) -> dict[str, Any]:
-    """``to_plain`` with each renamed setting under its old name, too, for programs that read results."""
-    plain = to_plain(config)
-    for item in msgspec.structs.fields(type(config)):
-        value = getattr(config, item.name)
-        if isinstance(value, Config):
-            plain[item.encode_name] = with_old_names(value)
-    return plain | {old: plain[new] for old, new in config.old_names.items()}
 
 
 def check_values(data: Any, where: str, *, infinite: bool = False) -> None:

@@ -2,12 +2,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import msgspec
 import pytest
 
-from semantic_mapper import config as config_module
 from semantic_mapper.config import (
     MAX_FILE_BYTES,
     Config,
@@ -21,7 +20,6 @@ from semantic_mapper.config import (
     read_json,
     read_toml,
     to_plain,
-    with_old_names,
 )
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.run_replay import mapper_config
@@ -67,12 +65,12 @@ def test_an_unknown_key_is_refused_with_the_nearest_valid_one(tmp_path: Path, te
         ("fast", "[sampling]\nguided = 4", r"sampling\.guided = 4 \(fast: 2\)"),
         (
             "fast",
-            "[sampling]\nfree_space = 0\n[render]\nshare = 0.5",
+            "[sampling]\nfree_space = 0\n[render]\nray_fraction = 0.5",
             r"otherwise: render\.ray_fraction = 0\.5 \(fast: 0\.12\);",
         ),
         ("reference", "[render]\ntarget_hz = 5", r"render\.target_hz = 5 \(reference: 0\.0\)"),
         ("balanced", "[sampling]\nguided = 4\n[render]\nscale = 0.5", None),
-        ("custom", "[sampling]\nguided = 4\n[render]\nshare = 0.5", None),
+        ("custom", "[sampling]\nguided = 4\n[render]\nray_fraction = 0.5", None),
     ],
 )
 def test_what_a_quality_would_override_is_refused(
@@ -215,38 +213,3 @@ def test_hostile_json_is_refused_by_name(tmp_path: Path, text: str) -> None:
     path.write_text(text, encoding="latin-1")
     with pytest.raises(ConfigError, match=r"camera\.json: "):
         read_json(path, dict)
-
-
-def test_old_names_are_read_with_one_warning_that_names_the_new_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    warned: list[dict[str, str]] = []
-    monkeypatch.setattr(config_module._log, "warning", lambda event, **values: warned.append(values))
-    path = write(tmp_path, "[render]\nshare = 0.3\n[sampling]\nleast_weight = 0.1")
-    config = load_config(path, MapperConfig)
-    assert (config.render.ray_fraction, config.sampling.sample_weight_threshold) == (0.3, 0.1)
-    assert warned == [
-        {"file": str(path), "old": "share", "new": "ray_fraction"},
-        {"file": str(path), "old": "least_weight", "new": "sample_weight_threshold"},
-    ]
-    plain = with_old_names(config)
-    assert plain["render"]["share"] == plain["render"]["ray_fraction"] == 0.3
-    path = write(tmp_path, "[render]\nshare = 0.3\nray_fraction = 0.2")
-    with pytest.raises(ConfigError, match="`share` is the old name of `ray_fraction`"):
-        load_config(path, MapperConfig)
-
-
-class _Inner(Config, frozen=True):
-    old_names: ClassVar = {"before": "now"}
-    old_values: ClassVar = {"now": {"old": "new"}}
-    now: str = ""
-
-
-class _Outer(Config, frozen=True):
-    inner: tuple[_Inner, ...] = ()
-    either: _Inner | None = None
-
-
-def test_old_names_and_values_are_read_in_lists_and_tables_of_tables() -> None:
-    read = convert_config({"inner": [{"before": "old"}, {"now": "x"}], "either": {"before": "y"}}, _Outer, "test")
-    assert read == _Outer(inner=(_Inner(now="new"), _Inner(now="x")), either=_Inner(now="y"))

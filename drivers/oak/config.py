@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -17,9 +17,6 @@ Height = Annotated[int, msgspec.Meta(ge=48, multiple_of=2)]
 
 class Config(semantic_mapper.config.Config, frozen=True):
     """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is requested."""
-
-    old_names: ClassVar = {"other_world": "on_tracking_reset"}
-    old_values: ClassVar = {"on_tracking_reset": {"end": "exit"}}
 
     # Its id (MXID), its IP address (PoE), or its USB path, as ``semantic-mapper cameras`` shows them. Empty = the only
     # one that is connected.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -94,8 +94,6 @@ class BoardPoses(Config, frozen=True):
 class OdometryPoses(Config, frozen=True):
     """RGB-D odometry: each frame is aligned to several keyframes; the world begins at the first frame."""
 
-    old_names: ClassVar = {"huber_m": "noise_m"}
-
     kind: Literal["rgbd"] = "rgbd"
     T_world_start: Matrix = IDENTITY  # T_world_camera of the first frame
     width: AtLeastOne = 320  # images are thinned out to about this
@@ -185,8 +183,6 @@ KINDS: dict[str, type[PoseConfig]] = {
 
 class PoseChecks(Config, frozen=True):
     """What ``PosedCamera`` refuses."""
-
-    old_names: ClassVar = {"first_agree": "init_consensus", "settle": "relocalize_after"}
 
     max_speed_m_s: Positive = 3.0  # faster than this between two images is a jump
     max_turn_deg_s: Positive = 360.0

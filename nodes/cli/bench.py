@@ -11,7 +11,7 @@ import typer
 
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.replay import ConfigOption, QualityOption, VoxelSizeOption, WeightsOption
-from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb, warn_of_old_name
+from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
 
 
 class Part(StrEnum):
@@ -83,7 +83,6 @@ def bench(
     depth: DepthOption = None,
     rooms: RoomsOption = None,
     loops: LoopsOption = 6,
-    returns: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
     minutes: MinutesOption = 60.0,
     hz: HzOption = 2.0,
     width: WidthOption = None,
@@ -91,7 +90,7 @@ def bench(
     memory_mb: MemoryOption = None,
     plot: PlotOption = None,
     out: OutOption = None,
-    json: PrintJsonOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Measure speed on this machine, as ratios between things measured in one run.
 
@@ -120,10 +119,7 @@ def bench(
     from semantic_mapper.nodes.cli.run_replay import mapper_config
     from semantic_mapper.replay.bench.walk import WalkPlan
 
-    if returns is not None:
-        warn_of_old_name("--returns", "--loops")
-        loops = returns
-    out, output.quiet = results_file(out, json)
+    out, output.quiet = results_file(out), json
     for path in (plot, out):
         if path is not None:
             prepare_file(path)

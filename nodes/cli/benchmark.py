@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from semantic_mapper.nodes.cli import suite_options as suites
-from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb
+from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
 
 WeightsOption = Annotated[
     list[Path] | None,
@@ -30,7 +30,6 @@ def benchmark(
     sources: suites.SourcesOption = None,
     own_image: suites.OwnImageOption = None,
     current: suites.CurrentOption = None,
-    baseline: suites.BaselineOption = None,
     depth: suites.DepthOption = None,
     tier: suites.TierOption = None,
     keyframes: suites.KeyframesOption = None,
@@ -43,7 +42,7 @@ def benchmark(
     config: suites.SuiteConfigOption = None,
     seed: SeedOption = None,
     out: OutOption = None,
-    json: PrintJsonOption = None,
+    json: JsonOption = False,
 ) -> int:
     """Score weights on the rooms of a suite, one column a weights file, and draw a contact sheet.
 
@@ -67,10 +66,10 @@ def benchmark(
     Example: semantic-mapper benchmark aerial --claims --out runs/aerial.json
     Example: semantic-mapper benchmark streets --claims --out runs/streets.json
     """
-    given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
+    given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "depth": depth}
     given |= {"sources": sources, "own_image": own_image, "current": current}
     given |= {"keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
-    out, print_json = results_file(out, json)
+    out, print_json = results_file(out), json
     if suite != "rooms":
         del given["seed"]
         suites.refuse_given(suite, given | {"weights": weights, "kind": kind, "map": maps or None, "refine": refine})

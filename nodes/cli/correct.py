@@ -12,7 +12,7 @@ import typer
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb, warn_of_old_name
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 
 if TYPE_CHECKING:
     from semantic_mapper.client import Correction, MapClient
@@ -41,7 +41,6 @@ def correct(
             "last pose of the file move with that pose, those to come as well.",
         ),
     ] = None,
-    until: Annotated[float | None, typer.Option(min=0, hidden=True)] = None,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Until the map has moved.")] = True,
     server: ServerOption = "",
     keys: KeysOption = None,
@@ -71,9 +70,6 @@ def correct(
     trajectory = read_corrections(file)
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
     poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
-    if until is not None:
-        warn_of_old_name("--until", "--apply-until")
-        apply_until = until
     until_ns = ALWAYS if apply_until is None else round(apply_until * 1e9)
     endpoint = map_endpoint(endpoint) or endpoint
     with MapClient(endpoint, identity=server_identity(server, keys)) as client:

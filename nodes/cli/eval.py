@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.replay import ConfigOption, MaxFramesOption
-from semantic_mapper.nodes.cli.verb import PrintJsonOption, must_be_there, results_file, verb, warn_of_old_name
+from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, results_file, verb
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,7 +29,7 @@ OutOption = Annotated[
     typer.Option("--out", metavar="FILE", help="JSON; else eval.json in the first DIR, or LOG.eval.json."),
 ]
 WeightsOption = Annotated[
-    list[Path] | None,
+    Path | None,
     typer.Option("--weights", help="LOG: weights file; the one in the package without it."),
 ]
 BaselinesOption = Annotated[
@@ -64,19 +64,7 @@ def evaluate(
     config: ConfigOption = None,
     seed: SeedOption = None,
     out: OutOption = None,
-    json: PrintJsonOption = None,
-    suite: Annotated[Literal["rooms"] | None, typer.Option(hidden=True)] = None,
-    split: Annotated[Literal["test", "val"] | None, typer.Option(hidden=True)] = None,
-    rooms: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
-    protocol: Annotated[Literal["generalize", "finetune", "scratch"] | None, typer.Option(hidden=True)] = None,
-    kind: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
-    views: Annotated[int | None, typer.Option(min=1, max=16, hidden=True)] = None,
-    baseline: Annotated[Literal["wide", "narrow"] | None, typer.Option(hidden=True)] = None,
-    depth: Annotated[Literal["on", "off"] | None, typer.Option(hidden=True)] = None,
-    tier: Annotated[Literal["cpu", "gpu"] | None, typer.Option(hidden=True)] = None,
-    keyframes: Annotated[int | None, typer.Option(min=2, hidden=True)] = None,
-    steps: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
-    maps: Annotated[bool, typer.Option("--map", hidden=True)] = False,
+    json: JsonOption = False,
 ) -> int:
     """Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML beside it.
 
@@ -89,22 +77,7 @@ def evaluate(
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
     Example: semantic-mapper eval kitchen.mcap --instances kitchen/instance
     """
-    out, print_json = results_file(out, json)
-    if suite is not None:
-        warn_of_old_name(f"eval --suite {suite}", f"benchmark {suite}")
-        from semantic_mapper.nodes.cli.suite import run_suite_verb
-        from semantic_mapper.nodes.cli.suite_options import suite_config
-
-        if targets or baselines or mesh or instances or max_frames:
-            given_in_vain = "takes no DIR_OR_LOG, --baselines, --mesh, --instances or --max-frames"
-            raise typer.BadParameter(given_in_vain, param_hint="--suite")
-        given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline}
-        given |= {"depth": depth, "keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
-        settings = suite_config(config, tier, given, maps)
-        return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json)
-    given = (split, rooms, protocol, kind, views, baseline, depth, tier, keyframes, steps)
-    if maps or any(value is not None for value in given):
-        raise typer.BadParameter("is an option of `semantic-mapper benchmark rooms`", param_hint="this")
+    out, print_json = results_file(out), json
     if baselines and seconds == 0:
         raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
     must_be_there(*targets or ())
@@ -112,14 +85,8 @@ def evaluate(
     from semantic_mapper.nodes.cli.run_replay import mapper_config
 
     mapper = mapper_config(config, None, seed or 0)
-    options = _single(weights), baselines, baseline_s, max_frames, mapper, seed or 0, instances
+    options = weights, baselines, baseline_s, max_frames, mapper, seed or 0, instances
     return _evaluate_targets(targets or [], options, mesh, out, print_json=print_json)
-
-
-def _single(weights: list[Path] | None) -> Path | None:
-    if weights is not None and len(weights) > 1:
-        raise typer.BadParameter("give one; `semantic-mapper benchmark` compares several", param_hint="--weights")
-    return weights[0] if weights else None
 
 
 def _evaluate_targets(

@@ -39,7 +39,7 @@ from semantic_mapper.nodes.cli import train as cli_train
 from semantic_mapper.nodes.cli import up as cli_up
 from semantic_mapper.nodes.cli import view as cli_view
 from semantic_mapper.nodes.cli import weights as cli_weights
-from semantic_mapper.nodes.cli.verb import JsonCommand, Settings
+from semantic_mapper.nodes.cli.verb import Settings
 from semantic_mapper.redaction import without_secrets
 
 _UsageError = cast("type[Exception]", typer.BadParameter.__base__)  # Click's, or Typer's own copy of it
@@ -107,15 +107,14 @@ for _function in (
 app.add_typer(cli_fleet.app, name="fleet")
 app.add_typer(cli_keys.app, name="keys")
 app.add_typer(cli_launch.app, name="launch")
-app.add_typer(cli_fleet.app, name="fleet")
 
-app.command("eval", cls=JsonCommand)(cli_eval.evaluate)
+app.command("eval")(cli_eval.evaluate)
 # Coordinates below 0 look like options.
-app.command("query", cls=JsonCommand, context_settings={"ignore_unknown_options": True})(cli_query.query)
+app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)
 app.command("boxes", context_settings={"ignore_unknown_options": True})(cli_boxes.boxes)
 app.command("train")(cli_train.train)
-app.command("benchmark", cls=JsonCommand)(cli_benchmark.benchmark)
-app.command("bench", cls=JsonCommand)(cli_bench.bench)
+app.command("benchmark")(cli_benchmark.benchmark)
+app.command("bench")(cli_bench.bench)
 
 
 def _show_version(wanted: bool) -> None:

@@ -12,7 +12,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb
+from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def query(
     server: ServerOption = "",
     keys: KeysOption = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the answer here, as JSON.")] = None,
-    json: PrintJsonOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Ask a saved map, or that of a running mapper, what is where.
 
@@ -122,7 +122,7 @@ def query(
     from semantic_mapper.files import write_json
     from semantic_mapper.nodes.cli.map_answers import answer_table
 
-    out, output.quiet = results_file(out, json)
+    out, output.quiet = results_file(out), json
     for path in (out, picture):
         if path is not None:
             prepare_file(path)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb, warn_of_old_name
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 
@@ -38,7 +38,6 @@ def record(
     on_disk_full: Annotated[
         Literal["stop", "delete-oldest"], typer.Option(help="Stop, or delete the oldest parts of this recording.")
     ] = "stop",
-    disk_full: Annotated[Literal["stop", "delete-oldest"] | None, typer.Option(hidden=True)] = None,
     reserve_mb: Annotated[float, typer.Option(min=0, help="With so much left, the disk counts as full.")] = 500.0,
     jpeg: Annotated[
         int, typer.Option(min=0, max=100, help="Colour images as JPEG of this quality; 0 = as they are, lossless.")
@@ -62,9 +61,6 @@ def record(
     from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 
     prepare_file(log)
-    if disk_full is not None:
-        warn_of_old_name("--disk-full", "--on-disk-full")
-        on_disk_full = disk_full
     wanted = {
         "out": str(log),
         "source_timeout_s": HEAR_S,

@@ -17,7 +17,6 @@ from semantic_mapper.config import (
     check_quality,
     convert_config,
     read_toml,
-    rename_settings,
 )
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
@@ -170,7 +169,7 @@ def mapper_config(
     Raises:
         ConfigError: see ``load_config`` and ``check_quality``.
     """
-    data = rename_settings(read_toml(path) if path else {}, MapperConfig, str(path))
+    data = read_toml(path) if path else {}
     config = convert_config(data, MapperConfig, str(path))
     check_quality(data, quality or config.quality, str(path))
     if voxel_size_m is not None:

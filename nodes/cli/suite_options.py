@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.verb import warn_of_old_name
-
 if TYPE_CHECKING:
     from semantic_mapper.benchmark.config import SuiteConfig
 
@@ -42,7 +40,6 @@ CurrentOption = Annotated[
     Literal["clean", "hard"] | None,
     typer.Option(help="Query images as all others, or blurred, noisy, dark, narrow or too close.  [default: clean]"),
 ]
-BaselineOption = Annotated[Literal["wide", "narrow"] | None, typer.Option(hidden=True)]
 DepthOption = Annotated[
     Literal["on", "computed", "off"] | None,
     typer.Option(help="The sensor's depth, depth computed from the pictures of the walk, or none.  [default: on]"),
@@ -128,10 +125,6 @@ def suite_config(
     if tier is not None:
         plain["tier"] = to_plain(TIERS[tier])
     given = {name: value for name, value in given.items() if value is not None}
-    if (baseline := given.pop("baseline", None)) is not None:
-        sources = {"narrow": "near"}.get(baseline, baseline)
-        warn_of_old_name(f"--baseline {baseline}", f"--sources {sources} --no-own-image")
-        given = {"sources": sources, "own_image": False} | given
     if given.get("steps") and "seconds" not in given:
         given["seconds"] = 0.0
     for name, value in given.items():

@@ -11,12 +11,11 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec
+from typing import Annotated, ParamSpec
 
 import structlog
 import typer
 from rich.text import Text
-from typer.core import TyperCommand
 
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.nodes.cli.console import stderr_console
@@ -28,7 +27,6 @@ from semantic_mapper.redaction import without_secrets
 EXIT_FAILED = 1
 EXIT_UNTRUSTED = 3  # poses and depth of a recording contradict each other, so that its map cannot be trusted
 EXIT_INTERRUPTED = 130
-STDOUT = "-"
 MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
 MIN_OPTION = 1e-9  # of the same, but for 0: one divided by it must be a number
 
@@ -36,10 +34,7 @@ _log = structlog.get_logger(__name__)
 
 ParamsT = ParamSpec("ParamsT")
 
-# Of verbs whose ``--json`` named a file once; see ``JsonCommand``.
-PrintJsonOption = Annotated[
-    Path | None, typer.Option("--json", metavar="", help="Print JSON, and nothing else, on stdout.")
-]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
 
 
 class Settings:
@@ -82,32 +77,15 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
     return command
 
 
-class JsonCommand(TyperCommand):
-    """A command whose ``--json`` prints, and once named a file: ``--json FILE.json`` still writes, with a warning."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read ``--json`` without a file as ``--json -``."""
-        given: list[str] = []
-        for word, following in zip(args, [*args[1:], ""], strict=False):
-            given.append(word)
-            if word == "--json" and not following.endswith(".json") and following != "-":
-                given.append(STDOUT)
-        return super().parse_args(ctx, given)
-
-
-def results_file(out: Path | None, json: Path | None) -> tuple[Path | None, bool]:
-    """The file that ``--out`` or an old ``--json FILE`` names, and whether JSON is to be printed.
+def results_file(out: Path | None) -> Path | None:
+    """The file that ``--out`` names.
 
     Raises:
         typer.BadParameter: the file is there and is no JSON, such as weights that were named by mistake.
     """
-    print_json = json is not None and str(json) == STDOUT
-    if json is not None and not print_json:
-        warn_of_old_name("--json FILE", "--out FILE")
-        out = out or json
     if out is not None and out.is_file() and out.suffix != ".json":
         raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
-    return out, print_json
+    return out
 
 
 def must_be_there(*paths: Path) -> None:
@@ -121,11 +99,6 @@ def must_be_there(*paths: Path) -> None:
             raise LogError(f"{path}: cannot be read: no such file or folder")
         if not path.is_file() and not path.is_dir():
             raise LogError(f"{path}: cannot be read: it is no regular file; copy its content to one")
-
-
-def warn_of_old_name(old: str, new: str) -> None:
-    """One line on stderr for an option that has another name now."""
-    _log.warning("option_renamed", old=old, new=new)
 
 
 def _check_values(options: Mapping[str, object]) -> None:

@@ -11,7 +11,7 @@ from msgspec import to_builtins
 from semantic_mapper.errors import MapError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.verb import verb, warn_of_old_name
+from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ def weights(
         int | None,
         typer.Option(min=0, metavar="VERSION", help="Return to this version; 0 = that which the mapper started with."),
     ] = None,
-    to: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
     server: ServerOption = "",
     keys: KeysOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
@@ -48,11 +47,6 @@ def weights(
     Example: semantic-mapper weights live
     Example: semantic-mapper weights live --rollback
     """
-    if to is not None:
-        warn_of_old_name("--rollback --to", "--rollback-to")
-        if not rollback:
-            raise typer.BadParameter("goes with --rollback; --rollback-to VERSION is both", param_hint="--to")
-        rollback_to = to
     output = Output.guarded()
     from semantic_mapper.client import MapClient
     from semantic_mapper.nodes.supervisor.running_launches import map_endpoint

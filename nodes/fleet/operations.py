@@ -20,7 +20,6 @@ from semantic_mapper.config import (
     check_quality,
     convert_config,
     read_toml,
-    rename_settings,
     to_plain,
 )
 from semantic_mapper.errors import ConfigError
@@ -150,8 +149,7 @@ def read_settings(operation: str, assignments: Sequence[str], config: Path | Non
         _assign(plain, path, _value(value), name)
     settings = convert_config(plain, kind, "--set")
     if rest == _MAPPER:
-        mapper = rename_settings(plain.get(_MAPPER, {}), MapperConfig, "--set")
-        check_quality(mapper, settings.mapper.quality, "--set")  # pyright: ignore[reportAttributeAccessIssue]
+        check_quality(plain.get(_MAPPER, {}), settings.mapper.quality, "--set")  # pyright: ignore[reportAttributeAccessIssue]
     return settings
 
 
@@ -163,7 +161,6 @@ def _check_known(operation: str, first: str, name: str) -> None:
     if rest:
         inner: type[Config] = fields[rest]
         names += [field.encode_name for field in msgspec.structs.fields(inner)]
-        names += list(inner.old_names)
     if first not in names:
         near = difflib.get_close_matches(first, names, n=1, cutoff=0.5)
         mend = f"did you mean `{near[0]}`?" if near else f"there is {', '.join(names)}"

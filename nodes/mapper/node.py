@@ -103,9 +103,9 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
 
 def _given(options: MapperOptions) -> set[str]:
     """Names in ``voxel_map`` that the user has set."""
-    from semantic_mapper.config import MapperConfig, read_toml, rename_settings
+    from semantic_mapper.config import read_toml
 
-    told = rename_settings(read_toml(Path(options.config)), MapperConfig, options.config) if options.config else {}
+    told = read_toml(Path(options.config)) if options.config else {}
     return {*told.get("voxel_map", {}), *(("voxel_size_m",) if options.voxel_size_m else ())}
 
 

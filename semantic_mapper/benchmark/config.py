@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -101,12 +101,6 @@ SPACINGS: dict[SourceChoice, SpacingConfig] = {  # "cover": the mapper's own cho
 class SceneBudget(Config, frozen=True):
     """How a field is fitted to one room, for ``finetune`` and ``scratch``."""
 
-    old_names: ClassVar = {
-        "head_start": "linear_probe_steps",
-        "resting_share": "frozen_encoder_fraction",
-        "doubtful_share": "hard_example_fraction",
-    }
-
     keyframes: AtLeastTwo = 12  # labelled
     unlabelled: NotNegative = 0  # further frames of the room, which bring their images (and depth) as source views
     guard: NotNegative = 3  # frames on either side of a query that are no keyframes
@@ -124,9 +118,6 @@ class SceneBudget(Config, frozen=True):
 
 class SuiteConfig(Config, frozen=True):
     """A run of the benchmark."""
-
-    old_names: ClassVar = {"baseline": "sources"}
-    old_values: ClassVar = {"sources": {"narrow": "near"}, "depth": {True: "on", False: "off"}}
 
     split: Split = "test"
     rooms: NotNegative = 0  # the first this many of the split; 0 = all

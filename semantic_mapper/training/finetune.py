@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -95,12 +95,6 @@ class PanopticFitConfig(Config, frozen=True):
 
 class FinetuneConfig(Config, frozen=True):
     """Budget and optimiser of a finetuning."""
-
-    old_names: ClassVar = {
-        "head_start": "linear_probe_steps",
-        "resting_share": "frozen_encoder_fraction",
-        "held_out_share": "held_out_fraction",
-    }
 
     # Wall-clock budget of all of it, looks at held-out rays included; 0 = only steps count (then a run repeats bit for
     # bit). The first look is made in any case.

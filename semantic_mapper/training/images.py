@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
 
@@ -33,8 +32,6 @@ from semantic_mapper.types import SourceViews
 
 class ImageStepConfig(Config, frozen=True):
     """The first part of training, on single images."""
-
-    old_names: ClassVar = {"share": "fraction", "depth_withheld": "depth_dropout"}
 
     fraction: Fraction = 0.5  # of the budget; 0 = rays from the first step on
     later: Fraction = 0.0  # fraction of the steps after that which are still on images, at the rate of rays

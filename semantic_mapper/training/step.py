@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
 
@@ -40,17 +39,6 @@ LEAST_WORTH = 0.05  # of a view that sees nothing of the query: it may still be 
 
 class StepConfig(Config, frozen=True):
     """How a training step draws its views, rays and samples."""
-
-    old_names: ClassVar = {
-        "own_view_share": "own_view_fraction",
-        "balanced_share": "balanced_fraction",
-        "doubtful_share": "hard_example_fraction",
-        "depth_withheld": "depth_dropout",
-        "blind": "no_depth",
-        "labels_withheld": "label_dropout",
-        "blind_samples": "samples_without_depth",
-        "blind_thinning": "no_depth_thinning",
-    }
 
     rays: AtLeastOne = 1024
     views_min: AtLeastOne = 3  # source views of a step are drawn from views_min..views_max

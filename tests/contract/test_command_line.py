@@ -1,8 +1,4 @@
-"""The command line: every verb, option and default of then, and exit codes.
-
-An option that gets another name keeps the old one as a hidden alias that warns: hidden options count here, so that they
-must stay. Help texts are free.
-"""
+"""The command line: every verb, option and default of then, and exit codes. Help texts are free."""
 
 from __future__ import annotations
 
@@ -42,10 +38,10 @@ COMMANDS: dict[str, str] = {
     "import nothing": "import {tmp}/none {tmp}/none.mcap",
     "import with an impossible turn": "import {tmp}/sequence {tmp}/turned.mcap --rotate 45",
     "query info": "query {map} info",
-    "query at": "query {map} at 0.5 -0.5 0.25 --json {tmp}/at.json",
-    "query nearest": "query {stored} nearest wall 0 0 1 --json {tmp}/nearest.json",
-    "query instances": "query {map} instances --up 0 0 1 --json {tmp}/instances.json",
-    "query graph": "query {map} graph --up 0 0 1 --json {tmp}/graph.json",
+    "query at": "query {map} at 0.5 -0.5 0.25 --out {tmp}/at.json",
+    "query nearest": "query {stored} nearest wall 0 0 1 --out {tmp}/nearest.json",
+    "query instances": "query {map} instances --up 0 0 1 --out {tmp}/instances.json",
+    "query graph": "query {map} graph --up 0 0 1 --out {tmp}/graph.json",
     "query of an unknown class": "query {map} nearest unicorn 0 0 1",
     "query with too few numbers": "query {map} at 1 2",
     "query of an unknown kind": "query {map} why",
@@ -201,7 +197,7 @@ def make_places(folder: Path) -> dict[str, str]:
 _GOLDEN: dict[str, Any] = read("command_line")
 
 
-def unlike_option(then: dict[str, Any], now: dict[str, Any], *, hidden: bool) -> list[str]:
+def unlike_option(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """In what a parameter does not take what it took."""
     found = [key for key in ("kind", "nargs", "many", "flag") if then[key] != now[key]]
     if now["required"] and not then["required"]:
@@ -210,8 +206,8 @@ def unlike_option(then: dict[str, Any], now: dict[str, Any], *, hidden: bool) ->
         found.append("choices")
     if not then["choices"] and not _takes(now["type"], then["type"]):
         found.append("type")
-    if then["default"] != now["default"] and not (hidden and now["default"] in (None, False)):
-        found.append("default")  # an alias has none of its own
+    if then["default"] != now["default"]:
+        found.append("default")
     for bound, stricter in (("least", lambda a, b: b > a), ("most", lambda a, b: b < a)):
         a, b = then[bound], now[bound]
         if b is not None and (a is None or stricter(a, b)) and not now["choices"]:
@@ -228,29 +224,19 @@ def _takes(now: str, then: str) -> bool:
 def test_a_verb_takes_what_it_took(verb: str) -> None:
     now = verbs()
     assert verb in now
-    hidden = hidden_options(verb)
     wrong: list[str] = []
     for name, then in _GOLDEN["verbs"][verb]["options"].items():
         if name not in now[verb]["options"]:
             wrong.append(f"{name}: is no option any more")
             continue
-        wrong += [f"{name}: {w}" for w in unlike_option(then, now[verb]["options"][name], hidden=name in hidden)]
+        wrong += [f"{name}: {w}" for w in unlike_option(then, now[verb]["options"][name])]
     given = {name for name, entry in now[verb]["options"].items() if entry["required"]}
     wrong += [f"{name}: has to be given" for name in given - set(_GOLDEN["verbs"][verb]["options"])]
     was, has = _GOLDEN["verbs"][verb]["arguments"], now[verb]["arguments"]
     for n, then in enumerate(was):
-        wrong += [f"argument {n}: {w}" for w in unlike_option(then, has[n], hidden=False)] if n < len(has) else [f"{n}"]
+        wrong += [f"argument {n}: {w}" for w in unlike_option(then, has[n])] if n < len(has) else [f"{n}"]
     wrong += [f"argument {n} is new and required" for n in range(len(was), len(has)) if has[n]["required"]]
     assert wrong == []
-
-
-def hidden_options(verb: str) -> set[str]:
-    """Names of options that help texts do not show: old names."""
-    command = api.command_tree()
-    for word in verb.split() if verb != "semantic-mapper" else []:
-        command = command.commands[word]
-    options = [p for p in command.params if getattr(p, "hidden", False)]
-    return {name for p in options for name in (*p.opts, *p.secondary_opts)}
 
 
 _MIDDLE = list(COMMANDS).index("replay without a folder")  # no command behind it needs a file of one before it

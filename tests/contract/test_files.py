@@ -138,7 +138,7 @@ voxel_size_m = 0.03
 save_every_s = 60.0
 query = "query"
 learner = "finetuner"
-least_agreement = 0.5
+min_map_agreement = 0.5
 publish = "tcp://127.0.0.1:5572"
 
 [[node]]
@@ -161,7 +161,7 @@ kind = "finetuner"
 [node.options]
 mapper = "mapper"
 labels = "labels"
-share = 0.25
+cpu_fraction = 0.25
 threads = 1
 niceness = 18
 out = "{out}"

@@ -1,7 +1,4 @@
-"""Every name that a TOML file of users may hold is still taken, and stands for what it stood for.
-
-A setting that is renamed goes on being read under its old name, with one warning.
-"""
+"""Every name that a TOML file of users may hold is still taken, and stands for what it stood for."""
 
 from __future__ import annotations
 

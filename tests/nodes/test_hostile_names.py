@@ -84,7 +84,7 @@ def test_names_in_results_maps_and_scores_are_text(hostile: Path, results: Path,
     for arguments in (
         ("info", results / "map.npz"),
         ("eval", results),
-        ("eval", log, "--weights", weights, "--config", config, "--json", tmp_path / "eval.json"),
+        ("eval", log, "--weights", weights, "--config", config, "--out", tmp_path / "eval.json"),
         ("compare", results, results),
         ("query", results, "instances"),
         ("query", results, "class", "[/b]"),

@@ -312,8 +312,8 @@ def test_a_log_with_computed_depth_replays_as_computed_and_off_leaves_it_out(
             "--depth",
             source,
         )
-        assert done.returncode == 0, done.stderr
         summary = json.loads((tmp_path / source / "summary.json").read_text())
+        assert done.returncode == (0 if summary["map"]["surface_points"] else 3), done.stderr
         assert summary["depth"][key] == 1.0
 
 

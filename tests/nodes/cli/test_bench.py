@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.nodes.support import error_line, run
 
-SMALL = ("--rooms", "2", "--returns", "1", "--minutes", "0.2", "--hz", "1", "--width", "96")
+SMALL = ("--rooms", "2", "--loops", "1", "--minutes", "0.2", "--hz", "1", "--width", "96")
 
 
 def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Path, config: Path) -> None:
@@ -24,5 +24,5 @@ def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Pat
 
 
 def test_a_walk_that_is_none_is_refused_with_what_it_needs(weights: Path, config: Path) -> None:
-    done = run("bench", "map", *SMALL, "--returns", "5", "--weights", weights, "--config", config)
+    done = run("bench", "map", *SMALL, "--loops", "5", "--weights", weights, "--config", config)
     assert done.returncode == 1 and "returns" in error_line(done.stderr)

@@ -24,7 +24,7 @@ CONFIG = tiny_config(keyframes={"source_views": 2}, sampling={"guided": 4})
 def test_every_kind_of_question_is_asked_while_frames_are_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
     file = tmp_path / "bench.json"
     options = ("--weights", weights, "--config", config, "--frames", "12", "--rate", "400", "--width", "96")
-    done = run("bench", "queries", *options, "--json", file)
+    done = run("bench", "queries", *options, "--out", file)
     assert done.returncode == 0, done.stderr
     assert "waiting for an answer at most 0 ms" in done.stdout and "distance_field" in done.stdout
     written = json.loads(file.read_text(encoding="utf-8"))

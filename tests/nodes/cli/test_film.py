@@ -109,7 +109,8 @@ def test_what_is_no_film_is_refused_by_the_verb(tmp_path: Path) -> None:
 
 
 def test_weights_that_are_not_there_are_told_before_the_film_is_read(tmp_path: Path) -> None:
-    done = run("map", tmp_path / "none.mp4", "--out", tmp_path / "out", "--weights", tmp_path / "nope.safetensors")
+    (tmp_path / "a.mp4").write_bytes(b"no film")
+    done = run("map", tmp_path / "a.mp4", "--out", tmp_path / "out", "--weights", tmp_path / "nope.safetensors")
     assert done.returncode == 1 and "nope.safetensors" in done.stderr
 
 

@@ -59,7 +59,7 @@ def test_log_without_labels_is_refused(weights: Path, tmp_path: Path) -> None:
 
 def test_eval_shows_replays_side_by_side_and_writes_json(replayed: Path, tmp_path: Path) -> None:
     file = tmp_path / "figures" / "eval.json"
-    done = run("eval", replayed, "--json", file)
+    done = run("eval", replayed, "--out", file)
     assert done.returncode == 0, done.stderr
     assert "mIoU" in done.stdout and "replayed" in done.stdout
     written = json.loads(file.read_text())
@@ -70,7 +70,7 @@ def test_eval_of_a_log_compares_with_baselines_on_frames_that_nobody_was_fitted_
     log: Path, tuned: Path, config: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "eval.json"
-    done = run("eval", log, "--weights", tuned, "--baselines", "--seconds", "1", "--config", config, "--json", file)
+    done = run("eval", log, "--weights", tuned, "--baselines", "--seconds", "1", "--config", config, "--out", file)
     assert done.returncode == 0, done.stderr
     scores = json.loads(file.read_text())["logs"][str(log)]
     assert scores["scored"] == 3 and scores["excluded"] == 3

@@ -148,11 +148,9 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
         assert wrong.returncode == 1 and "floor, table, cup, lamp" in wrong.stderr.replace("\n", " ")
 
 
-def test_json_is_printed_alone_and_an_old_file_is_still_written(map_file: Path, tmp_path: Path) -> None:
+def test_json_is_printed_alone(map_file: Path) -> None:
     printed = run("query", map_file, "--json", "nearest", "cup", "0", "0", "1")
     assert json.loads(printed.stdout)["class"] == "cup"
-    old = run("query", map_file, "info", "--json", tmp_path / "old.json")
-    assert json.loads((tmp_path / "old.json").read_text())["frames"] == 14 and "old='--json FILE'" in old.stderr
     piped = run("query", map_file, "instances").stdout
     assert "table" in piped and not set("│┃━─") & set(piped) and " \n" not in piped
 

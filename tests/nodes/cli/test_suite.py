@@ -138,10 +138,8 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("eval", "log.mcap", "--suite", "rooms"),
         ("eval", "log.mcap", "--kind", "unet"),
         ("eval", "log.mcap", "--rooms", "2"),
-        ("eval", "log.mcap", "--weights", "a", "--weights", "b"),
         ("benchmark", "rooms", "--protocol", "finetune", "--sources", "wide"),
         ("benchmark", "rooms", "--protocol", "finetune", "--no-own-image"),
-        ("benchmark", "rooms", "--protocol", "finetune", "--baseline", "wide"),
         ("benchmark", "rooms", "--seconds", "3"),
         ("benchmark", "rooms", "--keyframes", "3"),
         ("benchmark", "klevr", "--rooms", "3"),
@@ -164,22 +162,6 @@ def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, .
     done = run(*arguments)
     assert done.returncode == 2, done.stderr
     assert "Usage: semantic-mapper" in done.stderr
-
-
-def test_the_old_form_of_the_verb_warns_and_does_the_same(tmp_path: Path) -> None:
-    out = tmp_path / "old.json"
-    old = run("eval", "--suite", "rooms", "--rooms", "21", "--json", out)
-    assert old.returncode == 1 and "has 20 rooms" in old.stderr
-    assert "old='eval --suite rooms'" in old.stderr and "new='benchmark rooms'" in old.stderr
-    assert "old='--json FILE'" in old.stderr
-
-
-def test_the_old_option_of_the_source_views_warns_and_leaves_the_own_image_out(suite: Path, tmp_path: Path) -> None:
-    out = tmp_path / "old.json"
-    old = run("benchmark", "rooms", "--config", suite, "--rooms", "1", "--baseline", "wide", "--out", out)
-    assert old.returncode == 0 and "new='--sources wide --no-own-image'" in old.stderr
-    found = json.loads(out.read_text())["suite"]
-    assert found["sources"] == "wide" and found["own_image"] is False
 
 
 def test_more_rooms_than_there_are_is_refused() -> None:

@@ -318,7 +318,7 @@ def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(
     name: str, given: list[str], tmp_path: Path
 ) -> None:
     path = REPLAY_LAUNCH.with_name(name)
-    launch = load_launch(path, [*given, "share=0.25"], tmp_path)
+    launch = load_launch(path, [*given, "cpu_fraction=0.25"], tmp_path)
     options = launch.options["finetuner"]
     assert isinstance(options, FinetunerOptions) and options.cpu_fraction == 0.25 and options.inputs() == ("mapper",)
     assert options.niceness == (18 if name == "learning.toml" else 19)
