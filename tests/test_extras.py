@@ -64,7 +64,7 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh
                 'pip install "semantic-mapper[fleet]"',
             )
             for arguments in (
-                ["fleet", "run", "replay", "a.mcap", "--out", "none"],
+                ["fleet", "run", "replay", __file__, "--out", "none"],
                 ["fleet", "table", "none"],
                 ["train", "--out", "none", "--ray", "local"],
             )

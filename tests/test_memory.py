@@ -77,7 +77,7 @@ def test_a_package_that_was_loaded_in_part_lacks_memory_where_there_is_a_limit(m
 
 
 def test_a_verb_that_may_not_use_enough_memory_says_so() -> None:
-    limited = f"ulimit -v 1500000; exec '{COMMAND}' replay none.mcap --out none"
+    limited = f"ulimit -v 1500000; exec '{COMMAND}' replay {__file__} --out none"
     done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     line = error_line(done.stderr)

@@ -15,7 +15,7 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import PICTURES, ImportOptions, inside
 from semantic_mapper.replay.importers.placed import place_model
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
-from semantic_mapper.replay.sfm.colmap_model import ColmapModel, find_models, read_model
+from semantic_mapper.replay.sfm.colmap_model import ColmapImage, ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
 
 
@@ -28,24 +28,30 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     notices: list[str] = []
     place, model = _largest(folder, notices)
     roots = list(dict.fromkeys((folder / "images", *(parent / "images" for parent in place.parents[:3]), folder)))
-    found = {root: [inside(root, image.name).is_file() for image in model.images] for root in roots}
+    found = {root: [(root / image.name).is_file() for image in model.images] for root in roots}
     root = max(roots, key=lambda root: sum(found[root]))
     if not any(found[root]):
         name = model.images[0].name
         raise ImportSourceError(f"{folder}: the pictures of the model are missing; '{name}' is not in {roots[0]}")
     if model.left_out:
         notices.append(f"{counted(len(model.left_out), 'image')} left out; the first: {model.left_out[0]}")
-    names = {inside(root, image.name) for image in model.images}
-    unposed = [path for path in sorted(root.rglob("*")) if path.suffix.lower() in PICTURES and path not in names]
-    if root != folder and unposed:
+    images: list[tuple[Path, ColmapImage]] = []
+    for image in model.images:
+        try:
+            images.append((inside(root, image.name), image))
+        except ImportSourceError as error:
+            notices.append(f"1 image left out: {error}")
+    if not images:
+        raise ImportSourceError(notices[-1])
+    names = {file for file, _ in images}
+    beside = root.iterdir() if root == folder else root.rglob("*")
+    unposed = [path for path in sorted(beside) if path.suffix.lower() in PICTURES and path not in names]
+    if unposed:
         notices.append(
             f"{counted(len(unposed), 'picture')} in {root} without a pose in this model; the first: {unposed[0].name}"
         )
-    poses = np.stack([image.T_world_camera for image in model.images])
-    pictures = [
-        PosedPicture(inside(root, image.name), model.cameras[image.camera_id], image.T_world_camera)
-        for image in model.images
-    ]
+    poses = np.stack([image.T_world_camera for _, image in images])
+    pictures = [PosedPicture(file, model.cameras[image.camera_id], image.T_world_camera) for file, image in images]
     placed = place_model(poses, pictures, options, lambda: _depth(model))
     opened = placed.pictures("colmap", folder, pictures, options)
     opened.notices += notices

@@ -48,8 +48,8 @@ Vector = tuple[float, float, float]
 
 
 class _Camera(msgspec.Struct):
-    width: int
-    height: int
+    width: float
+    height: float
     projection_type: str = "perspective"
     focal: float | None = None
     focal_x: float | None = None
@@ -68,7 +68,7 @@ class _Shot(msgspec.Struct):
     rotation: Vector
     translation: Vector
     camera: str
-    capture_time: float | None = None  # seconds; 0 = not known
+    capture_time: Any = None  # seconds; 0 = not known
 
 
 class _Reference(msgspec.Struct):
@@ -78,17 +78,10 @@ class _Reference(msgspec.Struct):
 
 
 class _Model(msgspec.Struct):
-    cameras: dict[str, dict[str, Any]]
-    shots: dict[str, dict[str, Any]]
+    cameras: dict[str, dict[str, Any]] = {}
+    shots: dict[str, dict[str, Any]] = {}
+    points: dict[str, dict[str, Any]] = {}
     reference_lla: _Reference | None = None
-
-
-class _Point(msgspec.Struct):
-    coordinates: Vector
-
-
-class _Points(msgspec.Struct):
-    points: dict[str, _Point] = {}
 
 
 def find_opensfm(folder: Path) -> Path | None:
@@ -105,7 +98,8 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     file = find_opensfm(folder)
     if file is None:
         raise ImportSourceError(f"{folder}: no {FILE} in it, or below opensfm/")
-    models = [convert_known(model, _Model, str(file)) for model in read_plain_json(file, MAX_BYTES, list)]
+    plain = read_plain_json(file, MAX_BYTES, list)
+    models = [_Model() if not isinstance(model, dict) else convert_known(model, _Model, str(file)) for model in plain]
     number = max(range(len(models)), key=lambda n: len(models[n].shots), default=-1)
     if number < 0 or not models[number].shots:
         raise ImportSourceError(f"{file}: holds no posed picture")
@@ -132,13 +126,13 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     poses = np.stack([picture.T_world_camera for picture in pictures])
     reference = model.reference_lla or _reference_beside(file)
     if reference is None or not (reference.latitude or reference.longitude):
-        placed = place_model(poses, pictures, options, lambda: _depth(file, number, pictures))
+        placed = place_model(poses, pictures, options, lambda: _depth(model.points, pictures))
     elif options.scale is not None:
         raise ImportSourceError(f"{file}: is in metres already, by GPS; leave out --scale")
     else:
         origin = GpsPosition(reference.latitude, reference.longitude, reference.altitude)
         said = ["scale, up and north are those that OpenSfM found by GPS"]
-        far = scene_depth(_depth(file, number, pictures))
+        far = scene_depth(_depth(model.points, pictures))
         placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin), **far})
     opened = placed.pictures("opensfm", folder, pictures, options)
     opened.notices += unknown_notice(file, unknown_keys(model.cameras.values(), _Camera))
@@ -190,7 +184,8 @@ def _picture(
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3] = cv2.Rodrigues(np.array(shot.rotation))[0]
     T_camera_world[:3, 3] = shot.translation
-    time_s = shot.capture_time if shot.capture_time and 0 < shot.capture_time < MAX_STAMP_NS / 1e9 else None
+    time = shot.capture_time
+    time_s = time if isinstance(time, int | float) and 0 < time < MAX_STAMP_NS / 1e9 else None
     stamp_ns = None if time_s is None else round(time_s * 1e9)
     return PosedPicture(inside(root, name), camera, invert_pose(T_camera_world), stamp_ns=stamp_ns)
 
@@ -209,20 +204,21 @@ def _intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
     size = max(camera.width, camera.height)
     cx, cy = camera.c_x * size + camera.width / 2 - 0.5, camera.c_y * size + camera.height / 2 - 0.5
     lens = (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3)
+    if fisheye and (camera.p1 or camera.p2):
+        raise ImportSourceError(f"{where}: a fisheye with p1 and p2 is not read; run `opensfm undistort`")
     if fisheye:
         lens = (camera.k1, camera.k2, camera.k3, camera.k4)
     try:
-        sides = (camera.width, camera.height)
+        sides = (int(camera.width), int(camera.height))
         return lens_intrinsics("fisheye" if fisheye else "opencv", lens, (fx * size, fy * size, cx, cy), sides)
     except (ConfigError, FrameError) as error:
         raise ImportSourceError(f"{where}: {error}") from error
 
 
-def _depth(file: Path, number: int, pictures: list[PosedPicture]) -> float:
+def _depth(points: Mapping[str, Mapping[str, Any]], pictures: list[PosedPicture]) -> float:
     """Median depth of the points in front of some cameras and within their pictures; 0 = there are none."""
-    points = _read(file, list[_Points])[number].points.values()
-    xyz = np.array([point.coordinates for point in points], np.float64).reshape(-1, 3)
-    xyz = xyz[:: max(1, len(xyz) // _POINTS)]
+    rows = [row for point in points.values() if isinstance(row := point.get("coordinates"), list) and len(row) == 3]
+    xyz = np.array([row for row in rows[:: max(1, len(rows) // _POINTS)] if None not in row], np.float64).reshape(-1, 3)
     step = max(1, len(pictures) // _LOOKED_AT)
     frames = [PlacedFrame(0, p.T_world_camera, _seen(xyz, p)) for p in pictures[::step]]
     return median_depth(frames) if any(len(frame.xyz) for frame in frames) else 0.0

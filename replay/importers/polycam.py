@@ -28,6 +28,7 @@ from semantic_mapper.replay.importers.base import (
     refuse_keys,
     unknown_keys,
     unknown_notice,
+    without_picture,
 )
 from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -66,9 +67,17 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
     """
     keyframes = folder / "keyframes"
     corrected = (keyframes / "corrected_cameras").is_dir() and (keyframes / "corrected_images").is_dir()
-    kind = "corrected_" if corrected else ""
     notices: list[str] = []
-    images = numbered_files(keyframes / f"{kind}images", PICTURES, notices)
+    all_images = numbered_files(keyframes / "images", PICTURES, notices)
+    images = numbered_files(keyframes / "corrected_images", PICTURES, notices) if corrected else all_images
+    if corrected and not images:
+        notices.append(f"{keyframes / 'corrected_images'} is empty: ARKit's own pictures and poses are taken")
+        corrected, images = False, all_images
+    kind = "corrected_" if corrected else ""
+    cameras = numbered_files(keyframes / f"{kind}cameras", (".json",), notices)
+    notices += without_picture("camera", cameras, images, keyframes / f"{kind}images")
+    if missing := {*all_images} - {*images}:
+        notices.append(f"{counted(len(missing), 'picture')} of images/ that corrected_images/ lacks left out")
     if not images:
         raise ImportSourceError(f"{keyframes / 'images'}: no pictures; export 'raw data' (developer mode)")
     first = min(images)

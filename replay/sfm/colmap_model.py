@@ -34,6 +34,13 @@ MODELS: dict[int, tuple[str, int]] = {
     8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }
 _NAMES = ("cameras", "images", "points3D")
 
@@ -66,7 +73,7 @@ class ColmapModel:
         images: In the order of their names, by the numbers in these.
         points: (3,) of each point by its id.
         errors_px: Mean reprojection error of each point, by its id.
-        left_out: Why images are left out.
+        left_out: What is left out, and why.
     """
 
     cameras: dict[int, CameraIntrinsics]
@@ -116,7 +123,7 @@ def read_model(folder: Path) -> ColmapModel:
             broken[camera.number] = str(error)
     images: list[ColmapImage] = []
     left_out: list[str] = []
-    for row in _images_bin(files[1]) if binary else _images_txt(files[1]):
+    for row in _images_bin(files[1]) if binary else _images_txt(files[1], left_out):
         try:
             if row.camera_id not in cameras:
                 missing = f"{files[1]}: image '{row.name}' has camera {row.camera_id}, which is missing"
@@ -127,10 +134,13 @@ def read_model(folder: Path) -> ColmapModel:
     if left_out and not images:
         raise ImportSourceError(left_out[0])
     images.sort(key=lambda image: numeric_order(image.name))
-    rows = () if not files[2].exists() else _points_bin(files[2]) if binary else _points_txt(files[2])
     points, errors = {}, {}
-    for number, xyz, error in rows:
-        points[number], errors[number] = xyz, error
+    try:
+        rows = () if not files[2].exists() else _points_bin(files[2]) if binary else _points_txt(files[2])
+        for number, xyz, error in rows:
+            points[number], errors[number] = xyz, error
+    except ImportSourceError as error:  # poses need no points
+        left_out.append(f"points, but for the first {len(points)}: {error}")
     return ColmapModel(cameras, tuple(images), points, errors, tuple(left_out))
 
 
@@ -140,23 +150,24 @@ def intrinsics_of(model: str, width: int, height: int, params: list[float], wher
     Raises:
         ImportSourceError: a lens that neither OpenCV's pinhole nor its fisheye model has, or impossible values.
     """
+    advice = (
+        f"{where}: the lens model '{model}' is not read; undistort the images (`colmap image_undistorter`) and "
+        "import the model that comes out"
+    )
     wanted = dict(MODELS.values()).get(model)
-    if wanted is None or wanted != len(params):
-        raise ImportSourceError(f"{where}: camera model '{model}' with {len(params)} parameters is not known")
+    if wanted is None or wanted != len(params) or model == "EQUIRECTANGULAR":
+        raise ImportSourceError(f"{advice} ({len(params)} parameters)")
     one_focal = model.startswith(("SIMPLE", "RADIAL"))
     fx, fy, cx, cy, *lens = (params[0], *params) if one_focal else params
-    if model == "FOV" and not any(lens):
-        model = "PINHOLE"
+    if model in ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM") and not lens[0]:
+        model, lens = "PINHOLE", []
     if model == "THIN_PRISM_FISHEYE":  # k1 k2 p1 p2 k3 k4 sx1 sy1
         k1, k2, p1, p2, k3, k4, *prism = lens
         if not any((p1, p2, *prism)):
             model, lens = "OPENCV_FISHEYE", [k1, k2, k3, k4]
-    fisheye = model in ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+    fisheye = model in ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
     if not fisheye and model not in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"):
-        raise ImportSourceError(
-            f"{where}: the lens model '{model}' is not read; undistort the images (`colmap image_undistorter`) and "
-            "import the model that comes out"
-        )
+        raise ImportSourceError(advice)
     try:
         return lens_intrinsics("fisheye" if fisheye else "opencv", lens, (fx, fy, cx - 0.5, cy - 0.5), (width, height))
     except (ConfigError, FrameError) as error:
@@ -263,15 +274,16 @@ def _points_bin(file: Path) -> Iterator[tuple[int, Float64, float]]:
 def _cameras_txt(file: Path) -> Iterator[_CameraRow]:
     for line, words in _lines(file):
         try:
-            number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+            number, model, width, height = int(words[0]), words[1], int(float(words[2])), int(float(words[3]))
             params = [float(word) for word in words[4:]]
-        except (ValueError, IndexError) as error:
+        except (ValueError, IndexError, OverflowError) as error:
             raise _bad_line(file, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", error) from error
         yield _CameraRow(number, model, width, height, params, f"{file}, line {line}")
 
 
-def _images_txt(file: Path) -> Iterator[_ImageRow]:
-    """Two lines an image; the second one, its features, may be empty."""
+def _images_txt(file: Path, left_out: list[str]) -> Iterator[_ImageRow]:
+    """Two lines an image; the second one, its features, may be empty. Sentences on lines that cannot be read go into
+    ``left_out``."""
     rows = iter(_lines(file, empty=True))
     for line, words in rows:
         if not words:
@@ -282,12 +294,15 @@ def _images_txt(file: Path) -> Iterator[_ImageRow]:
                 raise ValueError("too few values")
         except (ValueError, IndexError) as error:
             form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            raise _bad_line(file, line, form, error) from error
+            left_out.append(str(_bad_line(file, line, form, error)))
+            next(rows, None)  # its features
+            continue
         line, words = next(rows, (line + 1, []))
         try:
             features = np.array([float(word) for word in words]).reshape(-1, 3)
-        except ValueError as error:
-            raise _bad_line(file, line, "X Y POINT3D_ID ...", error) from error
+        except ValueError as error:  # its pose is good
+            left_out.append(str(_bad_line(file, line, "X Y POINT3D_ID ...", error)))
+            features = np.empty((0, 3))
         points = features[:, 2].astype(np.int64)
         yield _ImageRow(name, camera, pose, features[:, :2] - 0.5, points)
 
@@ -312,7 +327,7 @@ def _image(row: _ImageRow, file: Path) -> ColmapImage:
 
 def _lines(file: Path, *, empty: bool = False) -> Iterator[tuple[int, list[str]]]:
     try:
-        lines = read_regular(file, MAX_BYTES).decode("utf-8", "replace").splitlines()
+        lines = read_regular(file, MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
     except OSError as error:
         raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
     for number, line in enumerate(lines, 1):

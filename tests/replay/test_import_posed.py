@@ -289,8 +289,8 @@ def arkit(T: Float64) -> Float64:
     return T_y_up @ T @ GL
 
 
-def test_polycam_raw_data_come_with_poses_times_and_trusted_depth(tmp_path: Path) -> None:
-    folder = tmp_path / "capture"
+def make_polycam(folder: Path) -> Path:
+    """A capture with corrected pictures and poses, a quarter second apart."""
     names = [str(5_000_000 + 250_000 * n) for n in range(3)]
     for kind in ("images", "corrected_images"):
         write_pictures(folder / "keyframes" / kind, [f"{name}.jpg" for name in names])
@@ -305,7 +305,11 @@ def test_polycam_raw_data_come_with_poses_times_and_trusted_depth(tmp_path: Path
         confidence[:, 0] = 0
         cv2.imwrite(str(folder / "keyframes" / "depth" / f"{name}.png"), np.full((H // 4, W // 4), 1250, np.uint16))
         cv2.imwrite(str(folder / "keyframes" / "confidence" / f"{name}.png"), confidence)
-    report, frames = imported(folder)
+    return folder
+
+
+def test_polycam_raw_data_come_with_poses_times_and_trusted_depth(tmp_path: Path) -> None:
+    report, frames = imported(make_polycam(tmp_path / "capture"))
     assert (report.format, report.with_depth, report.info.scale_known) == ("polycam", 3, True)
     for n, (frame, T) in enumerate(zip(frames, poses(), strict=True)):
         assert np.allclose(frame.T_world_camera, T, atol=1e-9) and frame.stamp_ns == 250_000_000 * n
