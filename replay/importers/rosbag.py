@@ -134,11 +134,12 @@ class RosbagRecording:
         depth_info = options.topics.get("depth_info", "")
         if depth is not None and (depth_info or self._has_info(depth)):
             infos[depth.name] = self._info_topic(depth, depth_info)
+        self._color_topic = color
         self._tree = TransformTree()
         self._stamps: dict[str, list[tuple[int, int]]] = {t.name: [] for t in (color, depth) if t is not None}
         self._first_image: dict[str, Any] = {}  # of each of these topics
         calibrations, poses = self._read_all({*infos.values(), *self._bag.topics(_INFO)})
-        self._color, self._color_topic = self._stamps[color.name], color
+        self._color = self._stamps[color.name]
         self._measured = self._intrinsics(color, calibrations[infos[color.name]], infos[color.name])
         self._T_frame_image = self._image_pose(color, calibrations[infos[color.name]])
         if "info" not in options.topics:
@@ -360,7 +361,7 @@ class RosbagRecording:
         poses: dict[str, list[Any]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
         transforms = self._bag.topics(*_TF)
         unstamped = 0
-        for name, received_ns, message in self._bag.messages({*self._stamps, *infos, *transforms, *poses}):
+        for name, received_ns, message, node in self._bag.messages({*self._stamps, *infos, *transforms, *poses}):
             if name in self._stamps:
                 stamp_ns = stamp_of(message.header)
                 unstamped += not stamp_ns
@@ -369,10 +370,10 @@ class RosbagRecording:
             elif name in calibrations:
                 calibrations[name].append(message)
             elif name in transforms:
-                self._tree.add(message.transforms, fixed=name.endswith("tf_static"))
+                self._tree.add(message.transforms, name, node, received_ns)
             else:
                 poses[name].append(message)
-        self.notices += self._tree.close()
+        self.notices += self._tree.close(self._color_topic.name)
         if unstamped:
             self.notices.append(f"{unstamped} images have no stamp: the time at which they were recorded stands for it")
         return calibrations, poses
@@ -421,6 +422,8 @@ class RosbagRecording:
         color = self._color_topic
         own = own if own is None or own.distorted or not self._is_scaled(own) else self._measured
         linked = depth.frame != color.frame and self._tree.reaches(color.frame, depth.frame)
+        if linked:
+            self._check_sources(color.frame, depth.frame)
         T = self._tree.lookup(color.frame, depth.frame, self._color[0][0], MAX_STAMP_NS) if linked else np.eye(4)
         if own is None:
             self.notices.append(f"{depth.name} has no calibration: it is taken as registered to {color.name}")
@@ -451,6 +454,7 @@ class RosbagRecording:
         camera, tree = self._color_topic.frame, self._tree
         if not topic:
             world = self._world(camera)
+            self._check_sources(world, camera)
             self._moving = tree.moving_above(camera, world)
 
             def from_tf(stamp_ns: int) -> Float64 | None:
@@ -464,7 +468,12 @@ class RosbagRecording:
                 f"{self._bag.src}: {topic} tells where '{body}' is, but tf does not say where the camera '{camera}' "
                 f"sits on it; record tf_static, or say with --body {camera} that the poses are the camera's"
             )
-
+        self._check_sources(body, camera)
+        if jump := track.jump_m():
+            raise ImportSourceError(
+                f"{self._bag.src}: the poses of {topic} jump to and fro by {jump:.2g} m or rad: two programs publish "
+                "it; record one of them, or name another topic: --topic pose=NAME"
+            )
         self._moving = [(topic, track)]
         self.notices += track.oddities(topic)
 
@@ -476,6 +485,13 @@ class RosbagRecording:
             return T_world_body @ T_body_camera @ self._T_frame_image
 
         return pose_at, f"poses are those of {camera}, from {topic} of {body}"
+
+    def _check_sources(self, target: str, source: str) -> None:
+        """Raises: ImportSourceError: tf has two truths about a transform between the frames."""
+        try:
+            self._tree.check(target, source)
+        except ImportSourceError as error:
+            raise ImportSourceError(f"{self._bag.src}: {error}") from error
 
     def _image_pose(self, color: _Topic, infos: list[Any]) -> Float64:
         """``T_frame_image`` (4, 4): how a stereo camera's rectification has turned the image within its frame."""
@@ -653,7 +669,7 @@ class _Bag:
         found: list[_Topic] = []
         for kind, field in ((_RAW, "encoding"), (_COMPRESSED, "format")):
             for name in self.topics(kind):
-                _, _, message = next(self.messages({name}), ("", 0, None))
+                _, _, message, _ = next(self.messages({name}), ("", 0, None, ""))
                 if message is not None:
                     encoding = str(getattr(message, field))
                     # The RealSense Viewer gives all cameras one frame, "0", although they stand apart.
@@ -662,11 +678,12 @@ class _Bag:
                     found.append(_Topic(name, kind == _RAW, encoding, frame))
         return found
 
-    def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time of recording, and message, in the order of recording."""
+    def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any, str]]:
+        """Topic, time of recording, message, and its node (ROS 1; else empty), in the order of recording."""
         with self._explained():
             for connection, received_ns, data in self._reader.messages(connections=self._connections(names)):
-                yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype)
+                node = "" if self._is_ros2 else connection.ext.callerid or ""
+                yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype), node
 
     def message(self, name: str, series: list[tuple[int, int]], index: int) -> Any:
         """One message of a topic; quick where they are asked for in order.

@@ -1,0 +1,156 @@
+"""Bags as robots record them: transforms of two sources, calibrations that drift, messages without stamp or frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.replay.importers.ros_transforms import Track
+
+from . import bags
+from .bags import CAMERA, Event, Messages
+from .test_import_rosbag import FRAMES, imported, make, notice
+
+LONG = [FRAMES[0]] * 8  # of a robot that stands still
+MS = 1_000_000
+Change = Callable[[Messages, list[Event]], list[Event]]
+
+
+def aside(T: np.ndarray, metres: float) -> np.ndarray:
+    T = T.copy()
+    T[1, 3] += metres
+    return T
+
+
+def second_source(topic: str, metres: float, later_ns: int = 5 * MS) -> Change:
+    """The robot's odometry again, on a topic, from one who sees it elsewhere."""
+
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        told = list(events)
+        for n, T in enumerate(bags.bodies(LONG)):
+            ns = bags.stamp_of(n) + later_ns
+            told.append((topic, ns, m.tf(ns, "odom", "base_link", aside(T, metres))))
+        return told
+
+    return change
+
+
+def test_two_programs_that_publish_one_transform_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ImportSourceError, match=r"'base_link' on 'odom' jumps to and fro by 0\.5 m.*--topic pose=NAME"):
+        imported(make(tmp_path / "one", "mcap", second_source("/tf", 0.5), LONG))
+    assert imported(make(tmp_path / "two", "mcap", second_source("/tf", 0.0), LONG))[0].frames == 8
+
+    # Of ROS 1 the nodes are known, whatever their rates.
+    with pytest.raises(ImportSourceError, match=r"'base_link' on 'odom' is told by /tf and, otherwise, by /tf of /ekf"):
+        imported(make(tmp_path / "three", "ros1", second_source("/tf@/ekf", 0.1, 0), LONG))
+    src = make(tmp_path / "again", "ros1", second_source("/tf@/ekf", 0.1, bags.PERIOD_NS * 8), LONG)
+    assert imported(src)[0].frames == 8  # it was started after the first had ended
+
+
+def test_two_sources_of_a_transform_do_no_harm_where_another_topic_tells_the_poses(tmp_path: Path) -> None:
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        events = second_source("/tf", 0.5)(m, events)
+        odometry = [
+            ("/odom", bags.stamp_of(n), m.odometry(bags.stamp_of(n), T, "base_link"))
+            for n, T in enumerate(bags.bodies(LONG))
+        ]
+        return [*events, *odometry]
+
+    _, frames = imported(make(tmp_path, "mcap", change, LONG), topics={"pose": "/odom"})
+    assert np.abs(frames[3].T_world_camera - bags.bodies(LONG)[3] @ bags.camera_on_base()).max() < 1e-6
+
+
+def test_of_two_robots_with_equal_frames_the_one_of_the_images_counts(tmp_path: Path) -> None:
+    def robots(camera: str) -> Change:
+        def change(m: Messages, events: list[Event]) -> list[Event]:
+            own: list[Event] = []
+            for topic, ns, message in events:
+                topic = f"/r1{topic}" if topic.startswith("/tf") else topic.replace("/cam/", f"{camera}/")
+                own.append((topic, ns, message))
+            return second_source("/r2/tf", 5.0)(m, own)
+
+        return change
+
+    report, frames = imported(make(tmp_path / "own", "mcap", robots("/r1/cam"), LONG))
+    assert notice(report, "transforms of /r2/tf are left out: /r1/cam/color/image_raw is not in its namespace")
+    assert np.abs(frames[3].T_world_camera - LONG[3].T_world_camera).max() < 1e-6
+    with pytest.raises(ImportSourceError, match=r"is told by /r1/tf and, otherwise, by /r2/tf: record the true one"):
+        imported(make(tmp_path / "none", "mcap", robots("/cam"), LONG))
+
+
+@pytest.mark.parametrize(
+    ("topic", "complaint"),
+    [
+        ("/tf_static", r"/tf_static says first \(0\.200, 0\.050, 0\.900\) m.*then \(0\.200, 0\.550, .*: cut the bag"),
+        ("/tf", r"is told by /tf_static and, otherwise, by /tf: record the true one"),
+    ],
+)
+def test_two_places_of_the_camera_are_refused(tmp_path: Path, topic: str, complaint: str) -> None:
+    def told(metres: float) -> Change:
+        def change(m: Messages, events: list[Event]) -> list[Event]:
+            at = m.tf(bags.stamp_of(1), "base_link", CAMERA, aside(bags.camera_on_base(), metres))
+            return [*events, (topic, bags.stamp_of(1), at)]
+
+        return change
+
+    with pytest.raises(ImportSourceError, match=rf"'{CAMERA}' on 'base_link' .*{complaint}"):
+        imported(make(tmp_path / "two", "ros1", told(0.5)))
+    within = imported(make(tmp_path / "one", "ros1", told(0.0005)), match_s=1.0)
+    assert within[0].frames == 6
+
+
+def track(stamps: np.ndarray, places: np.ndarray, yaw: np.ndarray) -> Track:
+    """Of places (N, 2) in metres and headings in radians, at times in seconds."""
+    turned = Rotation.from_rotvec(np.outer(yaw, (0, 0, 1))).as_quat()
+    rows = np.hstack((places, np.zeros((len(places), 1)), turned))
+    return Track([round(t * 1e9) for t in stamps], [tuple(row) for row in rows.tolist()])
+
+
+def walk(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A robot that drives at 1 m/s on a circle of 2 m."""
+    return np.stack((2 * np.sin(t / 2), 2 - 2 * np.cos(t / 2)), 1), t / 2
+
+
+@pytest.mark.parametrize(("first_hz", "second_hz"), [(10, 10), (30, 50), (10, 30)])
+@pytest.mark.parametrize("aside_m", [0.1, 0.5])
+def test_two_sources_are_told_apart_at_any_rates(first_hz: int, second_hz: int, aside_m: float) -> None:
+    a, b = np.arange(0, 30, 1 / first_hz), np.arange(0.003, 30, 1 / second_hz)
+    t = np.sort(np.append(a, b))
+    places, yaw = walk(t)
+    places[:, 1] += aside_m * np.isin(t, b)
+    places += np.random.default_rng(0).normal(0, 0.001, places.shape)
+    assert aside_m / 2 < track(t, places, yaw).jump_m() < 1.5 * aside_m
+
+
+def test_a_second_source_that_drifts_away_is_seen_although_it_began_well() -> None:
+    t = np.arange(0, 60, 0.05)
+    places, yaw = walk(t)
+    places[1::2, 1] += 0.01 * t[1::2]
+    assert track(t, places, yaw).jump_m() > 0
+
+
+def test_one_source_is_never_taken_for_two() -> None:
+    rng = np.random.default_rng(1)
+    for count in (6, 12, 13, 40, 80, 3000):
+        t = np.arange(count) * 0.1
+        places, yaw = walk(t)
+        still, none = np.zeros((count, 2)), np.zeros(count)
+        cases = {
+            "still": (t, still, none),
+            "driving": (t, places, yaw),
+            "noise on a line": (t, still + rng.normal(0, 0.1, (count, 1)) * (1, 0), none),
+            "noise": (t, places + rng.normal(0, 0.1, (count, 2)), yaw + rng.normal(0, 0.05, count)),
+            "late stamps": (t + rng.uniform(0, 0.09, count), 3 * t[:, None] * (1, 0), none),
+            "steps of the encoder": (t, np.round(places, 2), yaw),
+            "loop closures": (t, places + 0.8 * (t // 1.7 % 2)[:, None], yaw),
+            "each pose twice": (t, np.repeat(places, 2, axis=0)[:count] * 3, np.repeat(yaw, 2)[:count]),
+            "each pose three times": (t, np.repeat(places, 3, axis=0)[:count] * 3, np.repeat(yaw, 3)[:count]),
+            "told again": (np.repeat(t, 2)[:count], np.repeat(places, 2, axis=0)[:count], np.repeat(yaw, 2)[:count]),
+            "a sway of 2 Hz": (t, places + 0.05 * np.sin(4 * np.pi * t)[:, None], yaw),
+        }
+        assert {name: track(*case).jump_m() for name, case in cases.items()} == dict.fromkeys(cases, 0.0), count
