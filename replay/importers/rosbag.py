@@ -35,6 +35,7 @@ from semantic_mapper.replay.importers.base import (
     image_size_must_be,
     same_view,
 )
+from semantic_mapper.replay.importers.posed import KEPT_RECTIFIERS
 from semantic_mapper.replay.importers.ros_files import readable_bag
 from semantic_mapper.replay.importers.ros_transforms import (
     WORLDS,
@@ -63,6 +64,7 @@ _SAME_PLACE = 1e-6  # of a transform's entries; cameras that are closer are one
 _SAME_LENS = (
     0.005  # fraction of the focal length, and of the width, that two calibrations of one lens differ by at most
 )
+_FOCAL_CHANGE, _CENTRE_CHANGE = 1e-4, 0.1  # fraction, and pixels, from which an image gets a calibration of its own
 _REALSENSE_VIEWER = "/device_"  # begins the topics of its recordings
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 _VIEWER = (
@@ -140,18 +142,22 @@ class RosbagRecording:
         self._first_image: dict[str, Any] = {}  # of each of these topics
         calibrations, poses = self._read_all({*infos.values(), *self._bag.topics(_INFO)})
         self._color = self._stamps[color.name]
-        self._measured = self._intrinsics(color, calibrations[infos[color.name]], infos[color.name])
+        lenses = self._intrinsics(color, calibrations[infos[color.name]], infos[color.name])
+        self._lens_stamps, self._lenses = _distinct(lenses)
+        self._measured = lenses[0][1]
+        if len(set(self._lenses)) > 1:
+            self.notices.append(f"the calibration of {color.name} changes a little: each image has the nearest in time")
         self._T_frame_image = self._image_pose(color, calibrations[infos[color.name]])
         if "info" not in options.topics:
             self._refuse_contradictions(color, infos[color.name], calibrations)
-        self._rectify = _rectifier(src, self._measured)
+        self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
         self._depth_topic = depth
         self._depth = self._stamps[depth.name] if depth is not None else []
         self._T_color_depth: Float64 | None = None
         self._depth_intrinsics = self._measured
         if depth is not None:
             name = infos.get(depth.name, "")
-            own = self._intrinsics(depth, calibrations[name], name) if name else None
+            own = self._intrinsics(depth, calibrations[name], name)[0][1] if name else None
             if own is not None and not depth_info:
                 self._refuse_two_lenses(depth, own, infos[color.name], name)
             self._link_depth(depth, own)
@@ -171,7 +177,7 @@ class RosbagRecording:
         self._depth_of = [int(depth_order[i]) if i >= 0 else -1 for i in matches]
         self.info = StreamInfo(
             source=f"rosbag {src.resolve().stem}",
-            cameras={options.camera_id: self._rectify.intrinsics},
+            cameras={options.camera_id: self._rectifier(self._measured).intrinsics},
             frame_count=len(self._color),
             frame_hz=_rate(stamps),
         )
@@ -198,8 +204,10 @@ class RosbagRecording:
         pose = self._pose_at(stamp_ns)
         if pose is None:
             raise BadFrameError(where, f"there is no pose round its time {stamp_ns / 1e9:.6f} s{self._gap(stamp_ns)}")
+        measured = self._lenses[int(np.abs(self._lens_stamps - stamp_ns).argmin())]
+        rectify = self._rectifier(measured)
         try:
-            rgb, encoded = self._rgb(index)
+            rgb, encoded = self._rgb(index, measured)
         except CodecError as error:
             raise BadFrameError(where, f"image of {stamp_ns / 1e9:.6f} s: {error}") from error
         return LoadedFrame(
@@ -208,27 +216,37 @@ class RosbagRecording:
                 seq=number,
                 camera_id=self._options.camera_id,
                 rgb=rgb,
-                depth_m=self._depth_m(self._depth_of[number]),
+                depth_m=self._depth_m(self._depth_of[number], measured),
                 label=None,
-                intrinsics=self._rectify.intrinsics,
+                intrinsics=rectify.intrinsics,
                 T_world_camera=check_frame_pose(pose, where),
             ),
             encoded,
         )
 
-    def _rgb(self, index: int) -> tuple[UInt8, EncodedImage | None]:
+    def _rectifier(self, measured: CameraIntrinsics) -> Rectifier:
+        if measured not in self._rectifiers:
+            if len(self._rectifiers) >= KEPT_RECTIFIERS:
+                self._rectifiers.pop(next(iter(self._rectifiers)))
+            try:
+                self._rectifiers[measured] = Rectifier(measured)
+            except ConfigError as error:
+                raise BadFrameError(self._bag.src, str(error)) from error
+        return self._rectifiers[measured]
+
+    def _rgb(self, index: int, measured: CameraIntrinsics) -> tuple[UInt8, EncodedImage | None]:
         message = self._bag.message(self._color_topic.name, self._color, index)
         encoded = None
         if self._color_topic.raw:
             rgb = ros_images.color_image(message)
         else:
             rgb, encoded = ros_images.compressed_color_image(message)
-        image_size_must_be(rgb, self._measured, Path(self._color_topic.name))
-        if self._measured.distorted:
-            return self._rectify(np.ascontiguousarray(rgb[..., ::-1])), None
+        image_size_must_be(rgb, measured, Path(self._color_topic.name))
+        if measured.distorted:
+            return self._rectifier(measured)(np.ascontiguousarray(rgb[..., ::-1])), None
         return rgb, encoded
 
-    def _depth_m(self, index: int) -> Float32 | None:
+    def _depth_m(self, index: int, measured: CameraIntrinsics) -> Float32 | None:
         topic = self._depth_topic
         if index < 0 or topic is None:
             return None
@@ -239,24 +257,25 @@ class RosbagRecording:
             depth_m = read(message, self.depth_scale.units_per_m)
         except CodecError as error:
             raise BadFrameError(where, str(error)) from error
-        k = self._depth_intrinsics
+        rectify = self._rectifier(measured)
+        k = measured if self._T_color_depth is None else self._depth_intrinsics
         if depth_m.shape != (k.height, k.width):
             height, width = depth_m.shape
             if (
                 self._T_color_depth is None
-                and not self._measured.distorted
+                and not measured.distorted
                 and same_view((k.width, k.height), (width, height))
             ):
                 k = scale_intrinsics(k, width, height)  # registered, and made smaller
-                return register_depth(depth_m, k, np.eye(4), self._rectify.intrinsics)
+                return register_depth(depth_m, k, np.eye(4), rectify.intrinsics)
             raise BadFrameError(
                 where,
                 f"the depth image is {width}x{height}, its calibration says {k.width}x{k.height}; name the one that it "
                 "has (--topic depth_info=NAME), or import without depth (--topic depth=none)",
             )
         if self._T_color_depth is not None:
-            return register_depth(depth_m, k, self._T_color_depth, self._rectify.intrinsics)
-        return self._rectify.nearest(depth_m)
+            return register_depth(depth_m, k, self._T_color_depth, rectify.intrinsics)
+        return rectify.nearest(depth_m)
 
     def _find_images(self) -> tuple[_Topic, _Topic | None]:
         """The topics of colour and of depth.
@@ -358,6 +377,7 @@ class RosbagRecording:
     def _read_all(self, infos: set[str]) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
         """One pass over the bag: stamps of images and transforms; returns calibrations and poses by topic."""
         calibrations: dict[str, list[Any]] = {name: [] for name in infos}
+        self._info_stamps: dict[str, list[int]] = {name: [] for name in infos}
         poses: dict[str, list[Any]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
         transforms = self._bag.topics(*_TF)
         unstamped = 0
@@ -369,6 +389,7 @@ class RosbagRecording:
                 self._stamps[name].append((stamp_ns or received_ns, received_ns))
             elif name in calibrations:
                 calibrations[name].append(message)
+                self._info_stamps[name].append(stamp_of(message.header) or received_ns)
             elif name in transforms:
                 self._tree.add(message.transforms, name, node, received_ns)
             else:
@@ -378,26 +399,35 @@ class RosbagRecording:
             self.notices.append(f"{unstamped} images have no stamp: the time at which they were recorded stands for it")
         return calibrations, poses
 
-    def _intrinsics(self, topic: _Topic, infos: list[Any], name: str) -> CameraIntrinsics:
-        """Raises: ImportSourceError: they change, or cannot be used."""
+    def _intrinsics(self, topic: _Topic, infos: list[Any], name: str) -> list[tuple[int, CameraIntrinsics]]:
+        """Intrinsics by time, all of one lens.
+
+        Raises:
+            ImportSourceError: they change, or cannot be used.
+        """
         if not infos:
             raise ImportSourceError(f"{self._bag.src}: {name} has no message")
-        good = [info for info in infos if self._bag.is_calibrated(info)]
+        timed = list(zip(self._info_stamps[name], infos, strict=True))
+        good = [(stamp_ns, info) for stamp_ns, info in timed if self._bag.is_calibrated(info)]
         if good and len(good) < len(infos):
             self.notices.append(
                 f"{name}: {counted(len(infos) - len(good), 'message')} without a calibration passed over"
             )
         try:
             size = self._size(topic, infos)
-            found = [self._bag.intrinsics(info, size, rectified=topic.rectified) for info in good or infos[:1]]
+            lenses = [
+                (stamp_ns, self._bag.intrinsics(info, size, rectified=topic.rectified))
+                for stamp_ns, info in good or timed[:1]
+            ]
         except ImportSourceError as error:
             raise ImportSourceError(f"{self._bag.src}: {topic.name}: {error}") from error
+        found = [k for _, k in lenses]
         if any(k.distortion != found[0].distortion or not _one_lens(found[0], k) for k in found):
             raise ImportSourceError(
                 f"{self._bag.src}: the calibration of {topic.name} changes ({found[0]}, then {found[-1]}): the lens "
                 "has zoomed or the size was switched; cut the bag where it does"
             )
-        return found[0]
+        return lenses
 
     def _size(self, topic: _Topic, infos: list[Any]) -> tuple[int, int] | None:
         """(width, height) of the first image, where a calibration does not tell it."""
@@ -804,11 +834,17 @@ def _on(way: list[str]) -> str:
     return " on ".join(f"'{frame}'" for frame in way)
 
 
-def _rectifier(src: Path, measured: CameraIntrinsics) -> Rectifier:
-    try:
-        return Rectifier(measured)
-    except ConfigError as error:
-        raise ImportSourceError(f"{src}: {error}") from error
+def _distinct(lenses: list[tuple[int, CameraIntrinsics]]) -> tuple[NDArray[np.int64], list[CameraIntrinsics]]:
+    """Stamps in their order, and the intrinsics of each; those that do not differ much are one."""
+    known = lenses[0][1]
+    found: list[CameraIntrinsics] = []
+    ordered = sorted(lenses, key=lambda lens: lens[0])
+    for _, k in ordered:
+        focal = max(abs(known.fx - k.fx) / known.fx, abs(known.fy - k.fy) / known.fy)
+        if focal > _FOCAL_CHANGE or max(abs(known.cx - k.cx), abs(known.cy - k.cy)) > _CENTRE_CHANGE:
+            known = k
+        found.append(known)
+    return np.array([stamp_ns for stamp_ns, _ in ordered], np.int64), found
 
 
 def _rate(stamps: Any) -> float:

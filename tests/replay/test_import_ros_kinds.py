@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.importers.ros_transforms import Track
 
 from . import bags
-from .bags import CAMERA, Event, Messages
+from .bags import CAMERA, INFO, Event, Messages
 from .test_import_rosbag import FRAMES, imported, make, notice
 
 LONG = [FRAMES[0]] * 8  # of a robot that stands still
@@ -154,3 +156,27 @@ def test_one_source_is_never_taken_for_two() -> None:
             "a sway of 2 Hz": (t, places + 0.05 * np.sin(4 * np.pi * t)[:, None], yaw),
         }
         assert {name: track(*case).jump_m() for name, case in cases.items()} == dict.fromkeys(cases, 0.0), count
+
+
+@pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.15, 0.03, 0.001, -0.001, 0.0)])
+def test_each_image_has_the_calibration_of_its_time(tmp_path: Path, lens: tuple[float, ...]) -> None:
+    """An autofocus moves the centre by 0.08 px an image; what differs by less than 0.1 px is one calibration."""
+    true = [dataclasses.replace(FRAMES[0].intrinsics, cx=FRAMES[0].intrinsics.cx + 0.08 * n) for n in range(6)]
+
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        kept = [event for event in events if event[0] not in (INFO, bags.DEPTH_INFO)]
+        for n, k in enumerate(true):
+            ns = bags.stamp_of(n)
+            kept += [(topic, ns, m.info(ns, CAMERA, k, lens=lens)) for topic in (INFO, bags.DEPTH_INFO)]
+        return kept
+
+    report, frames = imported(make(tmp_path, "mcap", change))
+    assert notice(
+        report, "the calibration of /cam/color/image_raw changes a little: each image has the nearest in time"
+    )
+    for n, frame in enumerate(frames):
+        rectify = Rectifier(dataclasses.replace(true[n - n % 2], distortion=lens if any(lens) else ()))
+        assert frame.intrinsics == rectify.intrinsics
+        assert np.array_equal(frame.rgb, rectify(np.ascontiguousarray(FRAMES[n].rgb[..., ::-1])))
+        metres = (bags.millimetres(FRAMES[n]) / np.float32(1000)).astype(np.float32)
+        assert frame.depth_m is not None and np.array_equal(frame.depth_m, rectify.nearest(metres))
