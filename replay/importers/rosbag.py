@@ -14,7 +14,8 @@ import importlib
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,7 @@ from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float
 ROLES = ("image", "depth", "info", "depth_info", "pose")
 DEPTH_SCALE = DepthScale(ros_images.UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
 LISTED = 12  # topics that an error names
+LOOKED_AT = 100  # messages of a topic until one tells what it is
 
 _RAW, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
@@ -82,14 +84,16 @@ class _Topic:
     """A topic of images.
 
     Args:
-        name: Of the topic; ``encoding`` and ``frame``: of its first message.
+        name: Of the topic; ``encoding``: of its first message with data.
         raw: ``sensor_msgs/Image``, not compressed.
+        frame: Of the first message that names one; ``frame_late``: that is not the first.
     """
 
     name: str
     raw: bool
     encoding: str
     frame: str
+    frame_late: bool = False
 
     @property
     def rectified(self) -> bool:
@@ -136,6 +140,8 @@ class RosbagRecording:
         depth_info = options.topics.get("depth_info", "")
         if depth is not None and (depth_info or self._has_info(depth)):
             infos[depth.name] = self._info_topic(depth, depth_info)
+        color = self._with_frame(color, infos[color.name])
+        depth = depth and self._with_frame(depth, infos.get(depth.name, ""))
         self._color_topic = color
         self._tree = TransformTree()
         self._stamps: dict[str, list[tuple[int, int]]] = {t.name: [] for t in (color, depth) if t is not None}
@@ -344,6 +350,17 @@ class RosbagRecording:
             f"{there}"
         )
 
+    def _with_frame(self, topic: _Topic, info: str) -> _Topic:
+        """The topic with the frame of its calibration, where its images name none."""
+        whose = "a later image"
+        if not topic.frame and info:
+            messages = (message for _, _, message, _ in islice(self._bag.messages({info}), LOOKED_AT))
+            frame = next(filter(None, (frame_name(message.header.frame_id) for message in messages)), "")
+            topic, whose = replace(topic, frame=frame, frame_late=bool(frame)), info
+        if topic.frame_late:
+            self.notices.append(f"{topic.name}: its first image names no frame; '{topic.frame}' of {whose} is taken")
+        return topic
+
     def _pose_topic(self) -> str:
         """The topic that poses come from; empty = tf.
 
@@ -371,21 +388,27 @@ class RosbagRecording:
             raise ImportSourceError(
                 f"{self._bag.src}: has no poses: neither tf nor a topic of "
                 f"{', '.join(t.replace('/msg/', '/') for t in (*_NAMED_POSES, *_POSES))}; it has {self._bag.listing()}"
+                + self._path_hint()
                 + (_VIEWER if color.name.startswith(_REALSENSE_VIEWER) else "")
             )
 
-    def _read_all(self, infos: set[str]) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
-        """One pass over the bag: stamps of images and transforms; returns calibrations and poses by topic."""
+    def _path_hint(self) -> str:
+        paths = self._bag.topics("nav_msgs/msg/Path")
+        return f" ({paths[0]}, a nav_msgs/Path, is not read)" if paths else ""
+
+    def _read_all(self, infos: set[str]) -> tuple[dict[str, list[Any]], dict[str, list[tuple[int, Any]]]]:
+        """One pass over the bag: stamps of images and transforms; returns calibrations and timed poses by topic."""
         calibrations: dict[str, list[Any]] = {name: [] for name in infos}
         self._info_stamps: dict[str, list[int]] = {name: [] for name in infos}
-        poses: dict[str, list[Any]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
+        poses: dict[str, list[tuple[int, Any]]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
         transforms = self._bag.topics(*_TF)
         unstamped = 0
         for name, received_ns, message, node in self._bag.messages({*self._stamps, *infos, *transforms, *poses}):
             if name in self._stamps:
                 stamp_ns = stamp_of(message.header)
                 unstamped += not stamp_ns
-                self._first_image.setdefault(name, message)
+                if len(message.data):
+                    self._first_image.setdefault(name, message)
                 self._stamps[name].append((stamp_ns or received_ns, received_ns))
             elif name in calibrations:
                 calibrations[name].append(message)
@@ -393,7 +416,7 @@ class RosbagRecording:
             elif name in transforms:
                 self._tree.add(message.transforms, name, node, received_ns)
             else:
-                poses[name].append(message)
+                poses[name].append((received_ns, message))
         self.notices += self._tree.close(self._color_topic.name)
         if unstamped:
             self.notices.append(f"{unstamped} images have no stamp: the time at which they were recorded stands for it")
@@ -474,7 +497,7 @@ class RosbagRecording:
         self._T_color_depth, self._depth_intrinsics = invert_pose(self._T_frame_image) @ T, own
         self.notices.append(f"{depth.name} is registered to {color.name} here, by tf and the intrinsics of both")
 
-    def _pose_source(self, topic: str, messages: list[Any]) -> tuple[Callable[[int], Float64 | None], str]:
+    def _pose_source(self, topic: str, messages: list[tuple[int, Any]]) -> tuple[Callable[[int], Float64 | None], str]:
         """What tells the pose of a time, and a sentence on it.
 
         Raises:
@@ -602,17 +625,24 @@ class RosbagRecording:
                 return f"; {name} is there from {_span(track.stamps_ns)}, and not near it"
         return ""
 
-    def _track(self, topic: str, messages: list[Any]) -> tuple[str, Track]:
+    def _track(self, topic: str, messages: list[tuple[int, Any]]) -> tuple[str, Track]:
         """Whose poses a topic tells, and the poses."""
         named = topic in self._bag.topics(*_NAMED_POSES)
-        body = frame_name(self._options.body or (messages[0].child_frame_id if named and messages else ""))
+        body = frame_name(self._options.body or (messages[0][1].child_frame_id if named and messages else ""))
         if messages and not body:
             raise ImportSourceError(
                 f"{self._bag.src}: {topic} does not say whose poses it tells; name the frame with --body, such as "
                 f"--body {self._color_topic.frame} where they are the camera's"
             )
         read = self._bag.pose_reader(topic)
-        rows = [(stamp_of(message.header), pose_row(*read(message))) for message in messages]
+        rows = [
+            (stamp_of(message.header) or received_ns, pose_row(*read(message))) for received_ns, message in messages
+        ]
+        unstamped = sum(not stamp_of(message.header) for _, message in messages)
+        if unstamped:
+            self.notices.append(
+                f"{topic}: {counted(unstamped, 'pose')} without a stamp; the time of receipt stands for it"
+            )
         good = [(stamp, row) for stamp, row in rows if row is not None]
         if not good:
             raise ImportSourceError(f"{self._bag.src}: {topic} holds no pose")
@@ -635,6 +665,12 @@ class RosbagRecording:
             raise ImportSourceError(
                 f"{self._bag.src}: tf does not know the frame '{camera}' of {self._color_topic.name}; record tf and "
                 "tf_static, or name a topic of poses: --topic pose=NAME --body " + (camera or "FRAME")
+            )
+        if not self._tree.moving_above(camera, way[-1]):
+            raise ImportSourceError(
+                f"{self._bag.src}: tf has no frame {', '.join(WORLDS)} above the camera: {_on(way)}; and nothing tells "
+                f"how '{way[-1]}' moves: record tf or odometry{self._path_hint()}. Only where the camera stood still: "
+                f"--world {way[-1]}"
             )
         raise ImportSourceError(
             f"{self._bag.src}: tf has no frame {', '.join(WORLDS)} above the camera: {_on(way)}; name the world: "
@@ -695,17 +731,23 @@ class _Bag:
         return visible(", ".join(names[:LISTED])) + more if names else "no topic at all"
 
     def image_topics(self) -> list[_Topic]:
-        """Topics of images that have messages, by their first."""
+        """Topics of images that have messages, by the first of them that tell what they are."""
         found: list[_Topic] = []
         for kind, field in ((_RAW, "encoding"), (_COMPRESSED, "format")):
             for name in self.topics(kind):
-                _, _, message, _ = next(self.messages({name}), ("", 0, None, ""))
-                if message is not None:
-                    encoding = str(getattr(message, field))
+                encodings: list[str] = []
+                frames: list[str] = []
+                for _, _, message, _ in islice(self.messages({name}), LOOKED_AT):
+                    encodings.append(str(getattr(message, field)) if len(message.data) else "")
+                    frames.append(frame_name(message.header.frame_id))
+                    if encodings[-1] and any(frames):
+                        break
+                if frames:
                     # The RealSense Viewer gives all cameras one frame, "0", although they stand apart.
                     viewer = name.startswith(_REALSENSE_VIEWER)
-                    frame = name.rsplit("/", 2)[0] if viewer else frame_name(message.header.frame_id)
-                    found.append(_Topic(name, kind == _RAW, encoding, frame))
+                    frame = name.rsplit("/", 2)[0] if viewer else next(filter(None, frames), "")
+                    encoding = next(filter(None, encodings), "")
+                    found.append(_Topic(name, kind == _RAW, encoding, frame, frame_late=bool(frame) and not frames[0]))
         return found
 
     def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any, str]]:
@@ -760,8 +802,8 @@ class _Bag:
 
     def is_calibrated(self, info: Any) -> bool:
         """Whether a ``sensor_msgs/CameraInfo`` says anything: cameras send some before they know."""
-        K, _, P = self._matrices(info)
-        return bool((np.any(K) or np.any(P)) and np.isfinite(K).all() and np.isfinite(P).all())
+        K, D, P = self._matrices(info)
+        return bool((np.any(K) or np.any(P)) and all(np.isfinite(matrix).all() for matrix in (K, D, P)))
 
     def rectification(self, info: Any) -> tuple[Float64, Float64]:
         """R (3, 3) and P (12,) of a ``sensor_msgs/CameraInfo``."""

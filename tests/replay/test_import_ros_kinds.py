@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.importers.ros_transforms import Track
 
 from . import bags
-from .bags import CAMERA, INFO, Event, Messages
+from .bags import CAMERA, COLOR, DEPTH, INFO, Event, Messages
 from .test_import_rosbag import FRAMES, imported, make, notice
 
 LONG = [FRAMES[0]] * 8  # of a robot that stands still
@@ -180,3 +182,83 @@ def test_each_image_has_the_calibration_of_its_time(tmp_path: Path, lens: tuple[
         assert np.array_equal(frame.rgb, rectify(np.ascontiguousarray(FRAMES[n].rgb[..., ::-1])))
         metres = (bags.millimetres(FRAMES[n]) / np.float32(1000)).astype(np.float32)
         assert frame.depth_m is not None and np.array_equal(frame.depth_m, rectify.nearest(metres))
+
+
+def of(topic: str, events: list[Event]) -> list[Any]:
+    return [message for name, _, message in events if name == topic]
+
+
+def empty(message: Any) -> None:
+    message.encoding, message.height, message.width, message.step = "", 0, 0, 0
+    message.data = np.zeros(0, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("unnamed", "whose"), [(slice(0, 1), "a later image"), (slice(None), INFO)], ids=["first", "all"]
+)
+def test_images_without_a_frame_get_that_of_a_later_one_or_of_their_calibration(
+    tmp_path: Path, unnamed: slice, whose: str
+) -> None:
+    def change(_: Messages, events: list[Event]) -> list[Event]:
+        for topic in (COLOR, DEPTH):
+            for message in of(topic, events)[unnamed]:
+                message.header.frame_id = ""
+        return events
+
+    report, frames = imported(make(tmp_path, "ros1", change))
+    assert report.with_depth == 6 and notice(report, f"names no frame; '{CAMERA}' of {whose} is taken")
+    assert np.abs(frames[3].T_world_camera - FRAMES[3].T_world_camera).max() < 1e-6
+
+
+@pytest.mark.parametrize("topic", [COLOR, DEPTH])
+def test_a_first_message_without_data_costs_its_frame_alone(tmp_path: Path, topic: str) -> None:
+    def change(_: Messages, events: list[Event]) -> list[Event]:
+        empty(of(topic, events)[0])
+        return events
+
+    report, frames = imported(make(tmp_path, "sqlite3", change))
+    assert [frame.seq for frame in frames] == [1, 2, 3, 4, 5] and report.with_depth == 5
+    assert "encoding '' are not read" in report.skipped[0].reason
+
+
+def test_a_calibration_with_nan_in_its_lens_is_passed_over(tmp_path: Path) -> None:
+    def change(_: Messages, events: list[Event]) -> list[Event]:
+        of(INFO, events)[3].d = np.full(5, np.nan)
+        return events
+
+    report, _ = imported(make(tmp_path, "mcap", change))
+    assert report.frames == 6 and notice(report, f"{INFO}: 1 message without a calibration passed over")
+
+
+@pytest.mark.parametrize("kind", ["tf", "odometry", "pose"])
+def test_poses_without_stamps_have_the_time_of_their_receipt(tmp_path: Path, kind: str) -> None:
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        if kind == "tf":
+            for message in of("/tf", events):
+                for stamped in message.transforms:
+                    stamped.header = m.header(0, stamped.header.frame_id)
+            return events
+        kept = [event for event in events if event[0] != "/tf"]
+        for n, T in enumerate(bags.bodies(FRAMES)):
+            message = m.odometry(0, T, "base_link") if kind == "odometry" else m.pose_stamped(0, T)
+            kept.append(("/pose", bags.stamp_of(n), message))
+        return kept
+
+    report, frames = imported(make(tmp_path, "ros1", change), body="" if kind != "pose" else "base_link")
+    named = "tf of 'base_link'" if kind == "tf" else "/pose"
+    assert notice(report, f"{named}: 6 poses without a stamp; the time of receipt stands for it")
+    T_world_odom = bags.odom_in_map() if kind == "tf" else np.eye(4)
+    for frame, T in zip(frames, bags.bodies(FRAMES), strict=True):
+        assert np.abs(frame.T_world_camera - T_world_odom @ T @ bags.camera_on_base()).max() < 1e-6
+
+
+def test_a_path_is_named_as_what_is_not_read(tmp_path: Path) -> None:
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        kept = [event for event in events if event[0] != "/tf"]
+        return [*kept, ("/path", bags.START_NS, m.make("nav_msgs/Path", m.header(bags.START_NS, "odom"), []))]
+
+    missing = "nothing tells how 'base_link' moves: record tf or odometry (/path, a nav_msgs/Path, is not read)"
+    with pytest.raises(ImportSourceError, match=re.escape(missing)):
+        imported(make(tmp_path / "static", "mcap", change))
+    with pytest.raises(ImportSourceError, match=r"has no poses.*\(/path, a nav_msgs/Path, is not read\)"):
+        imported(make(tmp_path / "alone", "mcap", lambda m, e: [x for x in change(m, e) if x[0] != "/tf_static"]))
