@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import pairwise
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import interpolate_pose, invert_pose, pose_matrix
@@ -20,6 +22,12 @@ from semantic_mapper.types import Float64
 WORLDS = ("map", "world", "odom")  # names of a world by REP 105 and habit, the preferred first
 MAX_NORM_ERROR = 0.1  # of a unit quaternion; more is no rotation
 MAX_GAP_NS = 1_000_000_000  # over a longer gap nothing is interpolated
+_SAME = 1e-3  # of a transform's entries; what is told twice may differ by it
+# How two sources that take turns show, in poses whose unit is metres and radians (see Track.jump_m).
+_JUMP_M = 0.02  # of a pose from the line between its neighbours; less does no harm
+_SMOOTHER = 0.15  # fraction of that jump within which each source is smooth; noise stays above 0.35
+_DETOUR = 1.25  # length of the way over the distance; poses that are published several times each stay at 1
+_WINDOW = 80  # poses that are judged together
 
 
 class Track:
@@ -36,14 +44,65 @@ class Track:
 
     def __init__(self, stamps_ns: list[int], rows: list[tuple[float, ...]]) -> None:
         self.back = sum(b < a for a, b in pairwise(stamps_ns))
-        last: dict[int, tuple[float, ...]] = {}
-        self.doubled = 0
-        for stamp_ns, row in zip(stamps_ns, rows, strict=True):
-            self.doubled += last.setdefault(stamp_ns, row) != row
-            last[stamp_ns] = row
-        by_stamp = dict(sorted(last.items()))
-        self.stamps_ns: NDArray[np.int64] = np.array(list(by_stamp), np.int64)
-        self._rows = np.array(list(by_stamp.values()), np.float64).reshape(-1, 7)
+        stamps = np.array(stamps_ns, np.int64)
+        order = np.argsort(stamps, kind="stable")
+        self._all_stamps_ns: NDArray[np.int64] = stamps[order]
+        self._all_rows = np.array(rows, np.float64).reshape(-1, 7)[order]
+        again = np.diff(self._all_stamps_ns) == 0
+        self.doubled = int((again & np.any(np.diff(self._all_rows, axis=0) != 0, axis=1)).sum())
+        last = np.append(~again, [True] * bool(rows))
+        self.stamps_ns: NDArray[np.int64] = self._all_stamps_ns[last]
+        self._rows = self._all_rows[last]
+
+    def jump_m(self) -> float:
+        """How far the poses jump to and fro between two sources that take turns, in metres (or radians); 0 = not.
+
+        Each pose is compared with the line between two others. Where the next ones are far off it, but of the next few
+        a pair fits, one source wrote the pose and the pair, another the poses between. Noise has no such pairs, and
+        poses that are published several times each make no detours. One source may have 3 times the rate of the other.
+        """
+        rotations = (
+            Rotation.from_quat(self._all_rows[:, 3:]).as_matrix() if len(self._all_rows) else np.zeros((0, 3, 3))
+        )
+        x = np.hstack((self._all_rows[:, :3], rotations[:, :, :2].reshape(-1, 6)))
+        reach = 4 if len(x) >= _WINDOW // 2 else 2
+        i = np.arange(reach, len(x) - reach)
+        if len(i) < 2 * reach:
+            return 0.0
+        off = np.array([[self._off_line(x, i, j, k) for k in range(1, reach + 1)] for j in range(1, reach + 1)])
+        steps = np.append(0, np.cumsum(np.linalg.norm(np.diff(x, axis=0), axis=1)))
+        detour = (steps[i + reach] - steps[i - reach]) / (np.linalg.norm(x[i + reach] - x[i - reach], axis=1) + 1e-9)
+        next_ones, best = off[0, 0], off.min(axis=(0, 1))
+        for start in range(0, max(len(i) - _WINDOW, 0) + 1, _WINDOW // 2):
+            part = slice(start, start + _WINDOW)
+            jump = float(np.median(next_ones[part]))
+            smooth = np.quantile(best[part], 0.9) < _SMOOTHER * jump
+            if jump > _JUMP_M and smooth and np.median(detour[part]) > _DETOUR:
+                return jump
+        return 0.0
+
+    def _off_line(self, x: Float64, i: NDArray[np.intp], j: int, k: int) -> Float64:
+        """Distance (N,) of poses ``x[i]`` from the line between those j before and k after them."""
+        t = self._all_stamps_ns
+        gap = t[i + k] - t[i - j]
+        fraction = np.where(gap > 0, (t[i] - t[i - j]) / np.maximum(gap, 1), 0.5)[:, None]
+        return np.linalg.norm(x[i] - (1 - fraction) * x[i - j] - fraction * x[i + k], axis=1)
+
+    def differs(self, other: Track, *, unless_apart: bool) -> bool:
+        """Whether another source tells the same poses otherwise.
+
+        Args:
+            other: Of the other source.
+            unless_apart: One after the other is no contradiction: a program was started again.
+        """
+        both = (self.stamps_ns >= other.stamps_ns[0]) & (self.stamps_ns <= other.stamps_ns[-1])
+        pairs = [(self._pose(i), other.at(int(self.stamps_ns[i]), 0)) for i in _some(np.flatnonzero(both))]
+        apart = [np.abs(mine - its).max() for mine, its in pairs if its is not None]
+        return bool(np.quantile(apart, 0.9) > _JUMP_M) if apart else not unless_apart
+
+    def is_at(self, T: Float64) -> bool:
+        """Whether all poses are this one (4, 4)."""
+        return all(_same(self._pose(i), T) for i in _some(np.arange(len(self._rows))))
 
     def oddities(self, name: str) -> list[str]:
         """Sentences on what is odd about the poses, for people."""
@@ -80,6 +139,36 @@ class Track:
         return pose_matrix(self._rows[index, :3], self._rows[index, 3:])
 
 
+@dataclass(slots=True)
+class _Told:
+    """What one source tells of where one frame sits."""
+
+    topic: str
+    parents: set[str] = field(default_factory=set[str])
+    fixed: list[Float64] = field(default_factory=list[Float64])  # those that differ
+    stamps_ns: list[int] = field(default_factory=list[int])
+    rows: list[tuple[float, ...]] = field(default_factory=list[tuple[float, ...]])
+    unstamped: int = 0
+    track: Track | None = None
+
+    @property
+    def space(self) -> str:
+        """Namespace of the topic."""
+        return self.topic.rsplit("/", 1)[0]
+
+    def contradicts(self, other: _Told) -> bool:
+        """Whether both cannot be true."""
+        if self.parents != other.parents:
+            return True
+        if self.track is None or other.track is None:
+            return not all(one.is_only(T) for one, another in ((self, other), (other, self)) for T in another.fixed)
+        return self.track.differs(other.track, unless_apart=self.topic == other.topic)
+
+    def is_only(self, T: Float64) -> bool:
+        """Whether all that is told is this transform (4, 4)."""
+        return all(_same(mine, T) for mine in self.fixed) and (self.track is None or self.track.is_at(T))
+
+
 class TransformTree:
     """All transforms of a bag; ``close`` it once they are in.
 
@@ -89,32 +178,117 @@ class TransformTree:
 
     def __init__(self) -> None:
         self.refused = 0
+        self._told: dict[str, dict[str, _Told]] = {}  # by child and source
         self._parents: dict[str, set[str]] = {}
         self._fixed: dict[str, Float64] = {}
-        self._moving: dict[str, tuple[list[int], list[tuple[float, ...]]]] = {}
         self._tracks: dict[str, Track] = {}
 
-    def add(self, transforms: Iterable[Any], *, fixed: bool) -> None:
-        """Take in the ``geometry_msgs/TransformStamped`` of one message; ``fixed`` of tf_static."""
+    def add(self, transforms: Iterable[Any], topic: str, program: str, received_ns: int) -> None:
+        """Take in the ``geometry_msgs/TransformStamped`` of one message.
+
+        Args:
+            transforms: Of the message.
+            topic: Whose name ends in tf_static where they are fixed.
+            program: That published it; empty = not known.
+            received_ns: When; stands for the stamps of those that have none.
+        """
+        source = f"{topic} of {program}" if program else topic
         for stamped in transforms:
             row = pose_row(stamped.transform.translation, stamped.transform.rotation)
             child, parent = frame_name(stamped.child_frame_id), frame_name(stamped.header.frame_id)
             if row is None or not child or child == parent:
                 self.refused += 1
                 continue
-            self._parents.setdefault(child, set()).add(parent)
-            if fixed:
-                self._fixed[child] = pose_matrix(np.array(row[:3]), np.array(row[3:]))
+            told = self._told.setdefault(child, {}).setdefault(source, _Told(topic))
+            told.parents.add(parent)
+            if topic.endswith("tf_static"):
+                T = pose_matrix(np.array(row[:3]), np.array(row[3:]))
+                if not any(_same(T, known) for known in told.fixed):
+                    told.fixed.append(T)
             else:
-                stamps, rows = self._moving.setdefault(child, ([], []))
-                stamps.append(stamp_of(stamped.header))
-                rows.append(row)
+                stamp_ns = stamp_of(stamped.header)
+                told.unstamped += not stamp_ns
+                told.stamps_ns.append(stamp_ns or received_ns)
+                told.rows.append(row)
 
-    def close(self) -> list[str]:
-        """Sort what was taken in; sentences on what is odd about it."""
-        self._tracks = {child: Track(*found) for child, found in self._moving.items()}
-        self._moving.clear()
-        return [said for child, track in self._tracks.items() for said in track.oddities(f"tf of '{child}'")]
+    def close(self, image: str) -> list[str]:
+        """Sort what was taken in; sentences on what is odd about it.
+
+        Args:
+            image: Topic of the images. Of two robots that give their frames the same names, the one in whose namespace
+                it is counts.
+        """
+        notices: list[str] = []
+        for told in (told for sources in self._told.values() for told in sources.values()):
+            told.track = Track(told.stamps_ns, told.rows) if told.rows else None
+        others = self._other_robots(image)
+        for space in sorted(others):
+            notices.append(f"transforms of {space}/tf are left out: {image} is not in its namespace")
+        for child, sources in self._told.items():
+            for source in [source for source, told in sources.items() if told.space in others]:
+                del sources[source]
+            for told in sources.values():
+                self._parents.setdefault(child, set()).update(told.parents)
+                if told.fixed:
+                    self._fixed[child] = told.fixed[-1]
+            moving = [told for told in sources.values() if told.track is not None]
+            if not moving:
+                continue
+            unstamped = sum(told.unstamped for told in moving)
+            self._tracks[child] = Track(
+                [ns for told in moving for ns in told.stamps_ns], [row for told in moving for row in told.rows]
+            )
+            for told in moving:
+                notices += told.track.oddities(f"tf of '{child}'") if told.track is not None else []
+                told.stamps_ns, told.rows = [], []
+            if unstamped:
+                notices.append(
+                    f"tf of '{child}': {counted(unstamped, 'pose')} without a stamp; the time of receipt stands for it"
+                )
+        return notices
+
+    def _other_robots(self, image: str) -> set[str]:
+        """Namespaces whose transforms contradict those of a namespace that is nearer to the images'."""
+        others: set[str] = set()
+        for sources in self._told.values():
+            for a, b in combinations(sources.values(), 2):
+                rank = {told.space: len(told.space) if image.startswith(told.space + "/") else -1 for told in (a, b)}
+                if len(set(rank.values())) == 2 and not others & set(rank) and a.contradicts(b):
+                    others.add(min(rank, key=lambda space: rank[space]))
+        return others
+
+    def check(self, target: str, source: str) -> None:
+        """Refuse two truths about a transform between two frames.
+
+        Raises:
+            ImportSourceError: two programs publish one transform and differ.
+        """
+        up, down = self.way_up(source), self.way_up(target)
+        for child in set(up) ^ set(down):
+            if child not in self._told:
+                continue
+            what = f"tf: '{child}' on '{next(iter(self._parents[child]))}'"
+            sources = self._told[child]
+            for name, told in sources.items():
+                if len(told.fixed) > 1:
+                    a, b = (_place(T) for T in (told.fixed[0], told.fixed[-1]))
+                    raise ImportSourceError(
+                        f"{what} is fixed, but {name} says first {a}, then {b}: cut the bag between the two, or record "
+                        "the true one alone"
+                    )
+            for (a, told), (b, other) in combinations(sources.items(), 2):
+                if told.contradicts(other):
+                    raise ImportSourceError(
+                        f"{what} is told by {a} and, otherwise, by {b}: record the true one alone, or keep only it in "
+                        "the bag (`rosbag filter`, `ros2 bag convert`)"
+                    )
+            jump = self._tracks[child].jump_m() if child in self._tracks else 0.0
+            if jump:
+                raise ImportSourceError(
+                    f"{what} jumps to and fro by {jump:.2g} m or rad: two programs publish it; stop one (such as the "
+                    "odometry of the wheels beside a filter) and record again, or name a topic of poses: --topic "
+                    "pose=NAME"
+                )
 
     def moving_above(self, frame: str, world: str) -> list[tuple[str, Track]]:
         """The transforms between a frame and a world that change over time, as 'parent to child'."""
@@ -184,3 +358,18 @@ def pose_row(position: Any, rotation: Any) -> tuple[float, ...] | None:
     if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1) > MAX_NORM_ERROR:
         return None
     return tuple(float(value) for value in row)
+
+
+def _same(a: Float64, b: Float64) -> bool:
+    return bool(np.allclose(a, b, rtol=0, atol=_SAME))
+
+
+def _some(indices: NDArray[np.intp]) -> NDArray[np.intp]:
+    """At most 1000 of them, evenly."""
+    return indices[:: max(1, len(indices) // 1000)]
+
+
+def _place(T: Float64) -> str:
+    """A transform (4, 4) for people: metres, and degrees about x, y and z."""
+    degrees = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
+    return f"({', '.join(f'{v:.3f}' for v in T[:3, 3])}) m turned by ({', '.join(f'{v:.1f}' for v in degrees)}) degrees"

@@ -14,7 +14,8 @@ import importlib
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from semantic_mapper.replay.importers.base import (
     image_size_must_be,
     same_view,
 )
+from semantic_mapper.replay.importers.posed import KEPT_RECTIFIERS
 from semantic_mapper.replay.importers.ros_files import readable_bag
 from semantic_mapper.replay.importers.ros_transforms import (
     WORLDS,
@@ -52,6 +54,7 @@ from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float
 ROLES = ("image", "depth", "info", "depth_info", "pose")
 DEPTH_SCALE = DepthScale(ros_images.UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
 LISTED = 12  # topics that an error names
+LOOKED_AT = 100  # messages of a topic until one tells what it is
 
 _RAW, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
@@ -63,6 +66,7 @@ _SAME_PLACE = 1e-6  # of a transform's entries; cameras that are closer are one
 _SAME_LENS = (
     0.005  # fraction of the focal length, and of the width, that two calibrations of one lens differ by at most
 )
+_FOCAL_CHANGE, _CENTRE_CHANGE = 1e-4, 0.1  # fraction, and pixels, from which an image gets a calibration of its own
 _REALSENSE_VIEWER = "/device_"  # begins the topics of its recordings
 _TRANSPORTS = ("/compressedDepth", "/compressed")
 _VIEWER = (
@@ -80,14 +84,16 @@ class _Topic:
     """A topic of images.
 
     Args:
-        name: Of the topic; ``encoding`` and ``frame``: of its first message.
+        name: Of the topic; ``encoding``: of its first message with data.
         raw: ``sensor_msgs/Image``, not compressed.
+        frame: Of the first message that names one; ``frame_late``: that is not the first.
     """
 
     name: str
     raw: bool
     encoding: str
     frame: str
+    frame_late: bool = False
 
     @property
     def rectified(self) -> bool:
@@ -134,23 +140,30 @@ class RosbagRecording:
         depth_info = options.topics.get("depth_info", "")
         if depth is not None and (depth_info or self._has_info(depth)):
             infos[depth.name] = self._info_topic(depth, depth_info)
+        color = self._with_frame(color, infos[color.name])
+        depth = depth and self._with_frame(depth, infos.get(depth.name, ""))
+        self._color_topic = color
         self._tree = TransformTree()
         self._stamps: dict[str, list[tuple[int, int]]] = {t.name: [] for t in (color, depth) if t is not None}
         self._first_image: dict[str, Any] = {}  # of each of these topics
         calibrations, poses = self._read_all({*infos.values(), *self._bag.topics(_INFO)})
-        self._color, self._color_topic = self._stamps[color.name], color
-        self._measured = self._intrinsics(color, calibrations[infos[color.name]], infos[color.name])
+        self._color = self._stamps[color.name]
+        lenses = self._intrinsics(color, calibrations[infos[color.name]], infos[color.name])
+        self._lens_stamps, self._lenses = _distinct(lenses)
+        self._measured = lenses[0][1]
+        if len(set(self._lenses)) > 1:
+            self.notices.append(f"the calibration of {color.name} changes a little: each image has the nearest in time")
         self._T_frame_image = self._image_pose(color, calibrations[infos[color.name]])
         if "info" not in options.topics:
             self._refuse_contradictions(color, infos[color.name], calibrations)
-        self._rectify = _rectifier(src, self._measured)
+        self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
         self._depth_topic = depth
         self._depth = self._stamps[depth.name] if depth is not None else []
         self._T_color_depth: Float64 | None = None
         self._depth_intrinsics = self._measured
         if depth is not None:
             name = infos.get(depth.name, "")
-            own = self._intrinsics(depth, calibrations[name], name) if name else None
+            own = self._intrinsics(depth, calibrations[name], name)[0][1] if name else None
             if own is not None and not depth_info:
                 self._refuse_two_lenses(depth, own, infos[color.name], name)
             self._link_depth(depth, own)
@@ -170,7 +183,7 @@ class RosbagRecording:
         self._depth_of = [int(depth_order[i]) if i >= 0 else -1 for i in matches]
         self.info = StreamInfo(
             source=f"rosbag {src.resolve().stem}",
-            cameras={options.camera_id: self._rectify.intrinsics},
+            cameras={options.camera_id: self._rectifier(self._measured).intrinsics},
             frame_count=len(self._color),
             frame_hz=_rate(stamps),
         )
@@ -197,8 +210,10 @@ class RosbagRecording:
         pose = self._pose_at(stamp_ns)
         if pose is None:
             raise BadFrameError(where, f"there is no pose round its time {stamp_ns / 1e9:.6f} s{self._gap(stamp_ns)}")
+        measured = self._lenses[int(np.abs(self._lens_stamps - stamp_ns).argmin())]
+        rectify = self._rectifier(measured)
         try:
-            rgb, encoded = self._rgb(index)
+            rgb, encoded = self._rgb(index, measured)
         except CodecError as error:
             raise BadFrameError(where, f"image of {stamp_ns / 1e9:.6f} s: {error}") from error
         return LoadedFrame(
@@ -207,27 +222,37 @@ class RosbagRecording:
                 seq=number,
                 camera_id=self._options.camera_id,
                 rgb=rgb,
-                depth_m=self._depth_m(self._depth_of[number]),
+                depth_m=self._depth_m(self._depth_of[number], measured),
                 label=None,
-                intrinsics=self._rectify.intrinsics,
+                intrinsics=rectify.intrinsics,
                 T_world_camera=check_frame_pose(pose, where),
             ),
             encoded,
         )
 
-    def _rgb(self, index: int) -> tuple[UInt8, EncodedImage | None]:
+    def _rectifier(self, measured: CameraIntrinsics) -> Rectifier:
+        if measured not in self._rectifiers:
+            if len(self._rectifiers) >= KEPT_RECTIFIERS:
+                self._rectifiers.pop(next(iter(self._rectifiers)))
+            try:
+                self._rectifiers[measured] = Rectifier(measured)
+            except ConfigError as error:
+                raise BadFrameError(self._bag.src, str(error)) from error
+        return self._rectifiers[measured]
+
+    def _rgb(self, index: int, measured: CameraIntrinsics) -> tuple[UInt8, EncodedImage | None]:
         message = self._bag.message(self._color_topic.name, self._color, index)
         encoded = None
         if self._color_topic.raw:
             rgb = ros_images.color_image(message)
         else:
             rgb, encoded = ros_images.compressed_color_image(message)
-        image_size_must_be(rgb, self._measured, Path(self._color_topic.name))
-        if self._measured.distorted:
-            return self._rectify(np.ascontiguousarray(rgb[..., ::-1])), None
+        image_size_must_be(rgb, measured, Path(self._color_topic.name))
+        if measured.distorted:
+            return self._rectifier(measured)(np.ascontiguousarray(rgb[..., ::-1])), None
         return rgb, encoded
 
-    def _depth_m(self, index: int) -> Float32 | None:
+    def _depth_m(self, index: int, measured: CameraIntrinsics) -> Float32 | None:
         topic = self._depth_topic
         if index < 0 or topic is None:
             return None
@@ -238,24 +263,25 @@ class RosbagRecording:
             depth_m = read(message, self.depth_scale.units_per_m)
         except CodecError as error:
             raise BadFrameError(where, str(error)) from error
-        k = self._depth_intrinsics
+        rectify = self._rectifier(measured)
+        k = measured if self._T_color_depth is None else self._depth_intrinsics
         if depth_m.shape != (k.height, k.width):
             height, width = depth_m.shape
             if (
                 self._T_color_depth is None
-                and not self._measured.distorted
+                and not measured.distorted
                 and same_view((k.width, k.height), (width, height))
             ):
                 k = scale_intrinsics(k, width, height)  # registered, and made smaller
-                return register_depth(depth_m, k, np.eye(4), self._rectify.intrinsics)
+                return register_depth(depth_m, k, np.eye(4), rectify.intrinsics)
             raise BadFrameError(
                 where,
                 f"the depth image is {width}x{height}, its calibration says {k.width}x{k.height}; name the one that it "
                 "has (--topic depth_info=NAME), or import without depth (--topic depth=none)",
             )
         if self._T_color_depth is not None:
-            return register_depth(depth_m, k, self._T_color_depth, self._rectify.intrinsics)
-        return self._rectify.nearest(depth_m)
+            return register_depth(depth_m, k, self._T_color_depth, rectify.intrinsics)
+        return rectify.nearest(depth_m)
 
     def _find_images(self) -> tuple[_Topic, _Topic | None]:
         """The topics of colour and of depth.
@@ -324,6 +350,17 @@ class RosbagRecording:
             f"{there}"
         )
 
+    def _with_frame(self, topic: _Topic, info: str) -> _Topic:
+        """The topic with the frame of its calibration, where its images name none."""
+        whose = "a later image"
+        if not topic.frame and info:
+            messages = (message for _, _, message, _ in islice(self._bag.messages({info}), LOOKED_AT))
+            frame = next(filter(None, (frame_name(message.header.frame_id) for message in messages)), "")
+            topic, whose = replace(topic, frame=frame, frame_late=bool(frame)), info
+        if topic.frame_late:
+            self.notices.append(f"{topic.name}: its first image names no frame; '{topic.frame}' of {whose} is taken")
+        return topic
+
     def _pose_topic(self) -> str:
         """The topic that poses come from; empty = tf.
 
@@ -351,52 +388,69 @@ class RosbagRecording:
             raise ImportSourceError(
                 f"{self._bag.src}: has no poses: neither tf nor a topic of "
                 f"{', '.join(t.replace('/msg/', '/') for t in (*_NAMED_POSES, *_POSES))}; it has {self._bag.listing()}"
+                + self._path_hint()
                 + (_VIEWER if color.name.startswith(_REALSENSE_VIEWER) else "")
             )
 
-    def _read_all(self, infos: set[str]) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
-        """One pass over the bag: stamps of images and transforms; returns calibrations and poses by topic."""
+    def _path_hint(self) -> str:
+        paths = self._bag.topics("nav_msgs/msg/Path")
+        return f" ({paths[0]}, a nav_msgs/Path, is not read)" if paths else ""
+
+    def _read_all(self, infos: set[str]) -> tuple[dict[str, list[Any]], dict[str, list[tuple[int, Any]]]]:
+        """One pass over the bag: stamps of images and transforms; returns calibrations and timed poses by topic."""
         calibrations: dict[str, list[Any]] = {name: [] for name in infos}
-        poses: dict[str, list[Any]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
+        self._info_stamps: dict[str, list[int]] = {name: [] for name in infos}
+        poses: dict[str, list[tuple[int, Any]]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
         transforms = self._bag.topics(*_TF)
         unstamped = 0
-        for name, received_ns, message in self._bag.messages({*self._stamps, *infos, *transforms, *poses}):
+        for name, received_ns, message, node in self._bag.messages({*self._stamps, *infos, *transforms, *poses}):
             if name in self._stamps:
                 stamp_ns = stamp_of(message.header)
                 unstamped += not stamp_ns
-                self._first_image.setdefault(name, message)
+                if len(message.data):
+                    self._first_image.setdefault(name, message)
                 self._stamps[name].append((stamp_ns or received_ns, received_ns))
             elif name in calibrations:
                 calibrations[name].append(message)
+                self._info_stamps[name].append(stamp_of(message.header) or received_ns)
             elif name in transforms:
-                self._tree.add(message.transforms, fixed=name.endswith("tf_static"))
+                self._tree.add(message.transforms, name, node, received_ns)
             else:
-                poses[name].append(message)
-        self.notices += self._tree.close()
+                poses[name].append((received_ns, message))
+        self.notices += self._tree.close(self._color_topic.name)
         if unstamped:
             self.notices.append(f"{unstamped} images have no stamp: the time at which they were recorded stands for it")
         return calibrations, poses
 
-    def _intrinsics(self, topic: _Topic, infos: list[Any], name: str) -> CameraIntrinsics:
-        """Raises: ImportSourceError: they change, or cannot be used."""
+    def _intrinsics(self, topic: _Topic, infos: list[Any], name: str) -> list[tuple[int, CameraIntrinsics]]:
+        """Intrinsics by time, all of one lens.
+
+        Raises:
+            ImportSourceError: they change, or cannot be used.
+        """
         if not infos:
             raise ImportSourceError(f"{self._bag.src}: {name} has no message")
-        good = [info for info in infos if self._bag.is_calibrated(info)]
+        timed = list(zip(self._info_stamps[name], infos, strict=True))
+        good = [(stamp_ns, info) for stamp_ns, info in timed if self._bag.is_calibrated(info)]
         if good and len(good) < len(infos):
             self.notices.append(
                 f"{name}: {counted(len(infos) - len(good), 'message')} without a calibration passed over"
             )
         try:
             size = self._size(topic, infos)
-            found = [self._bag.intrinsics(info, size, rectified=topic.rectified) for info in good or infos[:1]]
+            lenses = [
+                (stamp_ns, self._bag.intrinsics(info, size, rectified=topic.rectified))
+                for stamp_ns, info in good or timed[:1]
+            ]
         except ImportSourceError as error:
             raise ImportSourceError(f"{self._bag.src}: {topic.name}: {error}") from error
+        found = [k for _, k in lenses]
         if any(k.distortion != found[0].distortion or not _one_lens(found[0], k) for k in found):
             raise ImportSourceError(
                 f"{self._bag.src}: the calibration of {topic.name} changes ({found[0]}, then {found[-1]}): the lens "
                 "has zoomed or the size was switched; cut the bag where it does"
             )
-        return found[0]
+        return lenses
 
     def _size(self, topic: _Topic, infos: list[Any]) -> tuple[int, int] | None:
         """(width, height) of the first image, where a calibration does not tell it."""
@@ -421,6 +475,8 @@ class RosbagRecording:
         color = self._color_topic
         own = own if own is None or own.distorted or not self._is_scaled(own) else self._measured
         linked = depth.frame != color.frame and self._tree.reaches(color.frame, depth.frame)
+        if linked:
+            self._check_sources(color.frame, depth.frame)
         T = self._tree.lookup(color.frame, depth.frame, self._color[0][0], MAX_STAMP_NS) if linked else np.eye(4)
         if own is None:
             self.notices.append(f"{depth.name} has no calibration: it is taken as registered to {color.name}")
@@ -441,7 +497,7 @@ class RosbagRecording:
         self._T_color_depth, self._depth_intrinsics = invert_pose(self._T_frame_image) @ T, own
         self.notices.append(f"{depth.name} is registered to {color.name} here, by tf and the intrinsics of both")
 
-    def _pose_source(self, topic: str, messages: list[Any]) -> tuple[Callable[[int], Float64 | None], str]:
+    def _pose_source(self, topic: str, messages: list[tuple[int, Any]]) -> tuple[Callable[[int], Float64 | None], str]:
         """What tells the pose of a time, and a sentence on it.
 
         Raises:
@@ -451,6 +507,7 @@ class RosbagRecording:
         camera, tree = self._color_topic.frame, self._tree
         if not topic:
             world = self._world(camera)
+            self._check_sources(world, camera)
             self._moving = tree.moving_above(camera, world)
 
             def from_tf(stamp_ns: int) -> Float64 | None:
@@ -464,7 +521,12 @@ class RosbagRecording:
                 f"{self._bag.src}: {topic} tells where '{body}' is, but tf does not say where the camera '{camera}' "
                 f"sits on it; record tf_static, or say with --body {camera} that the poses are the camera's"
             )
-
+        self._check_sources(body, camera)
+        if jump := track.jump_m():
+            raise ImportSourceError(
+                f"{self._bag.src}: the poses of {topic} jump to and fro by {jump:.2g} m or rad: two programs publish "
+                "it; record one of them, or name another topic: --topic pose=NAME"
+            )
         self._moving = [(topic, track)]
         self.notices += track.oddities(topic)
 
@@ -476,6 +538,13 @@ class RosbagRecording:
             return T_world_body @ T_body_camera @ self._T_frame_image
 
         return pose_at, f"poses are those of {camera}, from {topic} of {body}"
+
+    def _check_sources(self, target: str, source: str) -> None:
+        """Raises: ImportSourceError: tf has two truths about a transform between the frames."""
+        try:
+            self._tree.check(target, source)
+        except ImportSourceError as error:
+            raise ImportSourceError(f"{self._bag.src}: {error}") from error
 
     def _image_pose(self, color: _Topic, infos: list[Any]) -> Float64:
         """``T_frame_image`` (4, 4): how a stereo camera's rectification has turned the image within its frame."""
@@ -556,17 +625,24 @@ class RosbagRecording:
                 return f"; {name} is there from {_span(track.stamps_ns)}, and not near it"
         return ""
 
-    def _track(self, topic: str, messages: list[Any]) -> tuple[str, Track]:
+    def _track(self, topic: str, messages: list[tuple[int, Any]]) -> tuple[str, Track]:
         """Whose poses a topic tells, and the poses."""
         named = topic in self._bag.topics(*_NAMED_POSES)
-        body = frame_name(self._options.body or (messages[0].child_frame_id if named and messages else ""))
+        body = frame_name(self._options.body or (messages[0][1].child_frame_id if named and messages else ""))
         if messages and not body:
             raise ImportSourceError(
                 f"{self._bag.src}: {topic} does not say whose poses it tells; name the frame with --body, such as "
                 f"--body {self._color_topic.frame} where they are the camera's"
             )
         read = self._bag.pose_reader(topic)
-        rows = [(stamp_of(message.header), pose_row(*read(message))) for message in messages]
+        rows = [
+            (stamp_of(message.header) or received_ns, pose_row(*read(message))) for received_ns, message in messages
+        ]
+        unstamped = sum(not stamp_of(message.header) for _, message in messages)
+        if unstamped:
+            self.notices.append(
+                f"{topic}: {counted(unstamped, 'pose')} without a stamp; the time of receipt stands for it"
+            )
         good = [(stamp, row) for stamp, row in rows if row is not None]
         if not good:
             raise ImportSourceError(f"{self._bag.src}: {topic} holds no pose")
@@ -589,6 +665,12 @@ class RosbagRecording:
             raise ImportSourceError(
                 f"{self._bag.src}: tf does not know the frame '{camera}' of {self._color_topic.name}; record tf and "
                 "tf_static, or name a topic of poses: --topic pose=NAME --body " + (camera or "FRAME")
+            )
+        if not self._tree.moving_above(camera, way[-1]):
+            raise ImportSourceError(
+                f"{self._bag.src}: tf has no frame {', '.join(WORLDS)} above the camera: {_on(way)}; and nothing tells "
+                f"how '{way[-1]}' moves: record tf or odometry{self._path_hint()}. Only where the camera stood still: "
+                f"--world {way[-1]}"
             )
         raise ImportSourceError(
             f"{self._bag.src}: tf has no frame {', '.join(WORLDS)} above the camera: {_on(way)}; name the world: "
@@ -649,24 +731,31 @@ class _Bag:
         return visible(", ".join(names[:LISTED])) + more if names else "no topic at all"
 
     def image_topics(self) -> list[_Topic]:
-        """Topics of images that have messages, by their first."""
+        """Topics of images that have messages, by the first of them that tell what they are."""
         found: list[_Topic] = []
         for kind, field in ((_RAW, "encoding"), (_COMPRESSED, "format")):
             for name in self.topics(kind):
-                _, _, message = next(self.messages({name}), ("", 0, None))
-                if message is not None:
-                    encoding = str(getattr(message, field))
+                encodings: list[str] = []
+                frames: list[str] = []
+                for _, _, message, _ in islice(self.messages({name}), LOOKED_AT):
+                    encodings.append(str(getattr(message, field)) if len(message.data) else "")
+                    frames.append(frame_name(message.header.frame_id))
+                    if encodings[-1] and any(frames):
+                        break
+                if frames:
                     # The RealSense Viewer gives all cameras one frame, "0", although they stand apart.
                     viewer = name.startswith(_REALSENSE_VIEWER)
-                    frame = name.rsplit("/", 2)[0] if viewer else frame_name(message.header.frame_id)
-                    found.append(_Topic(name, kind == _RAW, encoding, frame))
+                    frame = name.rsplit("/", 2)[0] if viewer else next(filter(None, frames), "")
+                    encoding = next(filter(None, encodings), "")
+                    found.append(_Topic(name, kind == _RAW, encoding, frame, frame_late=bool(frame) and not frames[0]))
         return found
 
-    def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time of recording, and message, in the order of recording."""
+    def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any, str]]:
+        """Topic, time of recording, message, and its node (ROS 1; else empty), in the order of recording."""
         with self._explained():
             for connection, received_ns, data in self._reader.messages(connections=self._connections(names)):
-                yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype)
+                node = "" if self._is_ros2 else connection.ext.callerid or ""
+                yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype), node
 
     def message(self, name: str, series: list[tuple[int, int]], index: int) -> Any:
         """One message of a topic; quick where they are asked for in order.
@@ -713,8 +802,8 @@ class _Bag:
 
     def is_calibrated(self, info: Any) -> bool:
         """Whether a ``sensor_msgs/CameraInfo`` says anything: cameras send some before they know."""
-        K, _, P = self._matrices(info)
-        return bool((np.any(K) or np.any(P)) and np.isfinite(K).all() and np.isfinite(P).all())
+        K, D, P = self._matrices(info)
+        return bool((np.any(K) or np.any(P)) and all(np.isfinite(matrix).all() for matrix in (K, D, P)))
 
     def rectification(self, info: Any) -> tuple[Float64, Float64]:
         """R (3, 3) and P (12,) of a ``sensor_msgs/CameraInfo``."""
@@ -787,11 +876,17 @@ def _on(way: list[str]) -> str:
     return " on ".join(f"'{frame}'" for frame in way)
 
 
-def _rectifier(src: Path, measured: CameraIntrinsics) -> Rectifier:
-    try:
-        return Rectifier(measured)
-    except ConfigError as error:
-        raise ImportSourceError(f"{src}: {error}") from error
+def _distinct(lenses: list[tuple[int, CameraIntrinsics]]) -> tuple[NDArray[np.int64], list[CameraIntrinsics]]:
+    """Stamps in their order, and the intrinsics of each; those that do not differ much are one."""
+    known = lenses[0][1]
+    found: list[CameraIntrinsics] = []
+    ordered = sorted(lenses, key=lambda lens: lens[0])
+    for _, k in ordered:
+        focal = max(abs(known.fx - k.fx) / known.fx, abs(known.fy - k.fy) / known.fy)
+        if focal > _FOCAL_CHANGE or max(abs(known.cx - k.cx), abs(known.cy - k.cy)) > _CENTRE_CHANGE:
+            known = k
+        found.append(known)
+    return np.array([stamp_ns for stamp_ns, _ in ordered], np.int64), found
 
 
 def _rate(stamps: Any) -> float:

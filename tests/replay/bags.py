@@ -27,7 +27,7 @@ DEPTH_INFO = "/cam/aligned_depth_to_color/camera_info"
 _ROS1, _ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 _ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
-# What happens in a bag: topic, time, message.
+# What happens in a bag: topic (and, behind "@", the node of ROS 1 that publishes it), time, message.
 Event = tuple[str, int, Any]
 
 
@@ -187,7 +187,9 @@ def write_bag(path: Path, kind: Kind, events: Sequence[Event]) -> Path:
         for topic, received_ns, message in sorted(events, key=lambda event: event[1]):
             name = message.__msgtype__
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=store)
+                bare, _, node = topic.partition("@")
+                of_node = {"callerid": node} if node else {}
+                connections[topic] = writer.add_connection(bare, name, typestore=store, **of_node)
             writer.write(connections[topic], received_ns, serialize(message, name))
     return path
 
