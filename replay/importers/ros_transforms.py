@@ -148,6 +148,7 @@ class _Told:
     fixed: list[Float64] = field(default_factory=list[Float64])  # those that differ
     stamps_ns: list[int] = field(default_factory=list[int])
     rows: list[tuple[float, ...]] = field(default_factory=list[tuple[float, ...]])
+    received_ns: list[int] = field(default_factory=list[int])
     unstamped: int = 0
     track: Track | None = None
 
@@ -207,8 +208,8 @@ class TransformTree:
                     told.fixed.append(T)
             else:
                 stamp_ns = stamp_of(stamped.header)
-                told.unstamped += not stamp_ns
-                told.stamps_ns.append(stamp_ns or received_ns)
+                told.stamps_ns.append(stamp_ns)
+                told.received_ns.append(received_ns)
                 told.rows.append(row)
 
     def close(self, image: str) -> list[str]:
@@ -220,6 +221,7 @@ class TransformTree:
         """
         notices: list[str] = []
         for told in (told for sources in self._told.values() for told in sources.values()):
+            told.unstamped = fill_stamps(told.stamps_ns, told.received_ns)
             told.track = Track(told.stamps_ns, told.rows) if told.rows else None
         others = self._other_robots(image)
         for space in sorted(others):
@@ -240,7 +242,7 @@ class TransformTree:
             )
             for told in moving:
                 notices += told.track.oddities(f"tf of '{child}'") if told.track is not None else []
-                told.stamps_ns, told.rows = [], []
+                told.stamps_ns, told.received_ns, told.rows = [], [], []
             if unstamped:
                 notices.append(
                     f"tf of '{child}': {counted(unstamped, 'pose')} without a stamp; the time of receipt stands for it"
@@ -350,6 +352,19 @@ def frame_name(name: str) -> str:
 def stamp_of(header: Any) -> int:
     """Nanoseconds of a ``std_msgs/Header``."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def fill_stamps(stamps_ns: list[int], received_ns: list[int]) -> int:
+    """Put the time of receipt where a stamp is 0, which is none; returns how often.
+
+    A simulated clock begins at 0, so there it is one.
+    """
+    if any(0 < stamp < received / 2 for stamp, received in zip(stamps_ns, received_ns, strict=True)):
+        return 0
+    missing = [i for i, stamp in enumerate(stamps_ns) if not stamp]
+    for i in missing:
+        stamps_ns[i] = received_ns[i]
+    return len(missing)
 
 
 def pose_row(position: Any, rotation: Any) -> tuple[float, ...] | None:

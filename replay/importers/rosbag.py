@@ -42,6 +42,7 @@ from semantic_mapper.replay.importers.ros_transforms import (
     WORLDS,
     Track,
     TransformTree,
+    fill_stamps,
     frame_name,
     pose_row,
     stamp_of,
@@ -402,14 +403,14 @@ class RosbagRecording:
         self._info_stamps: dict[str, list[int]] = {name: [] for name in infos}
         poses: dict[str, list[tuple[int, Any]]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
         transforms = self._bag.topics(*_TF)
-        unstamped = 0
+        stamps: dict[str, list[int]] = {name: [] for name in self._stamps}
+        received: dict[str, list[int]] = {name: [] for name in self._stamps}
         for name, received_ns, message, node in self._bag.messages({*self._stamps, *infos, *transforms, *poses}):
             if name in self._stamps:
-                stamp_ns = stamp_of(message.header)
-                unstamped += not stamp_ns
                 if len(message.data):
                     self._first_image.setdefault(name, message)
-                self._stamps[name].append((stamp_ns or received_ns, received_ns))
+                stamps[name].append(stamp_of(message.header))
+                received[name].append(received_ns)
             elif name in calibrations:
                 calibrations[name].append(message)
                 self._info_stamps[name].append(stamp_of(message.header) or received_ns)
@@ -418,6 +419,8 @@ class RosbagRecording:
             else:
                 poses[name].append((received_ns, message))
         self.notices += self._tree.close(self._color_topic.name)
+        unstamped = sum(fill_stamps(stamps[name], received[name]) for name in stamps)
+        self._stamps = {name: list(zip(stamps[name], received[name], strict=True)) for name in stamps}
         if unstamped:
             self.notices.append(f"{unstamped} images have no stamp: the time at which they were recorded stands for it")
         return calibrations, poses
@@ -635,10 +638,9 @@ class RosbagRecording:
                 f"--body {self._color_topic.frame} where they are the camera's"
             )
         read = self._bag.pose_reader(topic)
-        rows = [
-            (stamp_of(message.header) or received_ns, pose_row(*read(message))) for received_ns, message in messages
-        ]
-        unstamped = sum(not stamp_of(message.header) for _, message in messages)
+        stamps = [stamp_of(message.header) for _, message in messages]
+        unstamped = fill_stamps(stamps, [received_ns for received_ns, _ in messages])
+        rows = [(stamp, pose_row(*read(message))) for stamp, (_, message) in zip(stamps, messages, strict=True)]
         if unstamped:
             self.notices.append(
                 f"{topic}: {counted(unstamped, 'pose')} without a stamp; the time of receipt stands for it"

@@ -252,6 +252,28 @@ def test_poses_without_stamps_have_the_time_of_their_receipt(tmp_path: Path, kin
         assert np.abs(frame.T_world_camera - T_world_odom @ T @ bags.camera_on_base()).max() < 1e-6
 
 
+def test_a_simulated_clock_begins_at_zero(tmp_path: Path) -> None:
+    """What was recorded by the computer's clock then has stamps from 0 on."""
+
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        made: list[Event] = [event for event in events if event[0] == "/tf_static"]
+        for n, (frame, T) in enumerate(zip(FRAMES, bags.bodies(FRAMES), strict=True)):
+            ns, received_ns = n * bags.PERIOD_NS, bags.stamp_of(n)
+            made += [
+                ("/tf", received_ns, m.tf(ns, "odom", "base_link", T)),
+                (INFO, received_ns, m.info(ns, CAMERA, frame.intrinsics)),
+                (COLOR, received_ns, m.image(ns, CAMERA, frame.rgb, "rgb8")),
+            ]
+        return made
+
+    report, frames = imported(make(tmp_path, "mcap", change))
+    assert not notice(report, "stamp") and [frame.stamp_ns for frame in frames] == [
+        n * bags.PERIOD_NS for n in range(6)
+    ]
+    for frame, T in zip(frames, bags.bodies(FRAMES), strict=True):
+        assert np.abs(frame.T_world_camera - T @ bags.camera_on_base()).max() < 1e-6
+
+
 def test_a_path_is_named_as_what_is_not_read(tmp_path: Path) -> None:
     def change(m: Messages, events: list[Event]) -> list[Event]:
         kept = [event for event in events if event[0] != "/tf"]
