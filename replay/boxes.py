@@ -104,9 +104,7 @@ def usable(path: Path, found: BoxFile) -> BoxFile:
     if found.is_xml and found.primitives:
         _log.warning("boxes_left_out", file=str(path), count=len(found.bad), reason=named)
         return found
-    ids = sorted({b.id for b in found.bad if b.id is not None})[:MAX_NAMED]
-    hint = f" (or without: `boxes {path.name} delete {' '.join(map(str, ids))}`)" if ids and not found.is_xml else ""
-    raise ConfigError(f"{path}, {named}{hint}")
+    raise ConfigError(f"{path}, {named}")
 
 
 def save_boxes(path: Path, boxes: BoxFile) -> None:

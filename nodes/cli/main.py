@@ -111,7 +111,7 @@ app.add_typer(cli_launch.app, name="launch")
 app.command("eval")(cli_eval.evaluate)
 # Coordinates below 0 look like options.
 app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)
-app.command("boxes", context_settings={"ignore_unknown_options": True})(cli_boxes.boxes)
+app.command("boxes")(cli_boxes.boxes)
 app.command("train")(cli_train.train)
 app.command("benchmark")(cli_benchmark.benchmark)
 app.command("bench")(cli_bench.bench)

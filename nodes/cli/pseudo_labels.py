@@ -179,7 +179,7 @@ def _where_classes_come_from(labels: PseudoLabels, needed: set[str]) -> str:
     if labels.source == OWN and needed <= set(load_checkpoint(path).label_set.names):
         return f"{said}; weights '{path.stem}' have all classes of the boxes: --pseudo {path.stem} takes their labels"
     return (
-        f"{said}: correct the boxes (`boxes FILE reclass ID CLASS`), say in `merge` of the file which class of the "
+        f"{said}: correct the classes of the boxes, say in `merge` of the file which class of the "
         "labels stands for it, or give other labels (--pseudo)"
     )
 

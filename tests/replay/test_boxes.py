@@ -314,7 +314,5 @@ def test_unknown_keys_of_the_file_are_refused(tmp_path: Path, text: str, message
 def test_all_bad_boxes_are_named_and_a_byte_order_mark_is_none(tmp_path: Path) -> None:
     path = write(tmp_path / "boxes.json", entry(), entry(id=70000), entry(id=3, size=[1, 1, 0]), entry(id="a"))
     path.write_text("\ufeff" + path.read_text())
-    with pytest.raises(
-        ConfigError, match=r"box 2 \(id 70000\).*box 3 \(id 3\).*box 4: id must.*boxes boxes.json delete 3 70000"
-    ):
+    with pytest.raises(ConfigError, match=r"box 2 \(id 70000\).*box 3 \(id 3\).*box 4: id must"):
         load_boxes(path)

@@ -11,7 +11,7 @@ import pytest
 
 from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.replay.boxes import BoxFile, load_boxes, save_boxes
+from semantic_mapper.replay.boxes import BoxFile, save_boxes
 from tests.nodes.support import error_line, run
 from tests.small import tiny_frames
 
@@ -28,85 +28,46 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_file_goes_round_through_all_changes(file: Path) -> None:
-    before = load_boxes(file).primitives[0]
-    for words in (
-        ("duplicate", "2"),
-        ("move", "6", "-0.5", "0", "1e-1"),
-        ("turn", "6", "90"),
-        ("resize", "6", "1", "2", "0.5"),
-        ("reclass", "6", "table"),
-        ("duplicate", "6", "--at-ns", "70"),
-        ("duplicate", "6", "--at-ns", "90"),
-        ("move", "6", "0", "1", "0", "--at-ns", "90"),
-        ("delete", "2", "5"),
-    ):
-        done = run("boxes", file, *words, "--in-place")
-        assert done.returncode == 0, done.stderr
-    assert "box 2, 5 deleted; 1 box written" in done.stdout
-    (table,) = load_boxes(file).primitives
-    assert (table.id, table.class_name, table.size.tolist()) == (6, "table", [1, 2, 0.5])
-    np.testing.assert_allclose(table.T_world_box[:3, 0], (0, 1, 0), atol=1e-12)
-    first, later = (pose[:3, 3] - before.T_world_box[:3, 3] for _, pose in table.stamps or ())
-    np.testing.assert_allclose((first, later), ((-0.5, 0, 0.1), (-0.5, 1, 0.1)), atol=1e-12)
-
-
-def test_list_and_out_leave_the_file_alone(file: Path, tmp_path: Path) -> None:
-    text, out = file.read_bytes(), tmp_path / "new" / "fewer.json"
-    listed = json.loads(run("boxes", file, "list", "--json").stdout)
+def test_boxes_are_listed_for_people_and_programs(file: Path) -> None:
+    text = file.read_bytes()
+    listed = json.loads(run("boxes", file, "--json").stdout)
     assert [(b["id"], b["class"], b["thing"]) for b in listed["boxes"]] == [(2, "chair", True), (5, "wall", False)]
-    assert "chair" in run("boxes", file).stdout
-    assert run("boxes", file, "delete", "5", "--out", out).returncode == 0
-    assert len(load_boxes(out).primitives) == 1 and file.read_bytes() == text
+    assert "chair" in run("boxes", file).stdout and file.read_bytes() == text
 
 
 def test_boxes_are_drawn_where_the_frames_show_them(file: Path, log: Path, tmp_path: Path) -> None:
     out = tmp_path / "boxes.jpg"
-    done = run("boxes", file, "picture", log, "--out", out)
+    done = run("boxes", file, "--picture", log, "--out", out)
     assert out.read_bytes().startswith(b"\xff\xd8") and "1 of 2 boxes in view of its frames; written" in done.stdout
     color = np.array(ROOMS.colors[ROOMS.names.index("chair")])[::-1]
     tiles = np.asarray(cv2.imread(str(out)))[110 : 110 + 300, 24 : 24 + 3 * 512].astype(int)
     assert (np.abs(tiles - color).max(-1) < 30).sum() > 300
 
 
-def test_wrong_use_and_wrong_ids_are_told_apart_and_change_nothing(file: Path, log: Path, tmp_path: Path) -> None:
+def test_wrong_use_changes_nothing(file: Path, log: Path, tmp_path: Path) -> None:
     text = file.read_bytes()
     for words in (
-        ("delete", "2"),
-        ("delete", "2", "--in-place", "--out", tmp_path / "b.json"),
-        ("move", "2", "1", "1", "--in-place"),
-        ("move", "2", "1", "1", "one", "--in-place"),
-        ("delete", "two", "--in-place"),
-        ("resize", "2", "1", "1", "1", "--at-ns", "5", "--in-place"),
-        ("picture", "log.mcap"),
-        ("list", "--in-place"),
-        ("delete", "2", "--in-place", "--json"),
-        ("delete", "2", "--out", tmp_path / "b.png"),
-        ("picture", log, "--out", tmp_path / "b.gif"),
-        ("picture", tmp_path / "log.png", "--out", tmp_path / "log.png"),
+        ("--picture", log),
+        ("--out", tmp_path / "b.png"),
+        ("--picture", log, "--out", tmp_path / "b.gif"),
+        ("--picture", tmp_path / "log.png", "--out", tmp_path / "log.png"),
     ):
         assert run("boxes", file, *words).returncode == 2, words
-    done = run("boxes", file, "delete", "9", "--in-place")
-    assert done.returncode == 1 and error_line(done.stderr).endswith(f"{file}: has no box 9; it has 2, 5")
-    done = run("boxes", file, "move", "2", "1e9", "0", "0", "--in-place")
-    assert done.returncode == 1 and "box 2: T_world_box: the box is at" in error_line(done.stderr)
     (tmp_path / "boxes.png").symlink_to(file)
-    done = run("boxes", file, "picture", log, "--out", tmp_path / "boxes.png")
+    done = run("boxes", file, "--picture", log, "--out", tmp_path / "boxes.png")
     assert done.returncode == 1 and "is the file of boxes" in error_line(done.stderr)
     assert file.read_bytes() == text
 
 
-def test_a_file_with_a_box_that_cannot_be_used_is_mended_by_taking_it_out(file: Path) -> None:
+def test_a_box_that_cannot_be_used_is_named(file: Path) -> None:
     data = json.loads(file.read_text())
     data["boxes"][1]["size"] = [1, 1, 1e-9]
     file.write_text(json.dumps(data))
     done = run("boxes", file)
     assert done.returncode == 1 and "box 2 (id 5): size must be at least" in error_line(done.stderr)
-    assert run("boxes", file, "delete", "5", "--in-place").returncode == 0
-    assert "chair" in run("boxes", file).stdout
 
 
-def test_xml_of_kitti360_is_not_replaced(tmp_path: Path) -> None:
+def test_xml_of_kitti360_is_listed_with_what_is_left_out(tmp_path: Path) -> None:
     xml = tmp_path / "0000.xml"
     corners = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -125,7 +86,3 @@ def test_xml_of_kitti360_is_not_replaced(tmp_path: Path) -> None:
     found = json.loads(listed.stdout)
     assert [(b["frames"], b["stamps_ns"]) for b in found["boxes"]] == [([], []), ([3], [])]
     assert found["bad"][0]["id"] == 9 and "1 frame: 3 to 3" in run("boxes", xml).stdout
-    done = run("boxes", xml, "move", "1", "1", "0", "0", "--in-place")
-    assert done.returncode == 1 and "give --out FILE.json" in error_line(done.stderr)
-    assert run("boxes", xml, "move", "1", "1", "0", "0", "--out", tmp_path / "b.json").returncode == 0
-    assert load_boxes(tmp_path / "b.json").primitives[0].T_world_box[0, 3] == 1
