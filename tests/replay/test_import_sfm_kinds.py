@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.sfm.colmap_model import MODELS, intrinsics_of
+from semantic_mapper.transport.messages import SCENE_DEPTH_KEY
 
 from .test_import_gps import flight, make_opensfm
 from .test_import_kinds import change_json, said
@@ -191,6 +193,46 @@ def test_values_of_opensfm_that_are_no_numbers_cost_what_they_are_of(tmp_path: P
     assert len(frames) == 4 and "made up" in said(report)
 
 
+def changed_opensfm(folder: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+    """A flight of 4 pictures; what ``change`` returns are further models."""
+    file = make_opensfm(folder, flight(4)) / "reconstruction.json"
+    (model,) = json.loads(file.read_text())
+    file.write_text(json.dumps([model, *(change(model) or ())]))
+    return folder
+
+
+@pytest.mark.parametrize("point", [None, {}, {"coordinates": None}, {"coordinates": [1, "x", 2]}, 3])
+def test_a_bad_point_of_opensfm_is_passed_over(tmp_path: Path, point: Any) -> None:
+    folder = changed_opensfm(tmp_path / "flight", lambda model: model["points"].update({"3": point}))
+    report, frames = imported(folder)
+    assert len(frames) == 4 and SCENE_DEPTH_KEY in report.info.metadata
+
+
+@pytest.mark.parametrize("small", [{}, None, {"shots": None}, {"shots": {}, "cameras": 3}, {"reference_lla": "x"}])
+def test_a_small_second_model_of_any_content_ends_no_import(tmp_path: Path, small: Any) -> None:
+    report, frames = imported(changed_opensfm(tmp_path / "flight", lambda model: [small]))
+    assert len(frames) == 4 and "2 parts" in said(report)
+
+
+@pytest.mark.parametrize(
+    ("name", "shot", "says"),
+    [
+        ("DJI_0.JPG", None, "shot 'DJI_0.JPG'"),
+        ("DJI_0.JPG", {"rotation": [0, 0, 0], "translation": [0, 0, None], "camera": "v2 dji"}, "translation"),
+        ("../a.jpg", {"rotation": [0, 0, 0], "translation": [0, 0, 0], "camera": "v2 dji"}, "outside"),
+        ("DJI_0.JPG", {"rotation": [0, 0, 0], "translation": [0, 0, 0], "camera": "none"}, "camera 'none'"),
+    ],
+)
+def test_a_bad_shot_of_opensfm_costs_its_picture(tmp_path: Path, name: str, shot: Any, says: str) -> None:
+    def change(model: dict[str, Any]) -> None:
+        del model["shots"]["DJI_0.JPG"]
+        model["shots"][name] = shot
+        model["cameras"]["none"] = None
+
+    report, frames = imported(changed_opensfm(tmp_path / "flight", change))
+    assert len(frames) == 3 and "1 picture left out" in said(report) and says in said(report)
+
+
 def test_a_fisheye_with_tangential_coefficients_is_refused(tmp_path: Path) -> None:
     lens = {"projection_type": "fisheye_opencv", "focal_x": 0.8, "focal_y": 0.8, "k1": 0.01, "p1": 0.1}
     with pytest.raises(ImportSourceError, match="p1 and p2 is not read"):
@@ -202,6 +244,11 @@ def test_a_fisheye_with_tangential_coefficients_is_refused(tmp_path: Path) -> No
     [
         ({"w": None, "h": None}, ""),
         ({"w": float(W)}, ""),
+        ({"w": str(W), "h": f"{H}.0"}, ""),
+        ({"w": 0}, ""),
+        ({"fps": "x"}, "made up at 60"),
+        ({"frameTimestamps": "x"}, ""),
+        ({"perFrameIntrinsicCoeffs": [[50.0, "x", 32.0, 24.0], None, 3]}, ""),
         ({"fps": None, "frameTimestamps": None}, "made up at 60"),
         ({"fps": 0}, "made up at 60"),
         ({"K": [], "perFrameIntrinsicCoeffs": [[50.0, 50.0, 32.0, 24.0]] * 3}, ""),
@@ -215,13 +262,39 @@ def test_missing_values_of_record3d_end_no_import(tmp_path: Path, changes: dict[
     assert len(frames) == 3 and says in said(report)
 
 
-def test_a_broken_pose_of_record3d_costs_its_picture_and_times_go_on(tmp_path: Path) -> None:
-    folder = make_record3d(tmp_path / "phone", frameTimestamps=[5.0, 5.5], fps=10)
+@pytest.mark.parametrize("value", [float("nan"), None, "x"])
+def test_a_broken_pose_of_record3d_costs_its_picture(tmp_path: Path, value: Any) -> None:
+    folder = make_record3d(tmp_path / "phone")
     found = json.loads((folder / "metadata.json").read_text())
-    found["poses"][1][4] = float("nan")
+    found["poses"][0] = value
+    found["poses"][1][4] = value
     (folder / "metadata.json").write_text(json.dumps(found))
     report, frames = imported(folder)
-    assert [frame.stamp_ns for frame in frames] == [0, 600_000_000] and "1 picture left out" in said(report)
+    assert [frame.stamp_ns for frame in frames] == [500_000_000] and "2 pictures left out" in said(report)
+
+
+@pytest.mark.parametrize(
+    ("times", "fps", "stamps_ms", "says"),
+    [
+        ([5.0, 5.5], 10, [0, 500, 600], "lack 1 picture; "),
+        ([5.0], 10, [0, 100, 200], "lack 2 pictures; "),
+        ([None, 5.0, 5.5], 10, [0, 100, 600], "follow at 10 frames a second"),
+        ([5.0, "x", 6.0], 10, [0, 500, 1000], "lack 1 picture; "),
+        ([5.0, 5.5], None, [0, 500, 517], "follow at 60 frames a second (assumed)"),
+    ],
+)
+def test_times_that_record3d_lacks_follow_at_its_rate(
+    tmp_path: Path, times: list[Any], fps: float | None, stamps_ms: list[int], says: str
+) -> None:
+    report, frames = imported(make_record3d(tmp_path / "phone", frameTimestamps=times, fps=fps))
+    assert [round(frame.stamp_ns / 1e6) for frame in frames] == stamps_ms and says in said(report)
+
+
+def test_a_pose_of_record3d_without_its_picture_is_counted(tmp_path: Path) -> None:
+    folder = make_record3d(tmp_path / "phone")
+    (folder / "rgb" / "1.jpg").rename(folder / "rgb" / "7.jpg")
+    report, frames = imported(folder)
+    assert len(frames) == 2 and "1 pose without a picture" in said(report) and "7.jpg" in said(report)
 
 
 def test_what_polycam_leaves_unpaired_is_told(tmp_path: Path) -> None:
@@ -229,7 +302,7 @@ def test_what_polycam_leaves_unpaired_is_told(tmp_path: Path) -> None:
     sorted((keyframes / "corrected_images").iterdir())[0].unlink()
     report, frames = imported(tmp_path / "scan")
     assert len(frames) == 2 and "1 camera without a picture" in said(report)
-    assert "1 picture of images/ that corrected_images/ lacks left out" in said(report)
+    assert "1 picture of images/ that corrected_images/ lacks left out; the first: 5000000.jpg" in said(report)
 
 
 def test_polycam_without_corrected_pictures_takes_the_others(tmp_path: Path) -> None:
