@@ -13,7 +13,7 @@ import numpy as np
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import PICTURES, ImportOptions, inside
-from semantic_mapper.replay.importers.placed import place_model
+from semantic_mapper.replay.importers.placed import has_picture, place_model
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.sfm.colmap_model import ColmapImage, ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
@@ -28,24 +28,27 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     notices: list[str] = []
     place, model = _largest(folder, notices)
     roots = list(dict.fromkeys((folder / "images", *(parent / "images" for parent in place.parents[:3]), folder)))
-    found = {root: [(root / image.name).is_file() for image in model.images] for root in roots}
-    root = max(roots, key=lambda root: sum(found[root]))
-    if not any(found[root]):
+    found = {root: sum(has_picture(root, image.name) for image in model.images) for root in roots}
+    root = max(roots, key=lambda root: found[root])
+    if not found[root]:
         name = model.images[0].name
+        inside(roots[0], name)  # tells of a name that leads out of it
         raise ImportSourceError(f"{folder}: the pictures of the model are missing; '{name}' is not in {roots[0]}")
-    if model.left_out:
-        notices.append(f"{counted(len(model.left_out), 'image')} left out; the first: {model.left_out[0]}")
     images: list[tuple[Path, ColmapImage]] = []
+    left_out = [*model.left_out]
     for image in model.images:
         try:
             images.append((inside(root, image.name), image))
         except ImportSourceError as error:
-            notices.append(f"1 image left out: {error}")
-    if not images:
-        raise ImportSourceError(notices[-1])
+            left_out.append(str(error))
+    if left_out:
+        notices.append(f"{counted(len(left_out), 'image')} left out; the first: {left_out[0]}")
+    if model.damaged:
+        notices.append(f"the model is damaged in {counted(len(model.damaged), 'place')}; the first: {model.damaged[0]}")
     names = {file for file, _ in images}
-    beside = root.iterdir() if root == folder else root.rglob("*")
-    unposed = [path for path in sorted(beside) if path.suffix.lower() in PICTURES and path not in names]
+    places, below = ({file.parent for file in names}, "*") if root == folder else ({root}, "**/*")
+    beside = sorted(path for place in places for path in place.glob(below))
+    unposed = [path for path in beside if path.suffix.lower() in PICTURES and path not in names]
     if unposed:
         notices.append(
             f"{counted(len(unposed), 'picture')} in {root} without a pose in this model; the first: {unposed[0].name}"

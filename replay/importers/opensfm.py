@@ -31,7 +31,7 @@ from semantic_mapper.replay.importers.base import (
     unknown_keys,
     unknown_notice,
 )
-from semantic_mapper.replay.importers.placed import PlacedModel, place_model
+from semantic_mapper.replay.importers.placed import PlacedModel, has_picture, place_model
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth, scene_depth
@@ -78,9 +78,9 @@ class _Reference(msgspec.Struct):
 
 
 class _Model(msgspec.Struct):
-    cameras: dict[str, dict[str, Any]] = {}
-    shots: dict[str, dict[str, Any]] = {}
-    points: dict[str, dict[str, Any]] = {}
+    cameras: dict[str, Any] = {}  # each is read by itself, so that a bad one costs no other
+    shots: dict[str, Any] = {}
+    points: Any = None  # they tell the depth alone
     reference_lla: _Reference | None = None
 
 
@@ -99,11 +99,11 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     if file is None:
         raise ImportSourceError(f"{folder}: no {FILE} in it, or below opensfm/")
     plain = read_plain_json(file, MAX_BYTES, list)
-    models = [_Model() if not isinstance(model, dict) else convert_known(model, _Model, str(file)) for model in plain]
-    number = max(range(len(models)), key=lambda n: len(models[n].shots), default=-1)
-    if number < 0 or not models[number].shots:
+    sizes = [len(_table(_table(model).get("shots"))) for model in plain]
+    if not any(sizes):
         raise ImportSourceError(f"{file}: holds no posed picture")
-    model = models[number]
+    number = sizes.index(max(sizes))
+    model = convert_known(plain[number], _Model, str(file))
     names = sorted(model.shots, key=numeric_order)
     root = _root(folder, file, names)
     cameras: dict[str, CameraIntrinsics | str] = {}
@@ -135,7 +135,7 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         far = scene_depth(_depth(model.points, pictures))
         placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin), **far})
     opened = placed.pictures("opensfm", folder, pictures, options)
-    opened.notices += unknown_notice(file, unknown_keys(model.cameras.values(), _Camera))
+    opened.notices += unknown_notice(file, unknown_keys(map(_table, model.cameras.values()), _Camera))
     unposed = [
         path for path in sorted(root.iterdir()) if path.suffix.lower() in PICTURES and path.name not in model.shots
     ]
@@ -145,13 +145,18 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         opened.notices.append(
             f"{counted(len(unposed), 'picture')} in {root} without a pose; the first: {unposed[0].name}"
         )
-    if len(models) > 1:
-        others = ", ".join(str(len(m.shots)) for n, m in enumerate(models) if n != number)
+    if len(sizes) > 1:
+        others = ", ".join(str(size) for n, size in enumerate(sizes) if n != number)
         opened.notices.append(
-            f"the reconstruction fell into {len(models)} parts; the largest is imported, those of {others} "
+            f"the reconstruction fell into {len(sizes)} parts; the largest is imported, those of {others} "
             "pictures are not"
         )
     return opened
+
+
+def _table(value: Any) -> dict[str, Any]:
+    """What is of another type holds nothing."""
+    return value if isinstance(value, dict) else {}
 
 
 def _read(file: Path, kind: type[ReadT]) -> ReadT:
@@ -170,8 +175,9 @@ def _reference_beside(file: Path) -> _Reference | None:
 def _root(folder: Path, file: Path, names: list[str]) -> Path:
     roots = (file.parent / "images", folder / "images", file.parent.parent / "images", file.parent)
     for root in roots:
-        if any(inside(root, name).is_file() for name in names):
+        if any(has_picture(root, name) for name in names):
             return root
+    inside(roots[0], names[0])  # tells of a name that leads out of it
     raise ImportSourceError(f"{folder}: the pictures are missing; '{names[0]}' is not in {roots[0]}")
 
 
@@ -185,7 +191,7 @@ def _picture(
     T_camera_world[:3, :3] = cv2.Rodrigues(np.array(shot.rotation))[0]
     T_camera_world[:3, 3] = shot.translation
     time = shot.capture_time
-    time_s = time if isinstance(time, int | float) and 0 < time < MAX_STAMP_NS / 1e9 else None
+    time_s = time if type(time) in (int, float) and 0 < time < MAX_STAMP_NS / 1e9 else None
     stamp_ns = None if time_s is None else round(time_s * 1e9)
     return PosedPicture(inside(root, name), camera, invert_pose(T_camera_world), stamp_ns=stamp_ns)
 
@@ -215,10 +221,15 @@ def _intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
         raise ImportSourceError(f"{where}: {error}") from error
 
 
-def _depth(points: Mapping[str, Mapping[str, Any]], pictures: list[PosedPicture]) -> float:
+def _depth(points: Any, pictures: list[PosedPicture]) -> float:
     """Median depth of the points in front of some cameras and within their pictures; 0 = there are none."""
-    rows = [row for point in points.values() if isinstance(row := point.get("coordinates"), list) and len(row) == 3]
-    xyz = np.array([row for row in rows[:: max(1, len(rows) // _POINTS)] if None not in row], np.float64).reshape(-1, 3)
+    rows = [_table(point).get("coordinates") for point in _table(points).values()]
+    numbers = [
+        row
+        for row in rows[:: max(1, len(rows) // _POINTS)]
+        if isinstance(row, list) and len(row) == 3 and all(isinstance(value, int | float) for value in row)
+    ]
+    xyz = np.array(numbers, np.float64).reshape(-1, 3)
     step = max(1, len(pictures) // _LOOKED_AT)
     frames = [PlacedFrame(0, p.T_world_camera, _seen(xyz, p)) for p in pictures[::step]]
     return median_depth(frames) if any(len(frame.xyz) for frame in frames) else 0.0

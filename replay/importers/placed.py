@@ -11,7 +11,7 @@ import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
-from semantic_mapper.replay.importers.base import DepthScale, ImportOptions
+from semantic_mapper.replay.importers.base import DepthScale, ImportOptions, inside
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, place_by_gps, read_position
 from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, scene_depth, upright
@@ -44,6 +44,14 @@ class PlacedModel:
         opened.notices += self.notices
         opened.info = msgspec.structs.replace(opened.info, metadata={**opened.info.metadata, **self.metadata})
         return opened
+
+
+def has_picture(root: Path, name: str) -> bool:
+    """Whether a model's picture is in this folder; one whose name leads out of it, or cannot be one, is not."""
+    try:
+        return inside(root, name).is_file()
+    except (ImportSourceError, OSError):
+        return False
 
 
 def place_model(

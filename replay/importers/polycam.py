@@ -76,8 +76,11 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
     kind = "corrected_" if corrected else ""
     cameras = numbered_files(keyframes / f"{kind}cameras", (".json",), notices)
     notices += without_picture("camera", cameras, images, keyframes / f"{kind}images")
-    if missing := {*all_images} - {*images}:
-        notices.append(f"{counted(len(missing), 'picture')} of images/ that corrected_images/ lacks left out")
+    if missing := sorted({*all_images} - {*images}):
+        notices.append(
+            f"{counted(len(missing), 'picture')} of images/ that corrected_images/ lacks left out; the first: "
+            f"{all_images[missing[0]].name}"
+        )
     if not images:
         raise ImportSourceError(f"{keyframes / 'images'}: no pictures; export 'raw data' (developer mode)")
     first = min(images)

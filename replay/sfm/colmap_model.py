@@ -16,8 +16,9 @@ import numpy as np
 
 from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
-from semantic_mapper.files import numeric_order, read_regular
+from semantic_mapper.files import decode_text, numeric_order, read_regular
 from semantic_mapper.geometry import invert_pose, pose_matrix
+from semantic_mapper.plain_text import counted
 from semantic_mapper.types import CameraIntrinsics, Float64, Int64
 
 MAX_BYTES = 1 << 31  # of one file of a model
@@ -41,6 +42,8 @@ MODELS: dict[int, tuple[str, int]] = {
     15: ("FISHEYE", 4),
     16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
+    18: ("SKEWED_PINHOLE", 5),
+    19: ("BROWN_CONRADY", 8),
 }
 _NAMES = ("cameras", "images", "points3D")
 
@@ -73,7 +76,8 @@ class ColmapModel:
         images: In the order of their names, by the numbers in these.
         points: (3,) of each point by its id.
         errors_px: Mean reprojection error of each point, by its id.
-        left_out: What is left out, and why.
+        left_out: Images that are left out, and why.
+        damaged: What is missing of cameras, features and points, and why.
     """
 
     cameras: dict[int, CameraIntrinsics]
@@ -81,6 +85,7 @@ class ColmapModel:
     points: dict[int, Float64]
     errors_px: dict[int, float]
     left_out: tuple[str, ...] = ()
+    damaged: tuple[str, ...] = ()
 
 
 def find_models(folder: Path) -> list[Path]:
@@ -103,8 +108,8 @@ def read_model(folder: Path) -> ColmapModel:
     """Read the model in a folder; binary files come before text.
 
     Raises:
-        ImportSourceError: a file is missing, cut off, or holds something else; no image has a pose and a camera with a
-            lens of OpenCV's models.
+        ImportSourceError: a file is missing, images.bin is cut off, or no image has a pose and a camera with a lens of
+            OpenCV's models.
     """
     binary = all((folder / f"{name}.bin").exists() for name in _NAMES[:2])
     kind = "bin" if binary else "txt"
@@ -114,7 +119,8 @@ def read_model(folder: Path) -> ColmapModel:
             raise ImportSourceError(f"{file}: missing; a model has cameras, images and points3D, .bin or .txt")
     cameras: dict[int, CameraIntrinsics] = {}
     broken: dict[int, str] = {}
-    for camera in _cameras_bin(files[0]) if binary else _cameras_txt(files[0]):
+    damaged: list[str] = []
+    for camera in _cameras_bin(files[0], damaged) if binary else _cameras_txt(files[0], damaged):
         try:
             cameras[camera.number] = intrinsics_of(
                 camera.model, camera.width, camera.height, camera.params, camera.where
@@ -123,7 +129,7 @@ def read_model(folder: Path) -> ColmapModel:
             broken[camera.number] = str(error)
     images: list[ColmapImage] = []
     left_out: list[str] = []
-    for row in _images_bin(files[1]) if binary else _images_txt(files[1], left_out):
+    for row in _images_bin(files[1]) if binary else _images_txt(files[1], left_out, damaged):
         try:
             if row.camera_id not in cameras:
                 missing = f"{files[1]}: image '{row.name}' has camera {row.camera_id}, which is missing"
@@ -132,16 +138,22 @@ def read_model(folder: Path) -> ColmapModel:
         except ImportSourceError as error:
             left_out.append(str(error))
     if left_out and not images:
-        raise ImportSourceError(left_out[0])
+        raise ImportSourceError([*damaged, *left_out][0])
     images.sort(key=lambda image: numeric_order(image.name))
     points, errors = {}, {}
+    not_finite = 0
     try:
         rows = () if not files[2].exists() else _points_bin(files[2]) if binary else _points_txt(files[2])
         for number, xyz, error in rows:
-            points[number], errors[number] = xyz, error
+            if np.isfinite(xyz).all():
+                points[number], errors[number] = xyz, error
+            else:
+                not_finite += 1
     except ImportSourceError as error:  # poses need no points
-        left_out.append(f"points, but for the first {len(points)}: {error}")
-    return ColmapModel(cameras, tuple(images), points, errors, tuple(left_out))
+        damaged.append(f"points, but for the first {len(points)}, left out: {error}")
+    if not_finite:
+        damaged.append(f"{files[2]}: {counted(not_finite, 'point')} without a finite position left out")
+    return ColmapModel(cameras, tuple(images), points, errors, tuple(left_out), tuple(damaged))
 
 
 def intrinsics_of(model: str, width: int, height: int, params: list[float], where: str) -> CameraIntrinsics:
@@ -157,10 +169,12 @@ def intrinsics_of(model: str, width: int, height: int, params: list[float], wher
     wanted = dict(MODELS.values()).get(model)
     if wanted is None or wanted != len(params) or model == "EQUIRECTANGULAR":
         raise ImportSourceError(f"{advice} ({len(params)} parameters)")
-    one_focal = model.startswith(("SIMPLE", "RADIAL"))
+    one_focal = model.startswith(("SIMPLE", "RADIAL", "BROWN"))
     fx, fy, cx, cy, *lens = (params[0], *params) if one_focal else params
-    if model in ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM") and not lens[0]:
+    if model in ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM", "SKEWED_PINHOLE") and not lens[0]:
         model, lens = "PINHOLE", []
+    if model == "BROWN_CONRADY":  # k1 k2 k3 p1 p2
+        model, lens = "OPENCV", [*lens[:2], *lens[3:], lens[2]]
     if model == "THIN_PRISM_FISHEYE":  # k1 k2 p1 p2 k3 k4 sx1 sy1
         k1, k2, p1, p2, k3, k4, *prism = lens
         if not any((p1, p2, *prism)):
@@ -178,10 +192,7 @@ class _Bytes:
     """Numbers of a binary file, in order."""
 
     def __init__(self, file: Path) -> None:
-        try:
-            self._data, self._at, self.file = read_regular(file, MAX_BYTES), 0, file
-        except OSError as error:
-            raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+        self._data, self._at, self.file = _read(file), 0, file
 
     def numbers(self, form: str) -> tuple[float, ...]:
         """Numbers as ``struct`` has them, little endian.
@@ -242,12 +253,17 @@ class _ImageRow:
     point_ids: Int64
 
 
-def _cameras_bin(file: Path) -> Iterator[_CameraRow]:
+def _cameras_bin(file: Path, damaged: list[str]) -> Iterator[_CameraRow]:
+    """Up to the first camera of a model that is not known: how long it is, is not known, either."""
     data = _Bytes(file)
     for _ in range(data.count()):
         number, model, width, height = (int(n) for n in data.numbers("iiQQ"))
         if model not in MODELS:
-            raise ImportSourceError(f"{file}: camera {number} has model {model}, which is not known")
+            damaged.append(
+                f"{file}: camera {number} has model {model}, which is not known; it and the cameras behind it are left "
+                "out. Undistort the images (`colmap image_undistorter`) and import the model that comes out"
+            )
+            return
         name, count = MODELS[model]
         params = list(data.numbers(f"{count}d"))
         yield _CameraRow(number, name, width, height, params, f"{file}, camera {number}")
@@ -271,37 +287,42 @@ def _points_bin(file: Path) -> Iterator[tuple[int, Float64, float]]:
         yield int(number), np.array((x, y, z)), float(error)
 
 
-def _cameras_txt(file: Path) -> Iterator[_CameraRow]:
+def _cameras_txt(file: Path, damaged: list[str]) -> Iterator[_CameraRow]:
     for line, words in _lines(file):
         try:
-            number, model, width, height = int(words[0]), words[1], int(float(words[2])), int(float(words[3]))
-            params = [float(word) for word in words[4:]]
+            number, width, height, *params = _numbers([words[0], *words[2:]])
+            row = _CameraRow(int(number), words[1].strip(",;"), int(width), int(height), params, f"{file}, line {line}")
         except (ValueError, IndexError, OverflowError) as error:
-            raise _bad_line(file, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", error) from error
-        yield _CameraRow(number, model, width, height, params, f"{file}, line {line}")
+            damaged.append(str(_bad_line(file, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", error)))
+            continue
+        yield row
 
 
-def _images_txt(file: Path, left_out: list[str]) -> Iterator[_ImageRow]:
-    """Two lines an image; the second one, its features, may be empty. Sentences on lines that cannot be read go into
-    ``left_out``."""
+def _images_txt(file: Path, left_out: list[str], damaged: list[str]) -> Iterator[_ImageRow]:
+    """Two lines an image; the second one, its features, may be empty. Sentences on poses that cannot be read go into
+    ``left_out``, on features into ``damaged``."""
     rows = iter(_lines(file, empty=True))
     for line, words in rows:
         if not words:
             continue
         try:
-            pose, camera, name = [float(word) for word in words[1:8]], int(words[8]), " ".join(words[9:])
+            *pose, camera = _numbers(words[1:9])
+            camera, name = int(camera), " ".join(words[9:])
             if len(pose) != 7 or not name:
                 raise ValueError("too few values")
-        except (ValueError, IndexError) as error:
+        except (ValueError, OverflowError) as error:
             form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             left_out.append(str(_bad_line(file, line, form, error)))
             next(rows, None)  # its features
             continue
         line, words = next(rows, (line + 1, []))
         try:
-            features = np.array([float(word) for word in words]).reshape(-1, 3)
+            features = np.array(_numbers(words)).reshape(-1, 3)
+            if not np.isfinite(features).all():
+                raise ValueError("not finite")
         except ValueError as error:  # its pose is good
-            left_out.append(str(_bad_line(file, line, "X Y POINT3D_ID ...", error)))
+            bad = _bad_line(file, line, "X Y POINT3D_ID ...", error)
+            damaged.append(f"{bad}; image '{name}' is without its features")
             features = np.empty((0, 3))
         points = features[:, 2].astype(np.int64)
         yield _ImageRow(name, camera, pose, features[:, :2] - 0.5, points)
@@ -310,7 +331,7 @@ def _images_txt(file: Path, left_out: list[str]) -> Iterator[_ImageRow]:
 def _points_txt(file: Path) -> Iterator[tuple[int, Float64, float]]:
     for line, words in _lines(file):
         try:
-            yield int(words[0]), np.array([float(word) for word in words[1:4]]).reshape(3), float(words[7])
+            yield int(words[0].strip(",;")), np.array(_numbers(words[1:4])).reshape(3), _numbers(words[7:8])[0]
         except (ValueError, IndexError) as error:
             raise _bad_line(file, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]", error) from error
 
@@ -326,13 +347,31 @@ def _image(row: _ImageRow, file: Path) -> ColmapImage:
 
 
 def _lines(file: Path, *, empty: bool = False) -> Iterator[tuple[int, list[str]]]:
+    data = _read(file)
     try:
-        lines = read_regular(file, MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
-    except OSError as error:
-        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
-    for number, line in enumerate(lines, 1):
+        text = decode_text(data)
+    except UnicodeDecodeError:  # names of pictures in another character set
+        text = data.decode("utf-8", "replace")
+    for number, line in enumerate(text.splitlines(), 1):
         if not line.startswith("#") and (empty or line.strip()):
             yield number, line.split()
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return read_regular(file, MAX_BYTES)
+    except OSError as error:
+        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except ConfigError as error:
+        raise ImportSourceError(str(error)) from error
+
+
+def _numbers(words: list[str]) -> list[float]:
+    """Numbers with a point or a decimal comma, between spaces, also with a comma or a semicolon behind each."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return [float(word.strip(",;").replace(",", ".")) for word in words]
 
 
 def _bad_line(file: Path, line: int, form: str, error: Exception) -> ImportSourceError:
