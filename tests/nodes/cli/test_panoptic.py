@@ -179,7 +179,8 @@ def test_a_class_that_labels_lack_says_whose_classes_they_are_and_which_weights_
         match_boxes(load_boxes(boxes), boxes, open_pseudo_labels(opened, None))
     strange = tmp_path / "strange.json"
     strange.write_text(boxes.read_text().replace('"class": "', '"class": "un'))
-    with open_log(log) as opened, pytest.raises(ConfigError, match=r"own label images: correct the classes of the boxes"):
+    expected = r"own label images: correct the classes of the boxes"
+    with open_log(log) as opened, pytest.raises(ConfigError, match=expected):
         match_boxes(load_boxes(strange), strange, open_pseudo_labels(opened, None))
 
 
