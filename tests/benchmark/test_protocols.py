@@ -82,7 +82,7 @@ def test_the_query_is_a_source_only_of_a_kind_that_needs_it() -> None:
 
 def test_without_depth_nothing_of_it_reaches_the_field() -> None:
     field = watched()
-    score(Entry("blind", "blind", field), tiny_suite(depth=False))
+    score(Entry("blind", "blind", field), tiny_suite(depth="off"))
     assert not field.seen.depth_m.any() and field.seen.channel is None
     assert field.sampling == tiny_suite().tier.blind
     score(Entry("seeing", "seeing", field), tiny_suite())
@@ -106,8 +106,8 @@ def test_computed_depth_comes_with_its_spread_and_is_sampled_more_widely() -> No
 
 def test_without_depth_coarse_samples_may_guide_fine_ones() -> None:
     tier = {"width": 48, "blind": {"mode": "reference", "coarse": 6, "fine": 4}}
-    record = score(tiny_contestant(), tiny_suite(depth=False, tier=tier)).record
-    uniform = score(tiny_contestant(), tiny_suite(depth=False)).record
+    record = score(tiny_contestant(), tiny_suite(depth="off", tier=tier)).record
+    uniform = score(tiny_contestant(), tiny_suite(depth="off")).record
     assert record.images[0].depth.count > 0 and record.settings != uniform.settings
     assert record.images[0].depth != uniform.images[0].depth
 
@@ -235,7 +235,7 @@ def test_labels_carried_by_depth_alone_stand_beside_what_was_fitted() -> None:
     assert figures["sure"] == last / count and (figures["sure_right"] is None) is (last == 0)
     assert score(tiny_contestant(), tiny_suite()).record.carried is None
     blind = {"keyframes": 3, "guard": 1, "seconds": 0, "steps": 1}
-    assert score(tiny_contestant(), tiny_suite(protocol="finetune", depth=False, scene=blind)).record.carried is None
+    assert score(tiny_contestant(), tiny_suite(protocol="finetune", depth="off", scene=blind)).record.carried is None
 
 
 def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:

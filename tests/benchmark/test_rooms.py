@@ -80,10 +80,6 @@ def test_the_camera_of_the_sequence_may_be_another():
     assert settings_digest(suite, "views") != settings_digest(SuiteConfig(), "views")
 
 
-def test_depth_may_be_said_as_it_was_before() -> None:
-    assert (tiny_suite(depth=True).depth, tiny_suite(depth=False).depth) == ("on", "off")
-
-
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
@@ -94,10 +90,6 @@ def test_depth_may_be_said_as_it_was_before() -> None:
 def test_depth_that_there_cannot_be_is_refused(changes: dict[str, object], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         check_suite(tiny_suite(**changes))
-
-
-def test_the_old_name_of_the_source_views_still_works() -> None:
-    assert tiny_suite(baseline="narrow").sources == "near" and tiny_suite(baseline="wide").sources == "wide"
 
 
 @pytest.mark.parametrize("seed", range(ROOM, ROOM + 5))
