@@ -116,8 +116,6 @@ def finetune(
     _refuse_mixed(weights, from_scratch, kind, keyframes, frames, labels, unlabelled, variant, boxes, pseudo, uncovered)
     if strokes and kind in ("grid", "panoptic"):
         raise typer.BadParameter(f"--kind {kind} learns from no strokes", param_hint="--strokes")
-    if seconds == 0 and not steps and config is None:
-        raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     must_be_there(log)
     output = Output.guarded()
     import msgspec

@@ -101,7 +101,7 @@ def _check_hosts(url: str) -> None:
     """Check host and port: packages raise whatever they like for them, or try again and again.
 
     Raises:
-        ConfigError: there is none of the two that can be.
+        ConfigError: one of the two is missing or impossible.
     """
     for part in url.split(CHAIN):
         if _split(part)[0].lower() not in _HOST_SCHEMES:

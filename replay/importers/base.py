@@ -130,7 +130,7 @@ class ImportReport:
         labelled: Of these, with a label image.
         with_depth: Of these, with a depth image.
         depth_scale: How their depth images were read.
-        median_depth_m: Of the measurements in the first of them, to judge the scale by; 0 where there are none.
+        median_depth_m: Of the measurements in the first of them, to judge the scale by; 0 without any.
         skipped: Frames and label images that were left out.
         notices: Sentences on what had to be assumed of the whole recording.
         format: Of the recording.
@@ -461,8 +461,10 @@ def read_numbers(text: str) -> list[float]:
     """Numbers of a row.
 
     Raises:
-        ValueError: a word is no number.
+        ValueError: a word is no number, or there are no words.
     """
+    if not text.strip():
+        raise ValueError("is empty or a comment")
     return [float(word) for word in split_row(text)]
 
 
@@ -501,7 +503,7 @@ def read_rows(file: Path, count: int, notices: list[str]) -> list[tuple[int, str
     if not between:
         return rows
     if len(rows) == count or 2 * between >= len(rows):
-        notices.append(f"{file}: {counted(between, 'line')} that are empty or a comment passed over")
+        notices.append(f"{file}: {counted(between, 'line')} passed over, empty or a comment")
         return rows
     texts = dict(rows)
     return [(line, texts.get(line, "")) for line in range(rows[0][0], rows[-1][0] + 1)]

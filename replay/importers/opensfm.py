@@ -222,7 +222,7 @@ def _intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
 
 
 def _depth(points: Any, pictures: list[PosedPicture]) -> float:
-    """Median depth of the points in front of some cameras and within their pictures; 0 = there are none."""
+    """Median depth of the points in front of some cameras and within their pictures; 0 without points."""
     rows = [_table(point).get("coordinates") for point in _table(points).values()]
     numbers = [
         row

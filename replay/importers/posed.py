@@ -146,7 +146,7 @@ class PosedPictures:
         return LoadedFrame(frame, None if changed else encoded)
 
     def _depth(self, picture: PosedPicture, rectifier: Rectifier, size: tuple[int, int]) -> Float32 | None:
-        """Depth image (H, W) in metres, of the size and the lens of the picture; None where there is none."""
+        """Depth image (H, W) in metres, of the size and the lens of the picture; None without depth."""
         if picture.depth_file is None or self._options.without_depth or not picture.depth_file.exists():
             return None
         depth_m = read_depth(picture.depth_file, self.depth_scale, None)

@@ -95,7 +95,7 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
 
 
 def _number(value: Any) -> float | None:
-    """A finite number, also one that is written as text; None = it is none."""
+    """A finite number, also one that is written as text; else None."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):

@@ -22,7 +22,7 @@ from semantic_mapper.types import Float64
 WORLDS = ("map", "world", "odom")  # names of a world by REP 105 and habit, the preferred first
 MAX_NORM_ERROR = 0.1  # of a unit quaternion; more is no rotation
 MAX_GAP_NS = 1_000_000_000  # over a longer gap nothing is interpolated
-_SAME = 1e-3  # of a transform's entries; what is told twice may differ by it
+_SAME = 1e-3  # of a transform's entries; two that are published may differ by it
 # How two sources that take turns show, in poses whose unit is metres and radians (see Track.jump_m).
 _JUMP_M = 0.02  # of a pose from the line between its neighbours; less does no harm
 _SMOOTHER = 0.15  # fraction of that jump within which each source is smooth; noise stays above 0.35

@@ -205,7 +205,7 @@ class RosbagRecording:
         stamp_ns = self._color[index][0]
         where = Path(self._color_topic.name)
         if not 0 <= stamp_ns < MAX_STAMP_NS:
-            raise BadFrameError(where, f"its stamp, {stamp_ns} ns, is none")
+            raise BadFrameError(where, f"its stamp, {stamp_ns} ns, is impossible")
         if number and self._color[int(self._order[number - 1])][0] == stamp_ns:
             raise BadFrameError(where, f"a second image of {stamp_ns / 1e9:.6f} s")
         pose = self._pose_at(stamp_ns)

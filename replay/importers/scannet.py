@@ -175,7 +175,7 @@ class ScanNetRecording:
         return ids
 
     def _read_table(self) -> UInt8 | None:
-        """Raw id -> NYU40 id, 0 where there is none: (65536,)."""
+        """Raw id -> NYU40 id, 0 for unknown: (65536,)."""
         here = self._folder.resolve()
         for folder in (here, *here.parents[:2]):
             file = folder / _TABLE

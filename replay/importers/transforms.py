@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
@@ -132,15 +132,12 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     )
     size = _common_size(folder, found, [frame for _, frame in frames])
     pictures: list[PosedPicture] = []
-    unit_ns = _time_unit([_seconds(frame) for _, frame in frames], file, notices)
+    stamps_ns = _stamps([_time(frame) for _, frame in frames], file, notices)
     metres = _metres_per_unit(found, file, notices) if options.scale is None else None
-    for number, frame in frames:
+    for (number, frame), stamp_ns in zip(frames, stamps_ns, strict=True):
         try:
-            pictures.append(
-                _picture(
-                    folder, found, frame, size, axes, unit_ns, f"{file}, frame {number} ('{frame.file_path[:80]}')"
-                )
-            )
+            where = f"{file}, frame {number} ('{frame.file_path[:80]}')"
+            pictures.append(_picture(folder, found, frame, size, axes, stamp_ns, where))
         except ImportSourceError as error:
             left_out.append(str(error))
     if left_out:
@@ -151,23 +148,31 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     if metres is not None:
         for picture in pictures:
             picture.T_world_camera[:3, 3] *= metres
-    scale, measured, said = _depth_scale(file, found, [frame for _, frame in frames], pictures, options)
+    scale, measured, said = _depth_scale(file, found, [frame for _, frame in frames], pictures, options, metres or 1.0)
     opened = PosedPictures(
         "transforms",
         folder,
         pictures,
         options,
         depth_scale=scale,
-        metric=measured or _UNITS.get(_unit(found)) is not None,
+        metric=measured or bool(_unit(found)),
     )
     opened.notices += [*notices, *said]
     return opened
 
 
 def _depth_scale(
-    file: Path, found: _Transforms, frames: Sequence[_Frame], pictures: Sequence[PosedPicture], options: ImportOptions
+    file: Path,
+    found: _Transforms,
+    frames: Sequence[_Frame],
+    pictures: Sequence[PosedPicture],
+    options: ImportOptions,
+    multiplied: float,
 ) -> tuple[DepthScale, bool, list[str]]:
-    """Of the depth images, whether there is one that makes the poses metres, and what is to be said of them."""
+    """Of the depth images, whether there is one that makes the poses metres, and what is to be said of them.
+
+    ``multiplied`` is what the positions of the file were multiplied by already.
+    """
     there = [
         picture.depth_file for picture in pictures if picture.depth_file is not None and picture.depth_file.is_file()
     ]
@@ -182,7 +187,7 @@ def _depth_scale(
                 f"{file}: depth_path needs integer_depth_scale, the unit of the poses per number of the depth images; "
                 "write it, or import without depth (--topic depth=none)"
             )
-        units = 1 / (factor * (options.scale or 1.0))
+        units = 1 / (factor * (options.scale or 1.0) * multiplied)  # depth in the unit of the poses follows them
         return DepthScale(units, file, float_units_per_m=units), False, []
     factor = 0.001 if found.depth_unit_scale_factor is None else found.depth_unit_scale_factor
     if not 0 < factor < 1e3:
@@ -221,11 +226,13 @@ def _common_size(folder: Path, found: _Transforms, frames: Sequence[_Frame]) -> 
     """(width, height) of the first picture that can be read, for files that do not tell it; None = none."""
     if found.w is not None and found.h is not None:
         return None
-    inside_folder: list[Path] = []
-    for frame in frames:
-        with suppress(ImportSourceError):  # reported when its turn comes
-            inside_folder.append(_image(folder, frame))
-    return first_size(inside_folder)
+
+    def images() -> Iterator[Path]:
+        for frame in frames:
+            with suppress(ImportSourceError):  # reported when its turn comes
+                yield _image(folder, frame)
+
+    return first_size(images())
 
 
 def _image(folder: Path, frame: _Frame) -> Path:
@@ -268,8 +275,8 @@ def _metres_per_unit(found: _Transforms, file: Path, notices: list[str]) -> floa
     return factor
 
 
-def _seconds(frame: _Frame) -> float | None:
-    """A frame's time in its unit; None = none that can be."""
+def _time(frame: _Frame) -> float | None:
+    """A frame's time in the file's unit; None if it is missing or impossible."""
     try:
         time = float(frame.timestamp) if frame.timestamp is not None else math.nan
     except ValueError:
@@ -277,19 +284,20 @@ def _seconds(frame: _Frame) -> float | None:
     return time if 0 <= time < math.inf else None
 
 
-def _time_unit(times: Sequence[float | None], file: Path, notices: list[str]) -> float:
-    """Nanoseconds of the unit of the frames' times: that of Unix times by their size, else by the usual gap."""
-    told = np.sort([time for time in times if time is not None])
-    if not len(told):
-        return 1e9
-    gap = float(np.median(np.diff(told))) if len(told) > 1 else 0.0
-    unix = [n for n in range(4) if 1e9 <= told[-1] / 1000**n <= 4e9 and gap / 1000**n <= 1000]
+def _stamps(times: Sequence[float | None], file: Path, notices: list[str]) -> list[int | None]:
+    """Nanoseconds. The unit is that of Unix times where they are as large as these, else it follows from the gap."""
+    known = np.sort([time for time in times if time is not None])
+    if not len(known):
+        return [None] * len(times)
+    gap = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    unix = [n for n in range(4) if 1e9 <= known[-1] / 1000**n <= 4e9 and gap / 1000**n <= 1000]
     usual = [n for n in range(4) if _BELIEVABLE_S[0] <= gap / 1000**n <= _BELIEVABLE_S[1]]
     steps = next(iter((*unix, *usual)), 0)
     name = ("seconds", "milliseconds", "microseconds", "nanoseconds")[steps]
     rate = f", {1000**steps / gap:.3g} frames a second" if gap else ""
     notices.append(f"{file}: 'timestamp' is read as {name}{rate}")
-    return 1e9 / 1000**steps
+    unit_ns = 1e9 / 1000**steps
+    return [None if t is None or t * unit_ns >= MAX_STAMP_NS else round(t * unit_ns) for t in times]
 
 
 def _picture(
@@ -298,15 +306,13 @@ def _picture(
     frame: _Frame,
     size: tuple[int, int] | None,
     axes: Float64,
-    unit_ns: float,
+    stamp_ns: int | None,
     where: str,
 ) -> PosedPicture:
     image = _image(folder, frame)
     T_world_gl = _matrix(frame.transform_matrix, image)
     depth = frame.depth_file_path or frame.depth_path
     lens = _intrinsics(all_frames, frame, size, where)
-    time = _seconds(frame)
-    stamp_ns = round(time * unit_ns) if time is not None and 0 <= time * unit_ns < MAX_STAMP_NS else None
     return PosedPicture(image, lens, T_world_gl @ axes, None if not depth else inside(folder, depth), stamp_ns)
 
 

@@ -109,7 +109,7 @@ class LogReader:
         except LogError:
             self._file.close()
             raise
-        except OSError as error:  # of a failing disk, or of a file that is none
+        except OSError as error:  # of a failing disk, or of a device
             self._file.close()
             raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
 

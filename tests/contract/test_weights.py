@@ -75,7 +75,7 @@ def rendered(weights: str, folder: Path, *, classes: bool = True) -> dict[str, A
 
 
 def fitted(kind: str, folder: Path) -> dict[str, Any]:
-    """The same of weights that were fitted to the golden log, and their held-out loss where it is told."""
+    """The same of weights that were fitted to the golden log, and their held-out loss where it is printed."""
     boxes, out = folder / "boxes.json", folder / f"{kind}.safetensors"
     boxes.write_text(json.dumps({"boxes": [{**box, "size": [0.7, 0.7, 0.7]} for box in BOXES]}))
     options = [str(boxes) if word == "boxes.json" else word for word in FITTED[kind]]

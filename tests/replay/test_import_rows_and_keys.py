@@ -31,7 +31,8 @@ def test_a_row_that_is_lost_is_a_bad_frame_and_shifts_no_other(tmp_path: Path, l
     rows[3] = lost
     (folder / "poses.txt").write_text("\n".join(rows) + "\n")
     report, frames = imported(folder)
-    assert [frame.seq for frame in frames] == [0, 1, 2, 4, 5] and len(report.skipped) == 1
+    assert [frame.seq for frame in frames] == [0, 1, 2, 4, 5]
+    assert [skipped.reason for skipped in report.skipped] == ["line 4: is empty or a comment"]
     assert all((frame.T_world_camera == before[frame.seq].T_world_camera).all() for frame in frames)
 
 
@@ -184,3 +185,14 @@ def test_files_say_what_to_name(tmp_path: Path, name: str, says: str) -> None:
     (tmp_path / name).write_text("{}")
     with pytest.raises(ImportSourceError, match=says):
         detect_format(tmp_path / name)
+
+
+def test_depth_in_the_unit_of_the_poses_is_scaled_with_them(tmp_path: Path) -> None:
+    folder = add_depth(make_transforms(tmp_path / "nerf", applied_scale=0.5, integer_depth_scale=0.001))
+    found = json.loads((folder / "transforms.json").read_text())
+    for frame in found["frames"]:
+        frame["depth_path"] = frame.pop("depth_file_path")
+    (folder / "transforms.json").write_text(json.dumps(found))
+    frame = imported(folder)[1][1]
+    assert np.allclose(frame.T_world_camera[:3, 3], 2 * poses()[1][:3, 3])
+    assert frame.depth_m is not None and np.allclose(frame.depth_m[frame.depth_m > 0], 2 * 1.501)

@@ -45,7 +45,7 @@ def test_version_is_that_of_the_package() -> None:
         ("import", "src", "dst", "--format", "film"),
         ("import", "src", "dst", "--topic", "image"),
         ("finetune", "room.mcap", "--keyframes", "1", "--out", "w"),
-        ("finetune", "room.mcap", "--keyframes", "4", "--out", "w", "--seconds", "0"),
+        ("finetune", __file__, "--keyframes", "4", "--out", "w", "--seconds", "0"),
         ("eval",),
         ("query", "map.npz", "where"),
         ("query", "map.npz", "at", "1", "2"),
