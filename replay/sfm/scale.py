@@ -25,6 +25,7 @@ from semantic_mapper.types import CameraIntrinsics, Float64, Int64, UInt8
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 
 UNSCALED_DEPTH_M = 2.0  # median depth of the points of a model whose scale nobody tells
+LARGEST_RATIO = 125.0  # of a scene to one without a scale; beyond it, no setting allows the ranges
 FAR_SCENE = 0.8  # of the range of the map: with a larger median depth, it would leave out half of the scene
 MIN_ANGLE_DEG = 2.0  # between the rays that a place is found by
 MAX_RAY_ERROR = 0.01  # a place is no further from its rays than this fraction of its distance
@@ -144,10 +145,13 @@ def fit_to_scene(config: MapperConfig, info: StreamInfo) -> tuple[MapperConfig, 
 
     A setting that is not the default stays. The ratios are those at which models without a scale are mapped.
     """
-    depth = float(info.metadata.get(SCENE_DEPTH_KEY, 0))
-    if depth <= FAR_SCENE * config.voxel_map.depth_max_m:
+    try:
+        depth = float(info.metadata.get(SCENE_DEPTH_KEY, 0))
+    except ValueError:  # another program's
+        depth = 0.0
+    if not FAR_SCENE * config.voxel_map.depth_max_m < depth < np.inf:
         return config, ""
-    ratio, usual = depth / UNSCALED_DEPTH_M, MapperConfig()
+    ratio, usual = min(depth / UNSCALED_DEPTH_M, LARGEST_RATIO), MapperConfig()
 
     def fitted(part: StructT, of_usual: StructT, *names: str) -> StructT:
         at_default = [name for name in names if getattr(part, name) == getattr(of_usual, name)]

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.config import MapperConfig
+from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.drivers.poses.board import make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
@@ -155,8 +155,10 @@ def test_a_marked_pixel_counts_in_its_own_frame_also_where_that_has_no_pose(rng:
 
 def test_ranges_follow_a_scene_that_is_larger_than_a_room_and_given_settings_stay() -> None:
     usual = MapperConfig()
-    for depth in (0.0, 3.9):
-        assert fit_to_scene(usual, StreamInfo("film", metadata=scene_depth(depth))) == (usual, "")
+    for metadata in ({}, scene_depth(3.9), *({"scene_depth": text} for text in ("far", "nan", "inf", "-1"))):
+        assert fit_to_scene(usual, StreamInfo("film", metadata=metadata)) == (usual, "")
+    far, _ = fit_to_scene(usual, StreamInfo("film", metadata=scene_depth(5000.0)))
+    assert convert_config(to_plain(far), MapperConfig, "far") == far
     street = StreamInfo("film", metadata=scene_depth(20.0))
     fitted, said = fit_to_scene(usual, street)
     assert (fitted.voxel_map.voxel_size_m, fitted.voxel_map.depth_max_m) == (0.2, 50)
