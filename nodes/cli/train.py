@@ -10,7 +10,6 @@ import typer
 
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.fleet_run import TrustedOption
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.process import StopRequest
 
@@ -38,7 +37,6 @@ def train(
             metavar="ADDRESS", help="Train on a Ray cluster: HOST:PORT, auto, or local for one of this machine alone."
         ),
     ] = None,
-    trusted_network: TrustedOption = False,
     ranks: Annotated[int, typer.Option(min=1, help="With --ray: processes that train, each on a GPU of its own.")] = 1,
     cpus_per_rank: Annotated[int, typer.Option(min=1, help="With --ray: cores of each of these processes.")] = 1,
 ) -> int:
@@ -69,14 +67,14 @@ def train(
     if kind == MAP_KIND or (kind is None and config is not None and _kind_of(config) == MAP_KIND):
         from semantic_mapper.nodes.cli.train_nesf import train_on_maps
 
-        if workers or weights or encoder or ray or ranks > 1 or cpus_per_rank > 1 or trusted_network:
+        if workers or weights or encoder or ray or ranks > 1 or cpus_per_rank > 1:
             raise ConfigError(
                 "--workers, --weights, --encoder, --ray and its options are for fields; --kind nesf starts from random "
                 "weights, in one process"
             )
         return train_on_maps(output, config, out, resume=resume, seconds=seconds, steps=steps, seed=seed)
-    if ray is None and (ranks > 1 or cpus_per_rank > 1 or trusted_network):
-        raise ConfigError("--ranks, --cpus-per-rank and --trusted-network need --ray; torchrun has --nproc_per_node")
+    if ray is None and (ranks > 1 or cpus_per_rank > 1):
+        raise ConfigError("--ranks and --cpus-per-rank need --ray; torchrun has --nproc_per_node")
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
     start = None if weights is None else str(weights)
     given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers, "start": start, "kind": kind}
@@ -104,7 +102,7 @@ def train(
             from semantic_mapper.nodes.fleet.cluster import connected
             from semantic_mapper.nodes.fleet.train_ranks import train_on_ray
 
-            with connected(ray, trusted_network=trusted_network):
+            with connected(ray):
                 checkpoint = train_on_ray(
                     settings,
                     folder,
