@@ -31,8 +31,8 @@ from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import decode_answer, encode_request
 from semantic_mapper.transport.endpoints import default_endpoint
+from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.query_sockets import QuerySocket
-from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.types import Bool, Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
@@ -129,7 +129,7 @@ class MapClient:
         endpoint: Of the mapper's query service; by default that of a mapper of this user that was started by hand.
         timeout_s: How long to wait for an answer before asking again.
         attempts: How often to ask.
-        identity: Of a mapper that has keys (``transport.security``), as those on other machines have.
+        identity: Of a mapper that has keys (``transport.keys``), as those on other machines have.
         refined: Ask for the map as it was refined last (option `refine_every_s` of the mapper) instead: its classes are
             those that refining found, its ``version`` is the one that was refined, and lags behind. ``MapError`` until
             there is one. ``occupancy`` and ``distance_field``, which no class enters, are of the map itself.

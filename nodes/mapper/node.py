@@ -119,7 +119,7 @@ def _answering(
 ) -> QueryService | nullcontext[None]:
     """The query service, or nothing where none is wanted."""
     from semantic_mapper.nodes.mapper.query_service import QueryService
-    from semantic_mapper.transport.security import load_keys
+    from semantic_mapper.transport.keys import load_keys
 
     if not options.query:
         return nullcontext()

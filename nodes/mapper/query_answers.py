@@ -27,8 +27,7 @@ from semantic_mapper.queries.rays import RayHits, cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import decode_request, encode_answer, encode_error
-from semantic_mapper.transport.framing import Parts
-from semantic_mapper.transport.headers import LabelSetForm
+from semantic_mapper.transport.messages import LabelSetForm, Parts
 from semantic_mapper.types import UInt8
 
 # One worker answers all that takes long: what would keep the others waiting for more than about a second is refused.

@@ -27,9 +27,9 @@ from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.mapper.query_answers import Answers, Question
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.transport.codec import encode_error
+from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.query_messages import ChangesRequest, Request
 from semantic_mapper.transport.query_sockets import QueryServer
-from semantic_mapper.transport.security import Keys
 
 PERIOD_S = 0.1  # between two snapshots, at least
 MAX_FRACTION = 0.1  # of the mapper's time that copying may take; the pause after a costly copy is longer

@@ -25,8 +25,8 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.exporters.rerun_log import RerunLog
 from semantic_mapper.replay.exporters.rerun_sdk import rr
+from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.messages import EndOfStream
-from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 

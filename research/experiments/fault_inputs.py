@@ -28,11 +28,10 @@ from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.supervisor.hang_detector import process_stats
 from semantic_mapper.nodes.supervisor.node_process import NodeProcess
-from semantic_mapper.transport.codec import decode, decode_request, encode, encode_frame
-from semantic_mapper.transport.framing import unpack_parts
+from semantic_mapper.transport.codec import decode, decode_request, encode, encode_frame, unpack_parts
+from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
-from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate
 

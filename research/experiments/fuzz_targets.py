@@ -25,10 +25,9 @@ from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.labels import NYU40
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.transport import codec
-from semantic_mapper.transport.framing import pack_parts, unpack_parts
-from semantic_mapper.transport.headers import LabelSetForm
+from semantic_mapper.transport.codec import pack_parts, unpack_parts
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused, LabelSetForm, Status, StreamInfo
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
 from semantic_mapper.transport.query_messages import QUESTIONS, Answer, Request, WeightsEntry, array_forms
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
@@ -103,14 +102,14 @@ def _info() -> StreamInfo:
 
 
 def _messages() -> list[bytes]:
-    options = (CodecOptions(), CodecOptions(rgb="raw", depth="raw"), CodecOptions(rgb="jpeg"))
+    options = (CodecOptions(), CodecOptions(rgb="raw"), CodecOptions(rgb="jpeg"))
     f = frame()
     assert f.depth_m is not None and f.label is not None
     confidence = np.full_like(f.depth_m, 0.5)
     update = MapUpdate(5, 3, "front", True, False, (0, 2), f.label, confidence, f.depth_m, 12, 4)
     others = (
         codec.encode(update),
-        codec.encode(update, CodecOptions(confidence="f32", depth="raw")),
+        codec.encode(update, CodecOptions()),
         codec.encode(FrameRefused(4, 5, "front", "pose holds NaN")),
         codec.encode(Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU",))),
         codec.encode(_info()),

@@ -17,9 +17,8 @@ from typing import IO, Self
 from semantic_mapper.errors import LogError
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import decode_as, read_envelope
-from semantic_mapper.transport.messages import Status
+from semantic_mapper.transport.messages import TOPICS, Status
 from semantic_mapper.transport.sockets import LosslessSubscriber
-from semantic_mapper.transport.topics import TOPICS
 from semantic_mapper.types import MapUpdate
 
 COMMAND = Path(sys.executable).parent / "semantic-mapper"

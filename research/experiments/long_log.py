@@ -11,8 +11,7 @@ from research.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.codec import EncodedImage
-from semantic_mapper.transport.compression import depth_from_uint16
-from semantic_mapper.transport.images import encode_rgb
+from semantic_mapper.transport.images import depth_from_uint16, encode_rgb
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from semantic_mapper.transport.headers import (
+from semantic_mapper.transport.messages import (
     Count,
     Digest,
     Finite,

@@ -63,19 +63,19 @@ from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
 from semantic_mapper.training.online import OnlineConfig
 from semantic_mapper.transport import codec, pose_message, query_messages
-from semantic_mapper.transport.headers import LabelSetForm
 from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.keys import load_keys
 from semantic_mapper.transport.messages import (
+    TOPICS,
     EndOfStream,
     FrameRefused,
     LabelledKeyframe,
+    LabelSetForm,
     Status,
     StreamInfo,
     WeightsInUse,
     WeightsUpdate,
 )
-from semantic_mapper.transport.security import load_keys
-from semantic_mapper.transport.topics import TOPICS
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 __all__ = [

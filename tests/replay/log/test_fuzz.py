@@ -22,7 +22,7 @@ from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.replay.log import reader
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.replay.log.recover import recover
-from semantic_mapper.transport.framing import pack_parts
+from semantic_mapper.transport.codec import pack_parts
 
 
 def with_chunk(compression: str, data: bytes, size: int, crc: int = 0) -> bytes:
