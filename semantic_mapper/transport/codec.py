@@ -108,7 +108,6 @@ _NOT_SENT_AS_0 = (
     "computed",
     "pseudo_label",
     "depth_sigma",
-    "refined",
     "gone",
     "moving",
     "world",
