@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -130,7 +131,7 @@ def find_maps(arguments: Sequence[str]) -> list[MapSource]:
     """
     found: list[MapSource] = []
     for argument in arguments:
-        if is_store(argument):
+        if not argument.endswith(MAP_SUFFIX) and is_store(argument):
             store = Store(argument)
             replays = sorted((r for r in store.results() if r.operation == "replay"), key=lambda r: r.finished_ns)
             latest = {result.log_digest: result for result in replays}.values()
@@ -169,11 +170,11 @@ def read_poses(path: Path) -> dict[str, Float64]:
         PoseError: a matrix is no rigid transform.
     """
     poses: dict[str, Float64] = {}
-    for name, values in read_json(path, dict[str, list[float] | list[list[float]]]).items():
+    for name, values in read_json(path, dict[str, list[Any]]).items():
         where = f"{path}: {name}"
         try:
             T = np.array(values, np.float64)
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise ConfigError(f"{where}: {error}") from error
         if T.shape == (4,):
             T = yaw_transform(T[:3], float(T[3]))

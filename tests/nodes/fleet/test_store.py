@@ -132,7 +132,7 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
         Store("memory://bucket/fleet?X-Amz-Signature=abc", create=True)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     for place in (tmp_path, tmp_path / "notes.txt"):
-        with pytest.raises((ConfigError, StoreError), match="choose another --out|is refused"):
+        with pytest.raises((ConfigError, StoreError), match=r"choose another --out|is refused"):
             Store(str(place), create=True)
     (tmp_path / "fleet.json").write_text('{"format": "semantic-mapper-fleet", "version": 99}', encoding="utf-8")
     with pytest.raises(ConfigError, match="damaged or of another version"):
