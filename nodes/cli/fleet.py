@@ -5,9 +5,8 @@ from __future__ import annotations
 import csv as csv_files
 import io
 from collections.abc import Iterable, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import typer
@@ -40,21 +39,12 @@ StoreArgument = Annotated[
 ]
 
 
-class OperationName(StrEnum):
-    """What is done with each log; see the verb of the same name."""
-
-    REPLAY = "replay"
-    EVAL = "eval"
-    AUTOLABEL = "autolabel"
-    FINETUNE = "finetune"
-    REFINE = "refine"
-
-
 @app.command()
 @verb
 def run(
     operation: Annotated[
-        OperationName, typer.Argument(metavar="OPERATION", help="replay, eval, autolabel, finetune or refine.")
+        Literal["replay", "eval", "autolabel", "finetune", "refine"],
+        typer.Argument(metavar="OPERATION", help="replay, eval, autolabel, finetune or refine; as the verb."),
     ],
     logs: Annotated[
         list[str],
@@ -102,25 +92,21 @@ def run(
     from semantic_mapper.nodes.fleet.inputs import find_inputs
     from semantic_mapper.nodes.fleet.urls import shown
 
-    inputs = find_inputs(logs, ".npz" if operation is OperationName.REFINE else ".mcap")  # before what is heavy
+    inputs = find_inputs(logs, ".npz" if operation == "refine" else ".mcap")  # before what is heavy
     from semantic_mapper.nodes.fleet.cluster import connected
     from semantic_mapper.nodes.fleet.operations import OPERATIONS
     from semantic_mapper.nodes.fleet.run import Resources, make_template, run_fleet
 
-    kind = OPERATIONS[operation.value]
-    assignments = [
-        *(("render.device=cuda",) if gpus and issubclass(kind.settings, MapperConfig) else ()),
-        *(settings or ()),
-    ]
-    template = make_template(operation.value, out, weights, assignments, config)
+    kind = OPERATIONS[operation]
+    on_gpu = ["render.device=cuda"] if gpus and issubclass(kind.settings, MapperConfig) else []
+    template = make_template(operation, out, weights, [*on_gpu, *(settings or ())], config)
     resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9))
     with (
         StopRequest() as stop,
         connected(address, worker_logs=Settings.verbose),
-        frame_progress(f"fleet {operation.value}", len(inputs), unit="logs") as bar,
+        frame_progress(f"fleet {operation}", len(inputs), unit="logs") as bar,
     ):
         report = run_fleet(template, inputs, resources, lambda: stop, lambda now: bar.set(now.over))
-    counts = {"total": report.total, "done": report.done, "existing": report.existing, "failed": len(report.failures)}
     output.print(
         f"{shown(out)}: {report.done} done, {report.existing} were there, {len(report.failures)} failed, "
         f"of {report.total}"
@@ -128,8 +114,7 @@ def run(
     for failure in report.failures[:MAX_LOGS]:
         output.print(f"  failed: {failure.log}: {failure.error}")
     if json:
-        failures = [{"log": failure.log, "error": failure.error} for failure in report.failures]
-        output.json({"store": shown(out), **counts, "failures": failures})
+        output.json({"store": shown(out), **msgspec.to_builtins(report)})
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the same command continues it", style="yellow")
         return stop.exit_code

@@ -66,8 +66,12 @@ def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool
             token.touch(0o600)
             token.write_text(secrets.token_hex(32), encoding="ascii")
             # A path, because programs that report errors often send the environment with them.
-            security = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), "RAY_USE_TLS": "0"}
-            stack.enter_context(_environment({**_COMMON, **_PATIENT, **security}, without="RAY_AUTH_TOKEN"))
+            security = {
+                "RAY_AUTH_MODE": "token",
+                "RAY_AUTH_TOKEN_PATH": str(token),
+                "RAY_USE_TLS": "0",
+            }
+            stack.enter_context(_environment({**_COMMON, **_PATIENT, **security}))
             stack.enter_context(_on_loopback())
             found = {
                 "address": LOCAL,
@@ -130,7 +134,7 @@ def _check_reachable(address: str) -> None:
     if not has_token and not _is_loopback(address):
         raise FleetError(
             f"{address} is reached through a network, and RAY_AUTH_MODE=token is not set, so that anybody there can "
-            "run code: start every node with RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH, and set both here (docs/fleet.md)"
+            "run code; start every node with RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH, and set both here, too"
         )
     try:
         socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S).close()
@@ -150,20 +154,18 @@ def _is_loopback(address: str) -> bool:
 
 
 @contextlib.contextmanager
-def _environment(variables: Mapping[str, str], *, without: str = "") -> Iterator[None]:
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Environment variables for Ray and the processes it starts; afterwards everything is as before."""
     before = dict(os.environ)
     os.environ.update(variables)
-    os.environ.pop(without, None)
+    if "RAY_AUTH_TOKEN_PATH" in variables:
+        os.environ.pop("RAY_AUTH_TOKEN", None)  # it would go before the path
     _reread_environment()
     try:
         yield
     finally:
-        for name in (*variables, *([without] if without else [])):
-            if name in before:
-                os.environ[name] = before[name]
-            else:
-                os.environ.pop(name, None)
+        os.environ.clear()
+        os.environ.update(before)
         _reread_environment()
 
 

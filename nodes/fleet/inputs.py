@@ -97,8 +97,6 @@ def _read_manifest(argument: str) -> Iterator[LogInput]:
     try:
         with reaching(argument):
             text = fs.cat_file(path).decode("utf-8-sig")
-    except FileNotFoundError as error:
-        raise ConfigError(f"{where}: no such manifest") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{where}: is no text in UTF-8 ({error})") from error
     reader = csv.DictReader(text.splitlines(), strict=True)

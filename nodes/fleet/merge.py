@@ -80,41 +80,35 @@ def merge_maps(
     names = [source.name for source in sources]
     if unknown := sorted(set(given) - set(names)):
         raise ConfigError(f"--poses names {', '.join(unknown)}, but the maps are {', '.join(names)}")
-    note = "pose as given" if given else "the world is its own"
-    given = given or {names[0]: np.eye(4)}
+    known = given or {names[0]: np.eye(4)}
     poses: dict[str, Float64] = {}
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="semantic-mapper-merge-") as folder:
         files = {source.name: _fetch(source, Path(folder) / f"{n}.npz") for n, source in enumerate(sources)}
         whole = _empty_map({name: describe_map(file) for name, file in files.items()})
-
-        def add(name: str, loaded: VoxelMap, T_world_map: Float64, note: str) -> None:
-            try:
-                whole.add(loaded, T_world_map)
-            except MapError as error:
-                raise MapError(f"{name}: {error}") from error
-            poses[name] = T_world_map
-            notes.append(f"{name}: {note}")
-            on_added()
-
-        for name in (name for name in names if name in given):
-            add(name, _load(files[name]), given[name], note)
-        missing = [name for name in names if name not in given]
-        while missing:
-            reasons: dict[str, str] = {}
-            for name in missing:
-                loaded = _load(files[name])
+        waiting = sorted(names, key=lambda name: name not in known)
+        while waiting:
+            refused: dict[str, str] = {}
+            for name in waiting:
+                loaded = VoxelMap.load(files[name], memory_mb=_memory_mb(describe_map(files[name])))
                 try:
-                    found = find_alignment(whole, loaded, _WAY_OUT)
+                    if name in known:
+                        T_world_map, note = known[name], "pose as given" if given else "the world is its own"
+                    else:
+                        found = find_alignment(whole, loaded, _WAY_OUT)
+                        T_world_map = found.T_map_other
+                        note = f"{found.agreeing} of {found.looked_for} places found in the maps before it"
+                    whole.add(loaded, T_world_map)
                 except MapError as error:
-                    reasons[name] = str(error)
-                else:
-                    said = f"{found.agreeing} of {found.looked_for} places found in the maps before it"
-                    add(name, loaded, found.T_map_other, said)
-            if list(reasons) == missing:
-                said = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-                raise MapError(f"{', '.join(missing)}: no pose was found; leave these maps out, or give it. {said}")
-            missing = list(reasons)
+                    refused[name] = str(error)
+                    continue
+                poses[name] = T_world_map
+                notes.append(f"{name}: {note}")
+                on_added()
+            if list(refused) == waiting:
+                reasons = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+                raise MapError(f"these maps cannot be added; leave them out, or do as it says: {reasons}")
+            waiting = list(refused)
     return MergeReport(whole, poses, tuple(notes))
 
 
@@ -201,14 +195,14 @@ def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
     blocks = min(8 * sum(manifest.blocks for manifest in manifests.values()), MAX_BLOCKS)
     config = msgspec.structs.replace(
         first.config,
-        memory_mb=min(first.config.memory_mb or MEMORY_MB, MEMORY_MB),
+        memory_mb=_memory_mb(first),
         max_blocks=max(first.config.max_blocks, blocks),
     )
     return VoxelMap(config, first.label_set)
 
 
-def _load(file: Path) -> VoxelMap:
-    return VoxelMap.load(file, memory_mb=min(describe_map(file).config.memory_mb or MEMORY_MB, MEMORY_MB))
+def _memory_mb(manifest: MapManifest) -> int:
+    return min(manifest.config.memory_mb or MEMORY_MB, MEMORY_MB)
 
 
 def _fetch(source: MapSource, target: Path) -> Path:
@@ -221,11 +215,8 @@ def _fetch(source: MapSource, target: Path) -> Path:
     file = Path(path)
     if "file" not in fs.protocol:
         file = target
-        try:
-            with reaching(source.url):
-                fs.get_file(path, str(file))
-        except FileNotFoundError as error:
-            raise MapError(f"{shown(source.url)}: no such map file") from error
+        with reaching(source.url):
+            fs.get_file(path, str(file))
     if source.sha256 and (not file.is_file() or file_digest(file) != source.sha256):
         raise StoreError(f"{shown(source.url)}: is damaged, or not the file of its result; `fleet run` makes it again")
     return file

@@ -39,7 +39,7 @@ from semantic_mapper.nodes.fleet.store import (
     encode_document,
     file_digest,
 )
-from semantic_mapper.nodes.fleet.urls import full_url, is_url, open_url, reaching, shown
+from semantic_mapper.nodes.fleet.urls import MissingError, full_url, is_url, open_url, reaching, shown
 from semantic_mapper.redaction import without_secrets
 
 MAX_RETRIES = 3  # of a task whose process died, whose node was lost, or that could not reach log or store
@@ -188,7 +188,10 @@ def run_fleet(
             running[remote.remote(task)] = task
         if not running and not waiting:
             return report
-        ready, _ = ray.wait(list(running), num_returns=len(running), timeout=0.2) if running else ([], [])
+        if not running:
+            time.sleep(0.2)
+            continue
+        ready, _ = ray.wait(list(running), num_returns=len(running), timeout=0.2)
         for reference in ready:
             task = running.pop(reference)
             error = _collect(report, reference)
@@ -271,8 +274,6 @@ def _find_weights(operation: str, store: Store, weights: str | None) -> tuple[st
             with reaching(weights):
                 fs.get_file(path, str(local))
             (load_nesf if refines else load_checkpoint)(local)
-        except FileNotFoundError as error:
-            raise WeightsError(f"{shown(weights)}: no such weights") from error
         except WeightsError as error:
             raise WeightsError(str(error).replace(str(local), shown(weights))) from error
         digest = file_digest(local)
@@ -401,7 +402,7 @@ def _versions(url: str) -> dict[str, str]:
             info = fs.info(path)
             is_folder = info["type"] == "directory"
             parts = fs.ls(path, detail=True) if is_folder else [{**info, "name": path}]
-    except FileNotFoundError as error:
+    except MissingError as error:
         raise LogError(f"{shown(url)}: no such log") from error
     if is_folder:
         parts = sorted((p for p in parts if p["name"].lower().endswith(".mcap")), key=lambda p: p["name"])

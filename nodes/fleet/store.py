@@ -22,14 +22,13 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
 from semantic_mapper.errors import ConfigError, StoreError
-from semantic_mapper.nodes.fleet.urls import is_url, open_url, reaching, shown
+from semantic_mapper.nodes.fleet.urls import MissingError, is_url, open_url, reaching, shown
 
 MARK = "fleet.json"
 _MARK_CONTENT = b'{"format": "semantic-mapper-fleet", "version": 2}\n'
@@ -190,7 +189,7 @@ class Store:
         try:
             with reaching(f"{self.shown}/{name}"):
                 return self._fs.cat_file(self._path(name))
-        except FileNotFoundError:
+        except MissingError:
             return None
 
     def exists(self, name: str) -> bool:
@@ -205,7 +204,7 @@ class Store:
         try:
             with reaching(f"{self.shown}/{folder}"):
                 found = self._fs.ls(self._path(folder), detail=False)
-        except FileNotFoundError:
+        except MissingError:
             return []
         names = (str(entry).rstrip("/").rsplit("/", 1)[-1] for entry in found)
         return sorted(name for name in names if name and not name.startswith("."))
@@ -220,7 +219,7 @@ class Store:
         if self.exists(name):
             return False
         try:
-            with self._writing(name):
+            with reaching(f"{self.shown}/{name}"):
                 if self.local is not None:
                     self._place(self.local / name, data, os.link)
                 else:
@@ -235,19 +234,11 @@ class Store:
 
     def write(self, name: str, data: bytes) -> None:
         """Write an object, whole or not at all; replaces one that is there."""
-        with self._writing(name):
+        with reaching(f"{self.shown}/{name}"):
             if self.local is not None:
                 self._place(self.local / name, data, os.replace)
             else:
                 self._fs.pipe_file(self._path(name), data)
-
-    @contextmanager
-    def _writing(self, name: str) -> Iterator[None]:
-        try:
-            with reaching(f"{self.shown}/{name}"):
-                yield
-        except FileNotFoundError as error:
-            raise StoreError(f"{self.shown}/{name}: cannot be written ({error})") from error
 
     def _place(self, target: Path, data: bytes, place: Any) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -268,7 +259,7 @@ class Store:
 
     def upload(self, file: Path, name: str) -> None:
         """Copy a local file into the store."""
-        with self._writing(name):
+        with reaching(f"{self.shown}/{name}"):
             if self.local is not None:
                 (self.local / name).parent.mkdir(parents=True, exist_ok=True)
             self._fs.put_file(str(file), self._path(name))
@@ -279,11 +270,8 @@ class Store:
         Raises:
             StoreError: it is missing, or the store cannot be reached.
         """
-        try:
-            with reaching(f"{self.shown}/{name}"):
-                self._fs.get_file(self._path(name), str(file))
-        except FileNotFoundError as error:
-            raise StoreError(f"{self.shown}/{name}: is missing") from error
+        with reaching(f"{self.shown}/{name}"):
+            self._fs.get_file(self._path(name), str(file))
 
     def remove(self, name: str) -> None:
         """Delete an object, or all below a folder; it may be missing."""

@@ -24,6 +24,10 @@ _OTHER_ERRORS = (
 )
 
 
+class MissingError(StoreError):
+    """There is no such file or object."""
+
+
 def is_url(text: str) -> bool:
     """Whether a URL is meant rather than a local path."""
     return bool(_split(text)[0])
@@ -68,14 +72,17 @@ def reaching(url: str) -> Iterator[None]:
     """Errors of requests as one of ours; the packages repeat a request by themselves where that may help.
 
     Raises:
+        MissingError: there is no such thing.
         StoreError: it cannot be reached, or is refused.
-        FileNotFoundError, FileExistsError: as they say.
+        FileExistsError: as it says.
     """
     others = [getattr(sys.modules[module], name) for module, name in _OTHER_ERRORS if module in sys.modules]
     try:
         yield
-    except (StoreError, FileExistsError, FileNotFoundError):
+    except (StoreError, FileExistsError):
         raise
+    except FileNotFoundError as error:
+        raise MissingError(f"{shown(url)}: is missing") from error
     except (PermissionError, NotADirectoryError, IsADirectoryError) as error:
         raise StoreError(
             f"{shown(url)}: is refused ({without_secrets(str(error))}); check the path, and who may read and write it"

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError, WeightsError
+from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError
 from semantic_mapper.nodes.fleet import run
 from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.fleet.inputs import LogInput
@@ -137,7 +137,7 @@ def test_a_store_is_not_made_for_what_cannot_be_run(tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
         run.make_template("replay", str(tmp_path / "store"), None, ["no=1"])
     assert not (tmp_path / "store").exists()
-    with pytest.raises(WeightsError, match=r"none\.safetensors: no such weights"):
+    with pytest.raises(StoreError, match=r"none\.safetensors: is missing"):
         run.make_template("replay", str(tmp_path / "store"), str(tmp_path / "none.safetensors"))
 
 

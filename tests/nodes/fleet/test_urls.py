@@ -57,14 +57,10 @@ def test_paths_become_absolute_and_unknown_schemes_are_refused(monkeypatch: pyte
     [
         (ConnectionResetError(f"cut, url='https://u:{SECRET}@host/a?X-Amz-Signature=abc'"), "cannot be reached"),
         (PermissionError("forbidden"), "who may read and write"),
+        (FileNotFoundError("no"), "s3://bucket/x.*is missing"),
     ],
 )
 def test_errors_of_requests_are_one_of_ours_without_what_signs_their_urls(error: OSError, said: str) -> None:
     with pytest.raises(StoreError, match=said) as caught, reaching("s3://bucket/x?sig=1"):
         raise error
     assert SECRET not in str(caught.value) and "abc" not in str(caught.value) and "sig" not in str(caught.value)
-
-
-def test_what_is_missing_says_so() -> None:
-    with pytest.raises(FileNotFoundError), reaching("x"):
-        raise FileNotFoundError
