@@ -31,7 +31,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.fleet.merge import Run, merge_maps, run_on_ray
 from semantic_mapper.nodes.fleet.store import Store

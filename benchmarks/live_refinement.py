@@ -14,8 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from benchmarks.paired_steps import LAP, Turn, slowdown
+from semantic_mapper.config import load_mapper_config
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.mapper.live_refinement import LiveRefinement
 from semantic_mapper.nodes.process import prepare_process
 from semantic_mapper.replay.log.sequence import open_log
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="as `refine --weights`")
     args = parser.parse_args()
     prepare_process()
-    bundle = Mapper.load(None, mapper_config(args.config, None))
+    bundle = Mapper.load(None, load_mapper_config(args.config))
     voxel_map = bundle.pipeline.voxel_map
     with open_log(args.log) as reader:
         frames = [item for item in reader.frames_or_errors(LAP) if isinstance(item, PosedFrame)]

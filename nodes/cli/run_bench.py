@@ -13,7 +13,7 @@ from rich.table import Table
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.nodes.cli.bench_queries import bench_queries
-from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.bench.depthless import bench_depthless
 from semantic_mapper.replay.bench.evidence import bench_evidence

@@ -36,12 +36,12 @@ from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.fields.nesf import NesfWeights, find_nesf, smoothed_votes
 from semantic_mapper.files import write_json
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.outputs import prepare_file
-from semantic_mapper.nodes.cli.report import write_suite_report
 from semantic_mapper.nodes.cli.suite_table import difference_lines, map_rows_table, rows_table, suite_table
+from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plots import cannot_draw, write_picture
+from semantic_mapper.replay.page import write_suite_report
+from semantic_mapper.replay.run_folder import prepare_file
 from semantic_mapper.scenes.suite import ROOMS_SUITE
 
 PACKAGES = ("torch", "numpy")

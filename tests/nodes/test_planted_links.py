@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.nodes.cli.outputs import hold_folder
 from semantic_mapper.replay.log.atomic_file import AtomicFile
+from semantic_mapper.replay.run_folder import hold_folder
 from semantic_mapper.training.folder_lock import LOCK_FILE, sole_use_of
 from tests.nodes.support import run_here
 
