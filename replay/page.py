@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -229,17 +228,6 @@ def table_of(heads: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> Tabl
     for row in rows:
         table.add_row(*row)
     return table
-
-
-def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures: Sequence[Path], found: Any) -> None:
-    """Write the report of a benchmark run with its pictures.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
-    figures = Section(tables=[table], lines=lines)
-    drawn = Section(pictures=list(picture_files(*((path, path.name) for path in pictures))))
-    write_page(path, found["title"], [figures, drawn, Section(folded={"All figures": json.dumps(found, indent=1)})])
 
 
 def stage_sections(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:

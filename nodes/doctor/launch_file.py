@@ -13,7 +13,7 @@ from semantic_mapper.nodes.doctor.robot import port_is_taken
 from semantic_mapper.nodes.options import FoxgloveOptions, MapperOptions, ZenohOptions
 from semantic_mapper.nodes.supervisor.launch_config import Launch, load_launch
 from semantic_mapper.transport.endpoints import check_bind
-from semantic_mapper.transport.security import load_keys, user_key_folder
+from semantic_mapper.transport.keys import load_keys, user_key_folder
 
 
 def launch_file(path: Path, settings: Sequence[str]) -> Iterator[Check]:
@@ -73,8 +73,6 @@ def _listening(launch: Launch) -> list[tuple[str, str]]:
 
 
 def _address(endpoint: str, folder: str) -> Check:
-    from semantic_mapper.transport.security import load_keys
-
     try:
         check_bind(endpoint, load_keys(Path(folder).expanduser()) if folder else None)
     except SemanticMapperError as error:

@@ -19,9 +19,9 @@ from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.plots import Histogram, PercentileBox
 from semantic_mapper.replay.page import linked, safe_link
 from semantic_mapper.types import UInt8
-from tests.replay.test_page import cells, pictures, read_page
 from tests.nodes.fleet.made_up import FINISHED_NS, made_up, store_of, with_files
 from tests.nodes.support import error_line, run
+from tests.replay.test_page import cells, pictures, read_page
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "fleet-results.md"
 
