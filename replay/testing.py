@@ -138,9 +138,8 @@ class ReplayedMap:
             MapError: no such map, or a damaged one.
         """
         from semantic_mapper.config import convert_config
-        from semantic_mapper.replay.compare.runs import compare_runs
+        from semantic_mapper.replay.compare.runs import Run, compare_runs, read_run
         from semantic_mapper.replay.compare.tolerances import Tolerances
-        from semantic_mapper.replay.run_folder import Run, read_run
 
         allowed = convert_config(tolerances, Tolerances, "tolerances")
         earlier = read_run(self.root / stored)
@@ -152,12 +151,12 @@ class ReplayedMap:
         Raises:
             OSError: it cannot be written.
         """
-        from semantic_mapper.replay.run_folder import MAP_FILE
+        from semantic_mapper.replay.run_folder import MAP_NAME
         from semantic_mapper.replay.summary import SUMMARY_FILE
 
         folder = self.root / target
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (MAP_FILE, SUMMARY_FILE):
+        for name in (MAP_NAME, SUMMARY_FILE):
             shutil.copyfile(self.folder / name, folder / name)
 
     def assert_like(self, stored: Path | str, **tolerances: float) -> None:
@@ -249,29 +248,8 @@ class LogReplays:
         return mapper
 
     def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
-        from semantic_mapper.mapper import Mapper
-        from semantic_mapper.replay.log.sequence import open_log
-        from semantic_mapper.replay.session import MapSession
-        from semantic_mapper.types import PosedFrame
+        from semantic_mapper.replay.jobs import ReplayRequest, replay_log
 
-        with open_log(path) as log:
-            bundle = Mapper.load(weights, config)
-            session = MapSession(
-                bundle,
-                stream_labels=log.info.label_set,
-                source=log.info.source,
-                scale_known=log.info.scale_known,
-            )
-            for error in log.errors:
-                session.note_damage(str(error))
-            for number, item in enumerate(log.frames_or_errors(min(len(log), max_frames or len(log)))):
-                if isinstance(item, PosedFrame):
-                    session.process(item)
-                else:
-                    session.refuse(number, 0, str(item))
-        if not session.fused:
-            reason = session.refusals.first[0].reason if session.refusals else "no frame finds a source view"
-            raise LogError(f"{path}: none of its frames could be mapped; the first: {reason}")
         folder = self._make_folder(path.stem)
-        summary = session.finish(folder)
-        return ReplayedMap(folder, session.pipeline.voxel_map, summary, self._root, self._update)
+        result = replay_log(ReplayRequest(path, folder, weights, config, max_frames))
+        return ReplayedMap(folder, result.session.pipeline.voxel_map, result.summary, self._root, self._update)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import show_error, verb
+from semantic_mapper.nodes.console import Output
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -83,12 +83,10 @@ def comparison_table(comparison: Comparison) -> Table:
 
 
 def _compare(a: Path, b: Path, tolerances: Tolerances, exact: bool, picture: Path | None) -> tuple[Comparison, Path]:
-    from semantic_mapper.nodes.cli.outputs import prepare_file
-    from semantic_mapper.nodes.cli.saved_maps import is_log
     from semantic_mapper.plots import write_picture
     from semantic_mapper.replay.compare.picture import draw_comparison
-    from semantic_mapper.replay.compare.runs import compare_runs
-    from semantic_mapper.replay.run_folder import read_run
+    from semantic_mapper.replay.compare.runs import compare_runs, read_run
+    from semantic_mapper.replay.run_folder import is_log, prepare_file
 
     for path in (a, b):
         if path.exists() and is_log(path):

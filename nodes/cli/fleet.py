@@ -15,11 +15,11 @@ from rich.table import Table
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, Settings, show_error, verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.run_folder import prepare_file
 
 if TYPE_CHECKING:
     from semantic_mapper.nodes.fleet.compare import Estimate, FleetComparison, LogChange

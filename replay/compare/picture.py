@@ -28,9 +28,8 @@ from semantic_mapper.plots import (
     rendered,
     text_width,
 )
-from semantic_mapper.replay.compare.runs import Comparison
+from semantic_mapper.replay.compare.runs import Comparison, Run
 from semantic_mapper.replay.compare.surface_match import SurfaceMatch
-from semantic_mapper.replay.run_folder import Run
 from semantic_mapper.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -16,8 +17,37 @@ from semantic_mapper.replay.compare.surface_match import (
     match_surfaces,
 )
 from semantic_mapper.replay.compare.tolerances import BITS, FIELDS, Tolerances, show
-from semantic_mapper.replay.run_folder import Run
-from semantic_mapper.replay.summary import dig
+from semantic_mapper.replay.run_folder import MAP_NAME
+from semantic_mapper.replay.summary import SUMMARY_FILE, dig, read_summary
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """What one run of a log has left: of a replay, or of a mapper node.
+
+    Args:
+        name: For people.
+        voxel_map: Its map.
+        summary: Its ``summary.json``; None where only the map is known.
+    """
+
+    name: str
+    voxel_map: VoxelMap
+    summary: Mapping[str, Any] | None
+
+
+def read_run(path: Path) -> Run:
+    """Read the folder of a run, or a saved map alone.
+
+    Raises:
+        ConfigError: a folder with a damaged summary.
+        MapError: no map there, or a damaged one.
+    """
+    if not path.is_dir():
+        return Run(str(path), VoxelMap.load(path), None)
+    voxel_map = VoxelMap.load(path / MAP_NAME)
+    there = (path / SUMMARY_FILE).exists()  # a mapper saves its map before its summary
+    return Run(str(path), voxel_map, read_summary(path) if there else None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.replay import ConfigOption, QualityOption, VoxelSizeOption, WeightsOption
 from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
+from semantic_mapper.nodes.console import Output
 
 
 class Part(StrEnum):
@@ -116,8 +116,8 @@ def bench(
     output = Output.guarded()
     from research.bench.walk import WalkPlan
     from research.cli.run_bench import MEASUREMENTS, BenchRequest, QueriesRequest, RenderRequest
-    from semantic_mapper.nodes.cli.outputs import prepare_file
-    from semantic_mapper.nodes.cli.run_replay import mapper_config
+    from semantic_mapper.config import load_mapper_config
+    from semantic_mapper.replay.run_folder import prepare_file
 
     out, output.quiet = results_file(out), json
     for path in (plot, out):
@@ -126,7 +126,8 @@ def bench(
     plan = WalkPlan(rooms or 30, loops, minutes, hz, width or 320)
     if depth is not None and part is not Part.PIPELINE:
         raise typer.BadParameter("goes with pipeline", param_hint="--depth")
-    settings = mapper_config(config, voxel_size, None, quality, depth, live=True)
+    given = {"voxel_map.voxel_size_m": voxel_size, "quality": quality, "depth.source": depth}
+    settings = load_mapper_config(config, {**given, "depth.refine_in_background": True})
     rendering, queries = RenderRequest(repeats, views or 1, log), QueriesRequest(rate, width or 640)
     virtual = (rooms or 4, views or 8)
     request = BenchRequest(weights, settings, rendering, frames, plan, memory_mb, plot, virtual, queries)

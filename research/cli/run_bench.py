@@ -21,7 +21,7 @@ from research.bench.walk import SLOPE_MINUTES, WalkPlan, bench_walk
 from research.cli.bench_queries import bench_queries
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
-from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plots import write_picture
 
 

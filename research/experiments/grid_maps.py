@@ -17,13 +17,12 @@ import torch
 
 from research.experiments.computed_maps import ERRORS, EVERY_TRUTH, Step, distances, measure, room_walk, true_surface
 from research.scenes import VALIDATION_SEEDS
-from semantic_mapper.config import DepthConfig, VoxelMapConfig, convert_config
+from semantic_mapper.config import DepthConfig, VoxelMapConfig, convert_config, load_mapper_config
 from semantic_mapper.errors import FrameError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.frame_depth import computed_trust
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.replay.autolabel import RENDERED_SPREAD
 from semantic_mapper.replay.rendered_depth import rendered_depth
 from semantic_mapper.training.finetune import FinetuneConfig
@@ -54,7 +53,9 @@ def of_grid(steps: Sequence[Step], surface: Float64, settings: GridFitConfig) ->
 
 def of_nothing(steps: Sequence[Step], surface: Float64) -> dict[str, float]:
     """``replay --depth off`` with the weights in the package."""
-    mapper = Mapper.load(None, mapper_config(None, None, depth="off", delay_frames=DELAY_FRAMES))
+    mapper = Mapper.load(
+        None, load_mapper_config(None, {"depth.source": "off", "depth.from_motion.delay_frames": DELAY_FRAMES})
+    )
     for step in steps:
         try:
             mapper.pipeline.step(step.frame)

@@ -34,6 +34,7 @@ from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plots import write_picture
+from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
@@ -142,7 +143,7 @@ def map_frames(frames: Iterable[PosedFrame], refined: bool, out: Path | None = N
     if out is None:
         session.process_rest()
     else:
-        session.finish(out)
+        finish_session(session, out)
     return session.pipeline.voxel_map.points().xyz
 
 

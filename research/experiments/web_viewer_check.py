@@ -22,11 +22,11 @@ from research.scenes import TEST_SEEDS, room_frames
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.report import Section, picture, picture_files, point_view, table_of, write_page
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import show_saved
 from semantic_mapper.plots import Bar, class_rows, draw_bars
 from semantic_mapper.replay.exporters.rerun_log import recording_server
+from semantic_mapper.replay.page import Section, picture, picture_files, point_view, table_of, write_page
 from semantic_mapper.types import CameraIntrinsics
 
 OUT = ROOT / "runs" / "web"

@@ -25,10 +25,9 @@ from semantic_mapper.replay.compare.picture import (
     RELABELLED,
     draw_comparison,
 )
-from semantic_mapper.replay.compare.runs import Comparison, compare_runs
+from semantic_mapper.replay.compare.runs import Comparison, Run, compare_runs, read_run
 from semantic_mapper.replay.compare.surface_match import match_surfaces
 from semantic_mapper.replay.compare.tolerances import FIELDS, Tolerances
-from semantic_mapper.replay.run_folder import Run, read_run
 from tests.figures import figure_of, misplaced_texts
 from tests.mapping.rendered_views import LABELS, small_map
 from tests.nodes.support import write_weights
