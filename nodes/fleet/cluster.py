@@ -119,8 +119,8 @@ def _check_reachable(address: str) -> None:
     Raises:
         FleetError: no address, nobody there, or no token where one is needed.
     """
+    parts = urlsplit(f"//{address}")
     try:
-        parts = urlsplit(f"//{address}")
         host, port = parts.hostname or "", parts.port or 0
     except ValueError:
         host, port = "", 0

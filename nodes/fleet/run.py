@@ -226,15 +226,16 @@ def _collect(report: RunReport, reference: Any) -> str:
         OtherCodeError: every log would fail like that.
     """
     import ray
+    from ray.exceptions import RayError, RayTaskError
 
     try:
-        done = ray.get(reference)
-    except ray.exceptions.RayTaskError as error:
+        done: Any = ray.get(reference)
+    except RayTaskError as error:
         cause = error.cause
         if isinstance(cause, OtherCodeError):
             raise cause from error
         return _one_line(f"{type(cause).__name__}: {cause}")
-    except ray.exceptions.RayError as error:  # the process died again and again, or its nodes did
+    except RayError as error:  # the process died again and again, or its nodes did
         return _one_line(f"the process of the task died {MAX_RETRIES + 1} times: {type(error).__name__}: {error}")
     report.done += done
     report.existing += not done

@@ -68,7 +68,7 @@ class MethodScores(msgspec.Struct, frozen=True):
     method: str
     iou: dict[str, float | None]
     names: tuple[str, ...] = ()
-    stretches: tuple[tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]], ...] = ()
+    stretches: tuple[tuple[tuple[int, ...], ...], ...] = ()
     first: tuple[int, ...] = ()
 
 

@@ -106,13 +106,13 @@ def loss_of_points(points: float) -> float:
 def compared(results: Iterator[tuple[TaskResult, TaskResult]]) -> FleetComparison:
     """A fleet before and after, through stores in memory."""
     number = next(_NUMBERS)
-    stores = [Store(f"memory://{side}{number}", create=True) for side in "ab"]
-    for both in results:
-        for store, one in zip(stores, both, strict=True):
-            store.commit(one)
-    found = compare_stores(*stores, GateOptions())
-    for store in stores:
-        store.remove("results")
+    before, after = (Store(f"memory://{side}{number}", create=True) for side in "ab")
+    for a, b in results:
+        before.commit(a)
+        after.commit(b)
+    found = compare_stores(before, after, GateOptions())
+    before.remove("results")
+    after.remove("results")
     return found
 
 

@@ -29,7 +29,7 @@ def scores_of(seed: int, loss: float = 0.0, noise: float = 0.0, noise_seed: int 
     hits = truth * np.clip(rng.uniform(0.6, 0.9, (12, 4)) * (1 - worse), 0.0, 1.0)
     sums = np.round(np.stack((hits, truth, 2 * truth - hits), axis=1)).astype(int)  # what is missed is predicted again
     total = sums.sum(axis=0)
-    iou = {name: float(value) for name, value in zip(NAMES, total[0] / total[2], strict=True)}
+    iou: dict[str, float | None] = {name: float(value) for name, value in zip(NAMES, total[0] / total[2], strict=True)}
     stretches = tuple(tuple(tuple(row) for row in part) for part in sums.tolist())
     return MethodScores("replay", iou, NAMES, stretches, tuple(range(0, 120, 10)))
 

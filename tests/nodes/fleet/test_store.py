@@ -8,6 +8,7 @@ from pathlib import Path
 
 import fsspec
 import pytest
+from fsspec.config import conf, set_conf_env
 from moto.server import ThreadedMotoServer
 
 from semantic_mapper.errors import ConfigError, StoreError
@@ -39,13 +40,13 @@ def bucket(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         ("FSSPEC_S3_ENDPOINT_URL", server),
     ):
         monkeypatch.setenv(name, value)
-    fsspec.config.set_conf_env(fsspec.config.conf)
+    set_conf_env(conf)
     files = fsspec.get_filesystem_class("s3")
     files.clear_instance_cache()
     fsspec.filesystem("s3").mkdir("results")
     yield BUCKET
     fsspec.filesystem("s3").rm("results", recursive=True)
-    fsspec.config.conf.pop("s3", None)
+    conf.pop("s3", None)
     files.clear_instance_cache()
 
 
