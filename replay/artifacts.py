@@ -94,7 +94,7 @@ def write_artifacts(
 
 def clear_results(out: Path) -> None:
     """Take away what an earlier run left beside its map: beside the next one, it would be of another map."""
-    for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html", "compare.png"):
+    for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html"):
         (out / name).unlink(missing_ok=True)
 
 

@@ -14,7 +14,7 @@ from semantic_mapper.nodes.cli.outputs import hold_folder
 from semantic_mapper.replay.log.atomic_file import AtomicFile
 from tests.nodes.support import run_here
 
-RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html", "compare.png")
+RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html")
 
 
 def test_no_result_is_written_through_a_link(

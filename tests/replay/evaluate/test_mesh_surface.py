@@ -4,7 +4,7 @@ import pytest
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.compare.surface import compare_with_mesh
+from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.small import tiny_config
 
