@@ -54,8 +54,7 @@ nightly: $(READY)  ## run all tests, those of research, and everything on a bare
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
 	.venv/bin/python -m research.experiments.v4l2_machine
 
-test-web: $(READY)  ## look at the viewer and the labelling page in a headless browser
-	.venv/bin/python -m research.experiments.web_viewer_check
+test-web: $(READY)  ## try the labelling page in a headless browser
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests/nodes/labeller/test_page.py
 
 check: $(READY)  ## formatting, lint, types, import contracts

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import islice
-
 import numpy as np
-import pytest
 
 from research.scenes import (
     TRAIN_SEEDS,
@@ -18,7 +15,6 @@ from research.scenes import (
     room_frames,
     room_views,
 )
-from research.scenes.survey import class_shares, contact_sheet, images_per_second
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.types import CameraIntrinsics
 
@@ -76,14 +72,3 @@ def test_hardly_any_frame_shows_nothing_but_walls() -> None:
         for frame in room_frames(seed, 8, CAMERA, room=FAST, path=path)
     ]
     assert np.mean(bare) < 0.03
-
-
-def test_the_survey_draws_counts_and_measures() -> None:
-    sheet = contact_sheet(TRAIN_SEEDS[:3], 1, across=2, camera=CAMERA)
-    assert sheet.shape == (2 * 72, 2 * 3 * 96, 3)
-    assert sheet.std() > 20
-    shares = class_shares(TRAIN_SEEDS[:3], 2)
-    assert sum(fraction[0] for fraction in shares.values()) == pytest.approx(1.0)
-    assert all(0 <= fraction[1] <= 1 for fraction in shares.values())
-    figures = images_per_second(islice(TRAIN_SEEDS, 1), 1, "oak_d")
-    assert figures["views_per_s"] > 0

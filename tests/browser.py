@@ -21,7 +21,7 @@ from typing import Any, Self
 
 from tools.debian_packages import library_path, unpack_packages
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 TREE = ROOT / ".tools" / "chromium"
 PROGRAM = TREE / "usr/lib/chromium/chromium-headless-shell"
 FLAGS = (
