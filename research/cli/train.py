@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 
 

@@ -33,7 +33,7 @@ from semantic_mapper.fields.source_maps import encoded_views
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.nodes.cli.map_answers import answer_instances
+from semantic_mapper.nodes.map_answers import answer_instances
 from semantic_mapper.plots import draw_picture_rows, write_picture
 from semantic_mapper.queries.oriented_box import upright_box
 from semantic_mapper.replay.box_picture import edges_in_view

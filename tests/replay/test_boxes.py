@@ -15,7 +15,7 @@ from semantic_mapper.fields.primitive_rays import PrimitiveSet
 from semantic_mapper.fields.primitives import Primitive, resized
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.labels import ROOMS, make_label_set
-from semantic_mapper.nodes.cli.map_answers import answer_instances
+from semantic_mapper.nodes.map_answers import answer_instances
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.replay.box_values import BoxFile

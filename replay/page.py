@@ -1,4 +1,4 @@
-"""The reports of replays, evaluations and benchmarks, each as one page of HTML.
+"""A report as one page of HTML.
 
 Pictures, figures and the map's points are inside the page; it fetches nothing, and its policy forbids it to. What comes
 from files and sockets is text in it: escaped, with control characters as escapes.
@@ -8,38 +8,31 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.overview import ELEVATION, LabelledPoints, draw_strip
+from semantic_mapper.evaluation.overview import ELEVATION, LabelledPoints
 from semantic_mapper.evaluation.splat import open_side, point_spacing
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.plain_text import visible
 from semantic_mapper.plots import UNKNOWN, Bar, class_rows, draw_bars, png_bytes
 from semantic_mapper.redaction import without_secrets
-from semantic_mapper.replay.artifacts import MAX_LISTED, map_up, picture_unit, view_strips
-from semantic_mapper.replay.summary import dig
 from semantic_mapper.types import Float64, UInt8
 
-if TYPE_CHECKING:
-    from semantic_mapper.replay.session import MapSession
-
-REPORT_NAME = "report.html"
-STRIPS = 4  # frames that are shown
 JPEG_QUALITY = 88
 MAX_VIEW_POINTS = 300_000  # 10 bytes each
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -100,9 +93,6 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
     Raises:
         ConfigError: it cannot be written.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup, escape
-
     pages = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -240,112 +230,7 @@ def table_of(heads: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> Tabl
     return table
 
 
-def write_replay_report(session: MapSession, summary: Mapping[str, Any], out: Path) -> None:
-    """Write ``report.html`` to the folder of a replay, with what is there already.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
-    label_set, points = session.pipeline.label_set, session.pipeline.voxel_map.points()
-    overview = out / "overview.png", "Frames, what was rendered for them, and the map from above and aside"
-    strips = [
-        picture(
-            draw_strip(s, label_set, picture_unit(session)),
-            f"{s.name}: camera, and what was rendered for it",
-            photo=True,
-        )
-        for s in view_strips(session, STRIPS)
-    ]
-    counts = [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()]
-    sections = [
-        Section(notes=notes(summary)),
-        *([Section("The map", view=point_view(points, label_set, map_up(session)))] if len(points.xyz) else []),
-        Section("Overview", pictures=list(picture_files(overview))),
-        Section("Figures", tables=[summary_table({out.resolve().name: summary})]),
-        *([Section("Frames", pictures=strips)] if strips else []),
-        *_stages({"this replay": summary}),
-        *_classes({"this replay": dig(summary, "metrics.per_class") or {}}),
-        Section(
-            "Frames that came, and what became of them",
-            notes=[f"Damaged: {stretch}" for stretch in summary["damaged_stretches"]],
-            tables=[table_of(("frames", ""), counts)],
-        ),
-        *_refused(summary["refusals"]),
-        Section(
-            "Configuration",
-            tables=[table_of(("package", "version"), list(summary["versions"].items()))],
-            folded={"Settings that were in force": json.dumps(summary["config"], indent=1)},
-        ),
-    ]
-    write_page(out / REPORT_NAME, f"Replay of {summary['source'] or 'a session'}", sections)
-
-
-def write_eval_report(
-    path: Path,
-    summaries: Mapping[str, Mapping[str, Any]],
-    folders: Sequence[Path],
-    logs: Mapping[str, Table],
-    found: Any,
-) -> None:
-    """Write the report of ``eval``.
-
-    Args:
-        path: Of the page.
-        summaries: Of replays, by name; ``folders`` are theirs, in this order.
-        logs: The table of each log that was scored.
-        found: All figures, as in the JSON file.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
-    sections: list[Section] = []
-    if summaries:
-        scores = {name: dig(s, "metrics.per_class") or {} for name, s in summaries.items()}
-        sections += [Section(tables=[summary_table(summaries)]), *_stages(summaries), *_classes(scores)]
-    for (name, summary), folder in zip(summaries.items(), folders, strict=True):
-        pictures = list(picture_files((folder / "overview.png", f"{name}: frames and map")))
-        settings = {"Settings that were in force": json.dumps(summary.get("config"), indent=1)}
-        sections.append(Section(name, notes(summary), pictures=pictures, folded=settings))
-    for log, table in logs.items():
-        methods = found["logs"][log]["methods"]
-        sections += [
-            Section(Path(log).name, found["logs"][log]["notes"], tables=[table]),
-            *_classes({n: m["per_class"] for n, m in methods.items()}),
-        ]
-    if found.get("surface"):
-        rows = [
-            (
-                name,
-                f"{f['median_m'] * 1000:.1f} mm",
-                f"{f['complete'] * 100:.1f} %",
-                f"{f['complete_10cm'] * 100:.1f} %",
-            )
-            for name, f in found["surface"].items()
-        ]
-        heads = ("map", "median distance from the mesh", "of the mesh within 5 cm", "within 10 cm")
-        sections.append(Section("Surface", tables=[table_of(heads, rows)]))
-    sections.append(Section(folded={"All figures": json.dumps(found, indent=1)}))
-    write_page(path, f"Evaluation of {', '.join([*summaries, *(Path(log).name for log in logs)])}", sections)
-
-
-def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures: Sequence[Path], found: Any) -> None:
-    """Write the report of a benchmark run with its pictures.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
-    figures = Section(tables=[table], lines=lines)
-    drawn = Section(pictures=list(picture_files(*((path, path.name) for path in pictures))))
-    write_page(path, found["title"], [figures, drawn, Section(folded={"All figures": json.dumps(found, indent=1)})])
-
-
-def _refused(refusals: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
-    rows = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in refusals]
-    if rows:
-        yield Section(f"Refused, the first {MAX_LISTED}", tables=[table_of(("seq", "stamp, ns", "reason"), rows)])
-
-
-def _stages(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:
+def stage_sections(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:
     """Median and 95th percentile of each stage of a step, as bars and in figures."""
     stages = {name: s.get("stages_ms") or {} for name, s in summaries.items()}
     several = len(stages) > 1
@@ -367,7 +252,7 @@ def _stages(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:
     yield Section("Times of the stages of a step", pictures=[drawn], tables=[table])
 
 
-def _classes(methods: Mapping[str, Mapping[str, float | None]]) -> Iterator[Section]:
+def class_sections(methods: Mapping[str, Mapping[str, float | None]]) -> Iterator[Section]:
     """IoU of each class, a bar for each method."""
     bars = [
         Bar(f"{name}: {method}" if len(methods) > 1 else name, {method: 100 * value})

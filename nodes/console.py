@@ -28,8 +28,10 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import visible
 from semantic_mapper.redaction import plain_without_secrets, without_secrets
+from semantic_mapper.replay.job_monitor import JobMonitor
 
 _log = structlog.get_logger(__name__)
 
@@ -114,17 +116,25 @@ def stderr_console() -> PlainConsole:
     return PlainConsole(stderr=True)
 
 
-class FrameProgress:
+class FrameProgress(JobMonitor):
     """A bar with frames a second and time left; events in the log where stderr is no terminal."""
 
-    def __init__(self, progress: Progress, task: Any, what: str, total: int | None, unit: str) -> None:
+    def __init__(
+        self, progress: Progress, task: Any, what: str, total: int | None, unit: str, stop: StopRequest | None
+    ) -> None:
         self._progress = progress
         self._task = task
         self._what = what
         self._total = total
         self._unit = unit
+        self._stop = stop
         self._done = 0
         self._began = self._told = time.monotonic()
+
+    @property
+    def stopped_by(self) -> str:
+        """The signal that asks for an early end; empty = none has come."""
+        return self._stop.name if self._stop is not None else ""
 
     def start(self, total: int | None) -> None:
         """Now it is known how many there are, and work begins."""
@@ -150,8 +160,10 @@ class FrameProgress:
 
 
 @contextmanager
-def frame_progress(what: str, total: int | None, unit: str = "frames") -> Iterator[FrameProgress]:
-    """Show progress while inside; ``total`` None where nobody knows it."""
+def frame_progress(
+    what: str, total: int | None, unit: str = "frames", stop: StopRequest | None = None
+) -> Iterator[FrameProgress]:
+    """Show progress while inside; ``total`` None where nobody knows it. ``stop`` is what ends the job early."""
     columns = (
         _TextColumn(lambda task: task.description, "bold"),
         BarColumn(),
@@ -164,7 +176,7 @@ def frame_progress(what: str, total: int | None, unit: str = "frames") -> Iterat
     )
     console = stderr_console()
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit)
+        yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit, stop)
 
 
 class _TextColumn(ProgressColumn):

@@ -18,16 +18,15 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.report import (
+from semantic_mapper.replay.artifacts import finish_session
+from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
+from semantic_mapper.replay.page import (
     MAX_VIEW_POINTS,
     Section,
     point_view,
-    write_eval_report,
     write_page,
     write_suite_report,
 )
-from semantic_mapper.nodes.cli.scoring import score_table
-from semantic_mapper.nodes.mapper.finish import finish_session
 from semantic_mapper.replay.session import MapSession
 from tests.nodes.support import write_weights
 from tests.small import tiny_config, tiny_frames

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from rich.console import Console
 
-from semantic_mapper.nodes.cli.map_answers import answer_instances, answer_table
+from semantic_mapper.nodes.map_answers import answer_instances, answer_table
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.oriented_box import OrientedBox
 

@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from semantic_mapper.nodes.cli.top_table import LaunchView
+from semantic_mapper.nodes.supervisor.launch_view import LaunchView
 from semantic_mapper.transport.messages import Status
 
 S = 1_000_000_000

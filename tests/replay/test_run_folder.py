@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.saved_maps import map_path
+from semantic_mapper.replay.run_folder import map_path
 
 
 @pytest.mark.parametrize(
