@@ -17,9 +17,9 @@ from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.endpoints import check_connect
+from semantic_mapper.transport.keys import ServerIdentity, load_keys, secure_client
 from semantic_mapper.transport.pose_message import MAX_POSE_BYTES, PoseMessage, decode_pose
-from semantic_mapper.transport.receiving import receive_bounded
-from semantic_mapper.transport.security import ServerIdentity, load_keys, secure_client
+from semantic_mapper.transport.sockets import receive_bounded
 
 _POLL_MS = 50
 _SILENCE_S = 1.0  # after so long without a message the connection is made again

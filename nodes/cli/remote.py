@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from semantic_mapper.transport.security import ServerIdentity
+    from semantic_mapper.transport.keys import ServerIdentity
 
 ServerOption = Annotated[
     str,
@@ -30,7 +30,7 @@ def server_identity(server: str, keys: Path | None) -> ServerIdentity | None:
     Raises:
         TransportError: no keys.
     """
-    from semantic_mapper.transport.security import ServerIdentity, load_keys
+    from semantic_mapper.transport.keys import ServerIdentity, load_keys
 
     if not server:
         return None

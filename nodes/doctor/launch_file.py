@@ -47,7 +47,7 @@ def own_keys() -> Iterator[Check]:
 
 def keys_in(folder: Path) -> Check:
     """Whether the keys of a folder, and those of all peers, can be used."""
-    from semantic_mapper.transport.security import load_keys
+    from semantic_mapper.transport.keys import load_keys
 
     try:
         peers = load_keys(folder).peers()
@@ -75,7 +75,7 @@ def _listening(launch: Launch) -> list[tuple[str, str]]:
 
 def _address(endpoint: str, folder: str) -> Check:
     from semantic_mapper.transport.endpoints import check_bind
-    from semantic_mapper.transport.security import load_keys
+    from semantic_mapper.transport.keys import load_keys
 
     try:
         check_bind(endpoint, load_keys(Path(folder).expanduser()) if folder else None)

@@ -14,7 +14,7 @@ from semantic_mapper.nodes.doctor import launch_file as doctor_launch
 from semantic_mapper.nodes.doctor.check import Check
 from semantic_mapper.nodes.doctor.robot import PORTS
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
-from semantic_mapper.transport.security import allow, make_keys
+from semantic_mapper.transport.keys import allow, make_keys
 from tests.nodes.support import REPLAY_LAUNCH
 
 ROBOT = REPLAY_LAUNCH.with_name("headless-onboard.toml")

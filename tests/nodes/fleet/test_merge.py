@@ -349,10 +349,10 @@ def test_maps_are_named_by_their_file_or_folder() -> None:
 @pytest.fixture(scope="module")
 def seen_maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], list[Float64]]:
     """Three robots in one room, which find each other by what they have seen."""
-    from benchmarks.fleet_merge import CAMERA, frames_of, robot_world
+    from research.experiments.fleet_merge import CAMERA, frames_of, robot_world
+    from research.scenes.storey import make_storey
     from semantic_mapper.config import VoxelMapConfig
     from semantic_mapper.labels import ROOMS
-    from semantic_mapper.scenes.storey import make_storey
 
     folder = tmp_path_factory.mktemp("seen")
     storey = make_storey(200001, 20.0)

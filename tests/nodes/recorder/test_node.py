@@ -43,9 +43,8 @@ from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame, repack_rgb
-from semantic_mapper.transport.headers import MAX_COUNT
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
+from semantic_mapper.transport.messages import MAX_COUNT, EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from tests.nodes.support import Running, error_line, eventually, repeated_frames, run, write_log
 from tests.nodes.test_faults import alone
@@ -307,7 +306,7 @@ def test_what_waits_when_the_recorder_is_stopped_is_written_or_counted(
 
 def test_frames_are_packed_anew_without_touching_anything_else() -> None:
     frame = samples.make_frame()
-    for options in (CodecOptions(rgb="raw"), CodecOptions(rgb="raw", depth="raw")):
+    for options in (CodecOptions(rgb="raw"), CodecOptions(rgb="raw")):
         raw = encode_frame(frame, options)
         png = repack_rgb(raw, CodecOptions(rgb="png"))
         assert png[2].startswith(b"\x89PNG") and png[3:] == raw[3:]

@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from semantic_mapper.replay.log import reader
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.replay.log.recover import recover
-from semantic_mapper.transport.framing import pack_parts
+from semantic_mapper.transport.codec import pack_parts
 from tests.replay.conftest import FRAMES
 
 COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "lz4": lz4.frame.compress, "zstd": zstandard.compress}
