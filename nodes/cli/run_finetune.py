@@ -31,8 +31,7 @@ from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.pseudo_labels import boxed_field, match_boxes, open_pseudo_labels, read_pseudo_labelled
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.box_times import with_times
-from semantic_mapper.replay.boxes import BoxFile, load_boxes
+from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_times
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
