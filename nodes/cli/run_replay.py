@@ -29,7 +29,7 @@ from semantic_mapper.replay.artifacts import clear_results
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.session import MapSession, open_recording
-from semantic_mapper.replay.sfm.film_note import read_left_out
+from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.scale import fit_to_scene
 from semantic_mapper.types import PosedFrame
 

@@ -24,8 +24,7 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.frame_depth import computed_trust
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.run_replay import mapper_config
-from semantic_mapper.replay.autolabel import RENDERED_SPREAD
-from semantic_mapper.replay.rendered_depth import rendered_depth
+from semantic_mapper.replay.autolabel import RENDERED_SPREAD, rendered_depth
 from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.grid_fit import GridFitConfig
 from semantic_mapper.training.scene_fit import fit_scene

@@ -16,8 +16,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from semantic_mapper.replay.log import reader
-from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.replay.log.recover import recover
+from semantic_mapper.replay.log.format import LogReader, recover
 from semantic_mapper.transport.codec import pack_parts
 from tests.replay.conftest import FRAMES
 
