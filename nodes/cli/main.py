@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 
 from semantic_mapper import __version__
 from semantic_mapper.nodes.cli import autolabel as cli_autolabel
+from semantic_mapper.nodes.cli import bench as cli_bench
 from semantic_mapper.nodes.cli import boxes as cli_boxes
 from semantic_mapper.nodes.cli import calibrate as cli_calibrate
 from semantic_mapper.nodes.cli import cameras as cli_cameras
@@ -109,6 +110,7 @@ app.command("eval")(cli_eval.evaluate)
 # Coordinates below 0 look like options.
 app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)
 app.command("boxes")(cli_boxes.boxes)
+app.command("bench")(cli_bench.bench)
 
 
 def _show_version(wanted: bool) -> None:
