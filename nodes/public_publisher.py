@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.transport.security import load_keys
+from semantic_mapper.transport.keys import load_keys
+from semantic_mapper.transport.messages import Buffer
 from semantic_mapper.transport.sockets import Publisher
 
 

@@ -31,8 +31,8 @@ from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import decode_answer, encode_request
 from semantic_mapper.transport.endpoints import default_endpoint
+from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.query_sockets import QuerySocket
-from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.types import Bool, Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
@@ -129,10 +129,7 @@ class MapClient:
         endpoint: Of the mapper's query service; by default that of a mapper of this user that was started by hand.
         timeout_s: How long to wait for an answer before asking again.
         attempts: How often to ask.
-        identity: Of a mapper that has keys (``transport.security``), as those on other machines have.
-        refined: Ask for the map as it was refined last (option `refine_every_s` of the mapper) instead: its classes are
-            those that refining found, its ``version`` is the one that was refined, and lags behind. ``MapError`` until
-            there is one. ``occupancy`` and ``distance_field``, which no class enters, are of the map itself.
+        identity: Of a mapper that has keys (``transport.keys``), as those on other machines have.
 
     Raises:
         TransportError: an invalid endpoint, or a mapper that is not among the peers.
@@ -145,9 +142,7 @@ class MapClient:
         timeout_s: float = 5.0,
         attempts: int = 3,
         identity: ServerIdentity | None = None,
-        refined: bool = False,
     ) -> None:
-        self._refined = refined
         self._asker, self._timeout_s = uuid.uuid4().hex, timeout_s
         self._socket = QuerySocket(
             endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts, identity=identity
@@ -339,8 +334,6 @@ class MapClient:
 
     def _send(self, kind: str, request: messages.Request) -> list[bytes]:
         request = replace(request, asker=self._asker, waits_s=min(self._timeout_s, messages.MAX_WAIT_S))
-        if isinstance(request, messages.LabelsRequest):
-            request = replace(request, refined=self._refined)
         return self._socket.ask(encode_request(kind, request))
 
     def _correction(self, kind: str, request: messages.Request) -> Correction:

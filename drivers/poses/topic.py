@@ -16,9 +16,9 @@ from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.endpoints import check_connect
+from semantic_mapper.transport.keys import ServerIdentity, load_keys, secure_client
 from semantic_mapper.transport.pose_message import MAX_POSE_BYTES, decode_pose
-from semantic_mapper.transport.receiving import receive_bounded
-from semantic_mapper.transport.security import ServerIdentity, load_keys, secure_client
+from semantic_mapper.transport.sockets import receive_bounded
 
 WAIT_S = 0.05  # how long an image waits for a pose at or after it, before the motion is extrapolated
 _KEPT = 2000  # poses

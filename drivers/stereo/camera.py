@@ -10,9 +10,9 @@ from typing import Any, Self
 
 import msgspec
 
+from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import load_stereo
-from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.stereo.config import Config
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.drivers.v4l2 import devices

@@ -34,8 +34,8 @@ from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.transport.codec import decode_as, read_envelope
+from semantic_mapper.transport.keys import ServerIdentity, load_keys
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
-from semantic_mapper.transport.security import ServerIdentity, load_keys
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 

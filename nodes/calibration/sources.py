@@ -23,7 +23,7 @@ from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo.camera import halves
 from semantic_mapper.errors import CameraError, ConfigError, SemanticMapperError
-from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.options import SOURCE_PATTERN
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.sequence import open_log

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from semantic_mapper.drivers.base import Camera, CorrectedWorld, FrameSource
     from semantic_mapper.drivers.mounts import Mount
     from semantic_mapper.nodes.camera.corrections import CorrectionSender
-    from semantic_mapper.transport.framing import Parts
-    from semantic_mapper.transport.messages import EndReason, NodeState
+    from semantic_mapper.transport.messages import EndReason, NodeState, Parts
     from semantic_mapper.transport.sockets import Publisher
     from semantic_mapper.types import PosedFrame
 

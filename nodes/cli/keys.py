@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output
-from semantic_mapper.nodes.cli.remote import default_folder
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -17,7 +16,14 @@ app = typer.Typer(
     help="Keys by which this machine and others know each other. Needed where a node listens beyond this machine.",
 )
 
-FolderOption = Annotated[Path, typer.Option("--keys", help="Folder of the keys.", default_factory=default_folder)]
+
+def _user_folder() -> Path:
+    from semantic_mapper.transport.keys import user_key_folder
+
+    return user_key_folder()
+
+
+FolderOption = Annotated[Path, typer.Option("--keys", help="Folder of the keys.", default_factory=_user_folder)]
 
 
 @app.command("make")
@@ -28,7 +34,7 @@ def make(keys: FolderOption) -> int:
     Example: semantic-mapper keys make
     """
     output = Output.guarded()
-    from semantic_mapper.transport.security import make_keys
+    from semantic_mapper.transport.keys import make_keys
 
     made = make_keys(keys)
     public = made.public.decode()
@@ -48,7 +54,7 @@ def show(
     Example: semantic-mapper keys show
     """
     output = Output.guarded()
-    from semantic_mapper.transport.security import load_keys
+    from semantic_mapper.transport.keys import load_keys
 
     own = load_keys(keys)
     peers = {name: key.decode() for name, key in own.peers().items()}
@@ -75,9 +81,9 @@ def allow(
     Example: semantic-mapper keys allow workstation 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'
     """
     output = Output.guarded()
-    from semantic_mapper.transport import security
+    from semantic_mapper.transport.keys import allow as allow_peer
 
-    security.allow(keys, name, key)
+    allow_peer(keys, name, key)
     output.print(f"'{name}' is a peer")
     return 0
 
@@ -93,8 +99,8 @@ def forget(
     Example: semantic-mapper keys forget workstation
     """
     output = Output.guarded()
-    from semantic_mapper.transport import security
+    from semantic_mapper.transport.keys import forget as forget_peer
 
-    security.forget(keys, name)
+    forget_peer(keys, name)
     output.print(f"'{name}' is no peer any more")
     return 0

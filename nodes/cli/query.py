@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.nodes.cli.console import Output
-from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
+from semantic_mapper.replay.run_folder import prepare_file
 
 if TYPE_CHECKING:
     from semantic_mapper.queries.graph import SceneGraph
@@ -43,7 +43,6 @@ class Asked(NamedTuple):
     min_confidence: float = 0.0
     server: str = ""
     keys: Path | None = None
-    refined: bool = False
     gone: bool = False
     picture: Path | None = None
 
@@ -73,9 +72,6 @@ def query(
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
     ] = 0.0,
-    refined: Annotated[
-        bool, typer.Option("--refined", help="Running mapper: the map as it was refined last (`refine_every_s`).")
-    ] = False,
     gone: Annotated[
         bool, typer.Option("--gone", help="Running mapper, instances: also those of earlier answers that have gone.")
     ] = False,
@@ -102,32 +98,29 @@ def query(
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
     Example: semantic-mapper query live nearest chair 0 0 1 --json
-    Example: semantic-mapper query live nearest chair 0 0 1 --refined
     Example: semantic-mapper query live instances --gone --json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     Example: semantic-mapper query s3://maps/house nearest chair 0 0 1
     """
     class_name, point = _read_arguments(question, arguments or [])
-    from semantic_mapper.nodes.cli.saved_maps import holds_tiles
+    from semantic_mapper.replay.run_folder import holds_tiles
 
     in_tiles = holds_tiles(source)
     endpoint = "" if in_tiles else map_endpoint(source)
-    if refined and not endpoint:
-        raise typer.BadParameter("goes with a running mapper; name the refined file itself", param_hint="--refined")
     if gone and not (endpoint and question is Question.INSTANCES):
         raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
     if picture is not None and question is not Question.GRAPH:
         raise typer.BadParameter("goes with `graph`", param_hint="--picture")
     output = Output.guarded()
     from semantic_mapper.files import write_json
-    from semantic_mapper.nodes.cli.map_answers import answer_table
+    from semantic_mapper.nodes.map_answers import answer_table
 
     out, output.quiet = results_file(out), json
     for path in (out, picture):
         if path is not None:
             prepare_file(path)
     ask = ask_tiles if in_tiles else ask_mapper if endpoint else ask_file
-    asked = Asked(question, class_name, point, up, min_confidence, server, keys, refined, gone, picture)
+    asked = Asked(question, class_name, point, up, min_confidence, server, keys, gone, picture)
     found = {"map": source, **ask(endpoint or source, asked)}
     if out is not None:
         write_json(out, found)
@@ -145,13 +138,13 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     Raises:
         ConfigError, MapError, LabelError: no map there, or a question that cannot be answered.
     """
-    from semantic_mapper.nodes.cli import map_answers
-    from semantic_mapper.nodes.cli.saved_maps import map_path
+    from semantic_mapper.nodes import map_answers
     from semantic_mapper.queries.graph import GraphTracker
     from semantic_mapper.queries.instances import InstanceTracker
     from semantic_mapper.queries.lookup import at
     from semantic_mapper.queries.mirror import MapMirror
     from semantic_mapper.queries.nearest import nearest
+    from semantic_mapper.replay.run_folder import map_path
 
     snapshot = MapMirror.load(map_path(Path(source))).snapshot()
     match asked.question:
@@ -178,7 +171,7 @@ def ask_tiles(source: str, asked: Asked) -> dict[str, Any]:
         StoreError: the store cannot be reached.
     """
     from semantic_mapper.mapping.files.up_axis import find_up
-    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes import map_answers
     from semantic_mapper.nodes.fleet.tile_reading import open_tiles
     from semantic_mapper.queries.graph import GraphTracker
     from semantic_mapper.queries.mirror import MapMirror
@@ -208,7 +201,7 @@ def ask_tiles(source: str, asked: Asked) -> dict[str, Any]:
 
 def _find_up(snapshot: MapSnapshot) -> tuple[float, ...]:
     """Away from the floor, as in the graph; z of the world where no floor shows it, which the answer tells (``up``)."""
-    from semantic_mapper.nodes.cli.map_answers import UP
+    from semantic_mapper.nodes.map_answers import UP
     from semantic_mapper.queries.graph import GraphTracker
 
     try:
@@ -225,9 +218,9 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
         MapError, LabelError: a question that cannot be answered.
     """
     from semantic_mapper.client import MapClient
-    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes import map_answers
 
-    with MapClient(source, identity=server_identity(asked.server, asked.keys), refined=asked.refined) as client:
+    with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
         match asked.question:
             case Question.INFO:
                 return map_answers.describe_map(client.mirror().snapshot())
@@ -237,10 +230,8 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
                 hit = client.nearest(asked.class_name, asked.point, asked.min_confidence)
                 return map_answers.answer_nearest(asked.class_name, asked.point, hit)
             case Question.INSTANCES:
-                # A map that grows has no things of its own; of a refined one the answer does not say.
-                by = "" if asked.refined else map_answers.CONNECTED
                 up = asked.up or map_answers.UP
-                return map_answers.answer_instances(up, client.instances(up, gone=asked.gone), by)
+                return map_answers.answer_instances(up, client.instances(up, gone=asked.gone), map_answers.CONNECTED)
             case Question.GRAPH:
                 return _answer_graph(source, client.graph(asked.up), asked.picture)
 
@@ -251,7 +242,7 @@ def _answer_graph(source: str, graph: SceneGraph, picture: Path | None) -> dict[
     Raises:
         MapError: there is no floor to draw.
     """
-    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes import map_answers
 
     if picture is not None:
         from semantic_mapper.plots import write_picture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Self
@@ -12,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Self
 import typer
 
 from semantic_mapper.errors import ConfigError, TransportError
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.replay import ConfigOption, MaxFramesOption, WeightsOption
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.process import StopRequest
 
 if TYPE_CHECKING:
@@ -55,9 +54,6 @@ def view(
     weights: WeightsOption = None,
     config: ConfigOption = None,
     max_frames: MaxFramesOption = 0,
-    refined: Annotated[
-        bool, typer.Option("--refined", help="Launch: the map as its mapper refined it last (`refine_every_s`).")
-    ] = False,
     server: ServerOption = "",
     keys: KeysOption = None,
 ) -> None:
@@ -79,14 +75,12 @@ def view(
         raise typer.BadParameter("go with a log", param_hint="--weights, --config, --max-frames")
     if server and "://" not in source:
         raise typer.BadParameter("goes with an endpoint such as tcp://robot:5570", param_hint="--server")
-    if refined and (log or (source and "://" not in source and _saved_map(path, source) is not None)):
-        raise typer.BadParameter("goes with a launch; a refined map is shown by its name", param_hint="--refined")
     output = Output.guarded()
     saved = None if log else _saved_map(path, source)
     if source and "://" not in source and not path.exists():
         other = "" if log or saved else ", and no socket folder of a launch"
         raise ConfigError(f"{path}: no such file{other}; without a name, `view` shows the one launch that runs here")
-    live = None if log or saved else replace(_find_live(source, query, server, keys), refined=refined)
+    live = None if log or saved else _find_live(source, query, server, keys)
     with StopRequest() as stop, _Page(port, data_port, memory, output) as page:
         if saved is not None:
             from semantic_mapper.nodes.viewer.sources import show_saved
@@ -143,14 +137,14 @@ class _Page:
 
 
 def _is_log(source: str) -> bool:
-    from semantic_mapper.nodes.cli.saved_maps import is_log
+    from semantic_mapper.replay.run_folder import is_log
 
     return bool(source) and is_log(Path(source))
 
 
 def _saved_map(path: Path, source: str) -> Path | None:
     """The file of a saved map, where the source is one."""
-    from semantic_mapper.nodes.cli.saved_maps import is_map, map_path
+    from semantic_mapper.replay.run_folder import is_map, map_path
 
     return map_path(path) if source and is_map(path) else None
 
@@ -183,10 +177,10 @@ def _show_log(
     refresh: float,
     stop: StopRequest,
 ) -> None:
-    from semantic_mapper.nodes.cli.run_replay import mapper_config
+    from semantic_mapper.config import load_mapper_config
     from semantic_mapper.nodes.viewer.mapped_log import show_log
 
-    settings = mapper_config(config, None)
+    settings = load_mapper_config(config)
     with frame_progress("map", None) as bar:
         show_log(
             path,

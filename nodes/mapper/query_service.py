@@ -27,9 +27,9 @@ from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.mapper.query_answers import Answers, Question
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.transport.codec import encode_error
+from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.query_messages import ChangesRequest, Request
 from semantic_mapper.transport.query_sockets import QueryServer
-from semantic_mapper.transport.security import Keys
 
 PERIOD_S = 0.1  # between two snapshots, at least
 MAX_FRACTION = 0.1  # of the mapper's time that copying may take; the pause after a costly copy is longer
@@ -86,7 +86,7 @@ class QueryService:
         correction: Takes corrected poses; without it they are refused.
         weights: Takes other weights; without it requests about them are refused.
         keys: See ``QueryServer``.
-        refined, moving, whereabouts: See ``Answers``.
+        moving, whereabouts: See ``Answers``.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
@@ -99,14 +99,13 @@ class QueryService:
         correction: LiveCorrection | None = None,
         keys: Keys | None = None,
         weights: LiveWeights | None = None,
-        refined: MapMirror | None = None,
         moving: MovingSpace | None = None,
         whereabouts: Whereabouts | None = None,
     ) -> None:
         self._map = voxel_map
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        self._answers = Answers(self._mirror, correction, weights, refined, moving, whereabouts)
+        self._answers = Answers(self._mirror, correction, weights, moving, whereabouts)
         self._copied_version = 0
         self._copy_again_at = 0.0
         self.asked = False  # whether anybody has ever asked about the map

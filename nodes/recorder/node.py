@@ -111,7 +111,7 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
 
 def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessSubscriber]) -> None:
     """Write what had come before somebody asked to stop; what there is no time for is counted."""
-    from semantic_mapper.transport.topics import read_topic
+    from semantic_mapper.transport.messages import read_topic
 
     deadline = time.monotonic() + DRAIN_S
     for source in sources:
@@ -230,8 +230,7 @@ class Recorder:
     def take(self, parts: list[bytes]) -> bool:
         """Keep one message; True where all streams have ended."""
         from semantic_mapper.transport.codec import decode_as
-        from semantic_mapper.transport.messages import EndOfStream, StreamInfo
-        from semantic_mapper.transport.topics import parse_topic
+        from semantic_mapper.transport.messages import EndOfStream, StreamInfo, parse_topic
 
         topic, _ = parse_topic(parts[0])
         self.received += topic.name == "frame"
@@ -343,8 +342,7 @@ def _last_frames(path: Path) -> dict[str, int]:
     from semantic_mapper.errors import LogError
     from semantic_mapper.replay.log.mcap_scan import read_payloads, scan_end
     from semantic_mapper.replay.log.sequence import parts_on_disk
-    from semantic_mapper.transport.codec import read_envelope
-    from semantic_mapper.transport.framing import unpack_parts
+    from semantic_mapper.transport.codec import read_envelope, unpack_parts
 
     found: dict[str, int] = {}
     for part in reversed(parts_on_disk(path).values()):

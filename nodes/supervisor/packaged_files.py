@@ -1,4 +1,4 @@
-"""Launch files and recipes that come with the package: ``launch/`` and ``recipes/`` of the top level."""
+"""Launch files that come with the package: ``launch/`` of the top level."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.replay.exporters.base import ExportFrame, encoded, quaternion
-from semantic_mapper.transport.compression import depth_to_uint16
+from semantic_mapper.transport.images import depth_to_uint16
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 

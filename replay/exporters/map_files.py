@@ -12,13 +12,19 @@ from numpy.typing import NDArray
 from semantic_mapper.config import read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
+from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.export import ColorBy, colored, sure_faces, sure_points
-from semantic_mapper.mapping.files.formats.glb import write_glb
-from semantic_mapper.mapping.files.formats.map_server import write_map_server
-from semantic_mapper.mapping.files.formats.npz import write_npz
-from semantic_mapper.mapping.files.formats.obj import write_obj
-from semantic_mapper.mapping.files.formats.ply import write_ply, write_ply_mesh
+from semantic_mapper.mapping.files.formats import (
+    ColorBy,
+    colored,
+    sure_faces,
+    sure_points,
+    write_glb,
+    write_map_server,
+    write_npz,
+    write_obj,
+    write_ply,
+)
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_scale import require_metres
@@ -105,6 +111,36 @@ def format_of(path: Path, given: str | None) -> Format:
     return SUFFIXES[path.suffix.lower()]
 
 
+def parse_transform(text: str) -> Float64:
+    """``"x y z yaw_deg"``, or the name of a text file that holds a rigid (4, 4) row by row.
+
+    Raises:
+        ConfigError: neither of these.
+        PoseError: the file holds something else than a rigid transform.
+    """
+    words = text.replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return _read_transform(Path(text))
+    if len(numbers) != 4 or not np.isfinite(numbers).all():
+        raise ConfigError(f"--transform '{text}': expected four numbers, x y z in metres and yaw in degrees")
+    return yaw_transform(np.array(numbers[:3]), numbers[3])
+
+
+def _read_transform(path: Path) -> Float64:
+    try:
+        T = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except FileNotFoundError as error:
+        raise ConfigError(f'--transform {path}: neither "x y z yaw_deg" nor a file') from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--transform {path}: cannot be read as numbers: {error}") from error
+    if T.shape != (4, 4):
+        raise ConfigError(f"--transform {path}: expected 4 rows of 4 numbers, got {T.shape[0]} of {T.shape[1]}")
+    check_pose(T, str(path))
+    return T
+
+
 def parse_up(text: str) -> Float64 | None:
     """``auto`` (None), an axis of the world (x, -y, ...), or three numbers.
 
@@ -171,7 +207,7 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     color = request.color or "rgb"
     mesh, files, found = colored(mesh, labels, color), (path,), ()
     if request.format == "ply-mesh":
-        write_ply_mesh(path, mesh, labels, scale_known=voxel_map.scale_known)
+        write_ply(path, mesh, labels, scale_known=voxel_map.scale_known)
     elif request.format == "obj":
         scale_known = voxel_map.scale_known
         files = write_obj(path, mesh, labels, class_materials=color == "class", scale_known=scale_known)

@@ -26,8 +26,7 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plain_text import counted
 from semantic_mapper.transport.codec import EncodedImage
-from semantic_mapper.transport.compression import depth_from_uint16
-from semantic_mapper.transport.images import decode_image_file
+from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 

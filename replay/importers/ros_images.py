@@ -18,8 +18,7 @@ from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, ImportSourceError
 from semantic_mapper.replay.importers.base import metres
 from semantic_mapper.transport.codec import EncodedImage
-from semantic_mapper.transport.compression import depth_from_uint16
-from semantic_mapper.transport.images import decode_image_file
+from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
 from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
 UNITS_PER_M = 1000.0  # of 16-bit depth

@@ -23,10 +23,9 @@ from semantic_mapper.errors import LogError
 from semantic_mapper.replay.log.atomic_file import AtomicFile
 from semantic_mapper.replay.log.mcap_scan import MAGIC
 from semantic_mapper.replay.log.reader import INFO_ATTACHMENT, LogAttachment, LogReader
-from semantic_mapper.transport.codec import EncodedImage, encode, encode_frame, header_type, read_envelope
-from semantic_mapper.transport.framing import Parts, pack_parts
+from semantic_mapper.transport.codec import EncodedImage, encode, encode_frame, header_type, pack_parts, read_envelope
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.transport.messages import Parts, StreamInfo
 from semantic_mapper.types import PosedFrame
 
 __all__ = ["LogAttachment", "LogReader", "LogWriter"]

@@ -14,8 +14,7 @@ from semantic_mapper.errors import CodecError, LogError, NodeError, TransportErr
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.transport.codec import Envelope, decode_as, encode
-from semantic_mapper.transport.framing import Parts
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Parts
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
 

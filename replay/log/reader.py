@@ -22,10 +22,8 @@ from semantic_mapper.replay.log.mcap_scan import (
     read_payloads,
     scan,
 )
-from semantic_mapper.transport.codec import Envelope, decode_as, read_envelope
-from semantic_mapper.transport.framing import unpack_parts
-from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.transport.topics import parse_topic
+from semantic_mapper.transport.codec import Envelope, decode_as, read_envelope, unpack_parts
+from semantic_mapper.transport.messages import StreamInfo, parse_topic
 from semantic_mapper.types import PosedFrame
 
 INFO_ATTACHMENT = "stream_info"

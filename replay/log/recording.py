@@ -16,8 +16,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.reader import LogAttachment, LogReader
 from semantic_mapper.replay.log.sequence import Part, part_path, parts_on_disk, read_part
-from semantic_mapper.transport.framing import Parts
-from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.transport.messages import Parts, StreamInfo
 
 DiskFull = Literal["stop", "delete-oldest"]
 RETRY_S = 1.0  # how often a recording that pauses looks for room

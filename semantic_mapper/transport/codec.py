@@ -1,16 +1,19 @@
 """The one codec of wire and log: messages, questions and answers <-> multipart ``[name, msgpack header, buffers...]``.
 
 What encodes and decodes raises nothing but ``CodecError``; only ``decode_answer`` raises what the answer says. Every
-size is bounded and checked before anything is allocated by it. Decoded arrays are fresh and writable.
+size is bounded and checked before anything is allocated by it. Decoded arrays are fresh and writable. In a log a
+message is a msgpack array of binaries, which any msgpack reader opens.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
+import msgpack
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -19,59 +22,48 @@ from numpy.typing import NDArray
 from semantic_mapper import errors
 from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.transport.compression import zstd_compress, zstd_decompress
-from semantic_mapper.transport.framing import (
+from semantic_mapper.transport.images import (
+    CodecOptions,
+    DepthSpec,
+    RgbSpec,
+    Uint8Spec,
+    decode_depth,
+    decode_rgb,
+    decode_uint8,
+    encode_depth,
+    encode_rgb,
+    encode_uint8,
+    zstd_compress,
+    zstd_decompress,
+)
+from semantic_mapper.transport.messages import (
+    MAX_ENTRIES,
+    MAX_HEADER_BYTES,
+    MAX_KEYFRAME_BYTES,
     MAX_KEYFRAME_PIXELS,
     MAX_PART_BYTES,
     MAX_PARTS,
+    MAX_WEIGHTS_BYTES,
+    TOPICS,
     Buffer,
-    Parts,
-    check_buffers,
-)
-from semantic_mapper.transport.headers import (
-    MAX_ENTRIES,
-    PROTOCOL_VERSION,
     CaptureStamp,
     Count,
     Finite,
-    IntrinsicsForm,
+    LabelledKeyframe,
     LabelSetForm,
+    Message,
+    Parts,
     Side,
     Source,
     Stamp,
-    Wire,
-    WireT,
-    Word,
-    check_header,
-    pack_header,
-    to_plain,
-    unpack_header,
-)
-from semantic_mapper.transport.images import (
-    CodecOptions,
-    ConfidenceSpec,
-    DepthSpec,
-    LabelSpec,
-    RgbSpec,
-    decode_confidence,
-    decode_depth,
-    decode_label,
-    decode_rgb,
-    encode_confidence,
-    encode_depth,
-    encode_label,
-    encode_rgb,
-)
-from semantic_mapper.transport.messages import (
-    MAX_KEYFRAME_BYTES,
-    MAX_WEIGHTS_BYTES,
-    FrameRefused,
-    LabelledKeyframe,
-    Message,
-    Status,
     StreamInfo,
+    Topic,
     WeightsUpdate,
+    Wire,
+    Word,
     digest_of,
+    read_topic,
+    topic_bytes,
 )
 from semantic_mapper.transport.query_messages import (
     MAX_REQUEST_ROWS,
@@ -83,16 +75,12 @@ from semantic_mapper.transport.query_messages import (
     Request,
     array_forms,
 )
-from semantic_mapper.transport.topics import TOPICS, Topic, read_topic, topic_bytes
 from semantic_mapper.types import MAX_PIXELS, MAX_POSE_SIGMA_M, CameraIntrinsics, Float32, MapUpdate, PosedFrame, UInt8
+
+PROTOCOL_VERSION = 1  # raise it when a header changes its meaning; readers refuse what they do not know
 
 _DEFAULTS = CodecOptions()
 _ROWS = {row.message: row for row in TOPICS.values()}
-_FORMS: dict[str, Any] = {  # of fields that stand otherwise in a header than in Python
-    "intrinsics": IntrinsicsForm,
-    "cameras": Annotated[dict[Source, IntrinsicsForm], Meta(max_length=64)],
-    "label_set": LabelSetForm | None,
-}
 _UPDATE_SCALARS = (
     "stamp_ns seq camera_id fused is_keyframe source_seqs blocks blocks_touched rays samples stage_ms world".split()
 )
@@ -101,23 +89,23 @@ _ERROR = "error"  # in the place of an answer's kind
 _RAISED = {
     e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError, errors.PoseError)
 }
-_ZSTD_LEVEL = 1
-_NOT_SENT_AS_0 = (
+_BEYOND = re.compile(r"Expected `float` [<>]= \S+e\+308")  # how msgspec says it
+_NOT_SENT_AS_0 = (  # what most messages do not need
     "unreadable",
     "scale_unknown",
     "computed",
     "pseudo_label",
     "depth_sigma",
-    "refined",
     "gone",
     "moving",
     "world",
     "T_map_world",
-)  # came later: what does not need it is read by older releases, too
-_FRAME_BUFFERS = ("rgb", "depth", "label", "depth_sigma")  # fields of a frame's header, in the order of their buffers
+)
+_Pose = Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)]  # (4, 4) float64 row by row, exact
 
 MessageT = TypeVar("MessageT")
 AnswerT = TypeVar("AnswerT", bound=Answer)
+WireT = TypeVar("WireT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,19 +150,25 @@ class Envelope:
 class FrameHeader(Wire, frozen=True):
     """``PosedFrame`` without its images; buffers: rgb, depth, label, depth_sigma, those that there are."""
 
+    IMAGES: ClassVar = ("rgb", "depth", "label", "depth_sigma")
+
     stamp_ns: CaptureStamp
     seq: Count
     camera_id: Source
     intrinsics: CameraIntrinsics
-    T_world_camera: Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)]  # row by row, float64, exact
+    T_world_camera: _Pose
     pose_source: Word
     pose_sigma: Annotated[float, Meta(ge=0, le=MAX_POSE_SIGMA_M)]
     rgb: RgbSpec
     depth: DepthSpec | None = None
-    label: LabelSpec | None = None
+    label: Uint8Spec | None = None
     depth_sigma: DepthSpec | None = None  # of computed depth
     pseudo_label: bool = False
-    world: Count = 0  # sent where it is not 0
+    world: Count = 0
+
+    def __post_init__(self) -> None:
+        if self.depth_sigma is not None and self.depth is None:
+            raise CodecError(f"{self.name}: has a spread of its depth, and no depth")
 
     @property
     def name(self) -> str:
@@ -190,6 +184,8 @@ class FrameHeader(Wire, frozen=True):
 class MapUpdateHeader(Wire, frozen=True, kw_only=True):
     """``MapUpdate`` without its images; buffers: label, confidence, depth and, where something moves, moving (0, 1)."""
 
+    IMAGES: ClassVar = ("label", "confidence", "depth", "moving")
+
     stamp_ns: Stamp
     seq: Count
     camera_id: Source
@@ -203,12 +199,12 @@ class MapUpdateHeader(Wire, frozen=True, kw_only=True):
     rays: Count = 0
     samples: Count = 0
     stage_ms: Annotated[dict[Word, Finite], Meta(max_length=64)]
-    label: LabelSpec
-    confidence: ConfidenceSpec
+    label: Uint8Spec
+    confidence: Uint8Spec  # rounded to the nearest 1/255
     depth: DepthSpec
-    moving: LabelSpec | None = None
+    moving: Uint8Spec | None = None
     world: Count = 0
-    T_map_world: Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)] | None = None  # None: no motion
+    T_map_world: _Pose | None = None  # None: no motion
 
     def __post_init__(self) -> None:
         if self.width * self.height > MAX_PIXELS:
@@ -236,8 +232,117 @@ def header_type(topic: str) -> type[msgspec.Struct]:
     kind = _HEADERS.get(topic) or cast("type[Wire]", TOPICS[topic].message)
     described: list[Any] = [("v", int, PROTOCOL_VERSION)]
     for item in msgspec.structs.fields(kind):
-        described.append((item.encode_name, _FORMS.get(item.name, item.type)))
+        described.append((item.encode_name, LabelSetForm | None if item.name == "label_set" else item.type))
     return msgspec.defstruct(kind.__name__.removesuffix("Header"), described, kw_only=True, forbid_unknown_fields=True)
+
+
+def pack_parts(parts: Parts) -> bytes:
+    """Multipart message -> one payload, for logs."""
+    return cast(bytes, msgpack.packb([bytes(p) if isinstance(p, memoryview) else p for p in parts], use_bin_type=True))
+
+
+def unpack_parts(payload: Buffer) -> list[bytes]:
+    """Inverse of ``pack_parts``.
+
+    Raises:
+        CodecError: not such a payload, or one beyond the size limits.
+    """
+    try:
+        parts = msgpack.unpackb(
+            payload,
+            max_array_len=MAX_PARTS,
+            max_bin_len=MAX_PART_BYTES,
+            max_str_len=0,
+            max_map_len=0,
+            max_ext_len=0,
+        )
+    except (ValueError, TypeError, RecursionError, OverflowError, msgpack.UnpackException) as error:
+        raise CodecError(f"payload is not a framed message: {error or type(error).__name__}") from error
+    if not isinstance(parts, list) or not all(isinstance(p, bytes) for p in cast("list[object]", parts)):
+        raise CodecError("payload is not a framed message: expected an array of binaries")
+    return cast("list[bytes]", parts)
+
+
+def check_buffers(parts: Parts, sizes: Sequence[int], what: str) -> Parts:
+    """The buffers of a message: all parts after topic and header.
+
+    Raises:
+        CodecError: they do not have the sizes that the header announces; names both.
+    """
+    actual = [len(p) for p in parts[2:]]
+    if actual != list(sizes):
+        raise CodecError(f"{what}: the header announces buffers of {list(sizes)} bytes, got {actual}")
+    return parts[2:]
+
+
+def to_plain(value: object, what: str) -> Any:
+    """A message or header as dicts, lists, strings and numbers; numbers of NumPy become Python's.
+
+    Raises:
+        CodecError: it holds something else.
+    """
+    try:
+        return msgspec.to_builtins(value, builtin_types=(bytes,), enc_hook=_plain_number)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise CodecError(f"{what}: cannot be sent: {error}") from error
+
+
+def pack_header(header: Mapping[str, Any], what: str) -> bytes:
+    """Plain fields, which have passed ``check_header``, -> msgpack.
+
+    Raises:
+        CodecError: longer than ``MAX_HEADER_BYTES``.
+    """
+    packed = cast(bytes, msgpack.packb({"v": PROTOCOL_VERSION, **header}, use_bin_type=True))
+    if len(packed) > MAX_HEADER_BYTES:
+        raise CodecError(f"{what}: cannot be sent: a header of {len(packed)} bytes, at most {MAX_HEADER_BYTES}")
+    return packed
+
+
+def unpack_header(packed: Buffer, what: str) -> dict[str, Any]:
+    """msgpack -> plain fields without the protocol's version, not checked any further.
+
+    Raises:
+        CodecError: too long, not msgpack, nested too deeply, no map, or of another protocol version.
+    """
+    if len(packed) > MAX_HEADER_BYTES:
+        raise CodecError(f"{what}: header of {len(packed)} bytes, at most {MAX_HEADER_BYTES} are accepted")
+    try:
+        header: Any = msgpack.unpackb(
+            packed, max_str_len=1 << 14, max_bin_len=0, max_array_len=MAX_ENTRIES, max_map_len=256, max_ext_len=0
+        )
+    except (ValueError, TypeError, RecursionError, OverflowError, msgpack.UnpackException) as error:
+        # ValueError includes msgpack's StackError and FormatError, and bad UTF-8.
+        raise CodecError(f"{what}: bad header: {error or type(error).__name__}") from error
+    if not isinstance(header, dict):
+        raise CodecError(f"{what}: header must be a map, got {type(header).__name__}")
+    fields = cast("dict[str, Any]", header)
+    version = fields.pop("v", None)
+    if version is True or version != PROTOCOL_VERSION:
+        raise CodecError(
+            f"{what}: protocol version {version!r:.40}, this program speaks {PROTOCOL_VERSION}; "
+            "run the same release of semantic-mapper on both sides"
+        )
+    return fields
+
+
+def check_header(header: object, kind: type[WireT], what: str) -> WireT:
+    """Plain fields -> a struct or dataclass. Values that are arrays already, or such objects, stay what they are.
+
+    Raises:
+        CodecError: an unknown or missing field, a wrong type, a number out of bounds or not finite, or what
+            ``__post_init__`` refuses; names the field.
+    """
+    try:
+        return msgspec.convert(header, kind)
+    except (ValueError, TypeError, RecursionError, OverflowError) as error:
+        raise CodecError(f"{what}: bad header: {_BEYOND.sub('only finite numbers can be sent', str(error))}") from error
+
+
+def _plain_number(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"no header holds a {type(value).__name__}")
 
 
 def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str = "source") -> list[bytes]:
@@ -259,7 +364,15 @@ def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str =
         case LabelledKeyframe():
             return _encode_keyframe(message, options)
         case WeightsUpdate():
-            return _encode_weights(message)
+            what = f"weights {message.version} of '{message.node}'"
+            if len(message.data) > MAX_WEIGHTS_BYTES:
+                raise CodecError(
+                    f"{what}: a file of {len(message.data)} bytes; at most {MAX_WEIGHTS_BYTES} can be sent"
+                )
+            header = to_plain(message, what)
+            check_header(header, WeightsUpdate, what)
+            packed = pack_header({**header, "bytes": len(message.data)}, what)
+            return [topic_bytes("weights", message.node), packed, message.data]
         case _:
             row = _ROWS[type(message)]
             source = getattr(message, row.source) if row.source else sender
@@ -267,7 +380,6 @@ def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str =
             header = to_plain(message, what)
             if isinstance(message, StreamInfo) and message.label_set is not None:
                 header["label_set"] = to_plain(LabelSetForm.of(message.label_set), what)
-            _leave_out_zeros(header)
             return [topic_bytes(row.name, source), _pack(header, row.message, what)]
 
 
@@ -286,20 +398,16 @@ def encode_frame(
         CodecError: NaN in the pose, or a camera id that a topic cannot hold.
     """
     if encoded_rgb is None:
-        encoded_rgb_bytes, encoding = encode_rgb(frame.rgb, options.rgb, options.jpeg_quality), options.rgb
+        encoding, rgb = options.rgb, encode_rgb(frame.rgb, options.rgb, options.jpeg_quality)
     else:
-        encoded_rgb_bytes, encoding = encoded_rgb.data, encoded_rgb.encoding
-    buffers = [encoded_rgb_bytes]
-    depth = label = sigma = None
+        encoding, rgb = encoded_rgb.encoding, encoded_rgb.data
+    packed: dict[str, tuple[Wire, bytes]] = {"rgb": (RgbSpec(encoding, len(rgb)), rgb)}
     if frame.depth_m is not None:
-        depth, data = encode_depth(frame.depth_m, options)
-        buffers.append(data)
+        packed["depth"] = encode_depth(frame.depth_m, options.depth_scale)
     if frame.label is not None:
-        label, data = encode_label(frame.label, options)
-        buffers.append(data)
+        packed["label"] = encode_uint8(frame.label)
     if frame.depth_sigma_m is not None:
-        sigma, data = encode_depth(frame.depth_sigma_m, options)
-        buffers.append(data)
+        packed["depth_sigma"] = encode_depth(frame.depth_sigma_m, options.depth_scale)
     header = FrameHeader(
         stamp_ns=frame.stamp_ns,
         seq=frame.seq,
@@ -308,46 +416,42 @@ def encode_frame(
         T_world_camera=tuple(frame.T_world_camera.ravel().tolist()),
         pose_source=frame.pose_source,
         pose_sigma=float(frame.pose_sigma),
-        rgb=RgbSpec(encoding, len(encoded_rgb_bytes)),
-        depth=depth,
-        label=label,
-        depth_sigma=sigma,
-        pseudo_label=frame.label_is_pseudo and label is not None,
+        pseudo_label=frame.label_is_pseudo and frame.label is not None,
         world=int(frame.world),
+        **{name: cast(Any, spec) for name, (spec, _) in packed.items()},
     )
-    return [topic_bytes("frame", frame.camera_id), _pack_frame_header(header), *buffers]
+    return [topic_bytes("frame", frame.camera_id), _pack_struct(header), *(data for _, data in packed.values())]
 
 
-def with_label(parts: Parts, pseudo_label: UInt8 | None, options: CodecOptions = _DEFAULTS) -> list[bytes]:
+def with_label(parts: Parts, pseudo_label: UInt8 | None) -> list[bytes]:
     """A frame with a pseudo label (H, W), or none, in place of its label; all else stays, byte for byte.
 
     Raises:
         CodecError: no frame.
     """
-    packed = None if pseudo_label is None else encode_label(pseudo_label, options)
+    packed = None if pseudo_label is None else encode_uint8(pseudo_label)
     return _rebuilt(parts, {"label": packed}, pseudo_label=packed is not None)
 
 
-def with_computed_depth(
-    parts: Parts, depth_m: Float32, sigma_m: Float32, options: CodecOptions = _DEFAULTS
-) -> list[bytes]:
+def with_computed_depth(parts: Parts, depth_m: Float32, sigma_m: Float32) -> list[bytes]:
     """A frame with computed depth (H, W) and its one-sigma spread, in metres; all else stays, byte for byte.
 
     Raises:
         CodecError: no frame.
     """
-    return _rebuilt(parts, {"depth": encode_depth(depth_m, options), "depth_sigma": encode_depth(sigma_m, options)})
+    scale = _DEFAULTS.depth_scale
+    return _rebuilt(parts, {"depth": encode_depth(depth_m, scale), "depth_sigma": encode_depth(sigma_m, scale)})
 
 
 def _rebuilt(parts: Parts, images: Mapping[str, tuple[Wire, bytes] | None], **fields: Any) -> list[bytes]:
     """A frame with other images, by their fields in the header, and other fields; None = without the image."""
-    header, buffers = _open_frame(parts)
-    data = {name: bytes(buffer) for name, buffer in _named(header, buffers).items()}
+    header, buffers = _open_as(FrameHeader, parts)
+    data = {name: bytes(buffer) for name, buffer in _by_name(header, buffers).items()}
     for name, packed in images.items():
         fields[name], data[name] = (None, b"") if packed is None else packed
     header = msgspec.structs.replace(header, **fields)
-    there = [data[name] for name in _FRAME_BUFFERS if getattr(header, name) is not None]
-    return [bytes(parts[0]), _pack_frame_header(header), *there]
+    kept = [data[name] for name in FrameHeader.IMAGES if getattr(header, name) is not None]
+    return [bytes(parts[0]), _pack_struct(header), *kept]
 
 
 def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
@@ -356,7 +460,7 @@ def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
     Raises:
         CodecError: no frame, or its colour image is damaged.
     """
-    header, buffers = _open_frame(parts)
+    header, buffers = _open_as(FrameHeader, parts)
     if header.rgb.encoding == options.rgb:
         return [bytes(part) for part in parts]
     data = encode_rgb(_decode_rgb(header, buffers[0]), options.rgb, options.jpeg_quality)
@@ -369,22 +473,21 @@ def decode(parts: Parts) -> Message:
     Raises:
         CodecError: anything that ``encode`` would not have made.
     """
-    row, _ = read_topic(parts)
-    match row.name:
-        case "frame":
-            return _decode_frame(*_open_frame(parts))
-        case "map":
-            return _decode_map_update(*_open_map_update(parts))
-        case "keyframe":
-            header, frame = _open_keyframe(parts)
+    _, header, buffers = _open(parts)
+    match header:
+        case FrameHeader():
+            return _decode_frame(header, buffers)
+        case MapUpdateHeader():
+            return _decode_map_update(header, buffers)
+        case KeyframeHeader():
+            frame = _open_as(FrameHeader, buffers)
             return LabelledKeyframe(_decode_frame(*frame), header.label_set, header.teacher)
-        case "weights":
-            update = _open_weights(parts)
-            if digest_of(update.data) != update.digest:
-                raise CodecError(f"{_weights_name(update)}: the file is not the one that its digest names")
-            return update
+        case WeightsUpdate() if digest_of(header.data) != header.digest:
+            raise CodecError(
+                f"weights {header.version} of '{header.node}': the file is not the one that its digest names"
+            )
         case _:
-            return _open_plain(parts, row)
+            return header
 
 
 def decode_as(kind: type[MessageT], parts: Parts) -> MessageT:
@@ -407,25 +510,29 @@ def read_envelope(parts: Parts) -> Envelope:
     Raises:
         CodecError: not one of ours, or damaged.
     """
-    row, source = read_topic(parts)
-    match row.name:
-        case "frame":
-            header, _ = _open_frame(parts)
-            return _frame_envelope(row.name, header)
-        case "keyframe":
-            _, (header, _) = _open_keyframe(parts)
-            return _frame_envelope(row.name, header)
-        case "map":
-            update, _ = _open_map_update(parts)
-            where = {"world": update.world, "T_map_world": update.T_map_world or ()}
-            return Envelope(row.name, source, update.stamp_ns, update.seq, **where)
-        case "weights":
-            _open_weights(parts)
-            return Envelope(row.name, source)
-    message = _open_plain(parts, row)
-    if isinstance(message, FrameRefused):
-        return Envelope(row.name, source, message.stamp_ns, message.seq)
-    return Envelope(row.name, source, message.stamp_ns if isinstance(message, Status) else 0)
+    row, header, buffers = _open(parts)
+    _, source = read_topic(parts)
+    if isinstance(header, KeyframeHeader):
+        header, _ = _open_as(FrameHeader, buffers)
+    stamp_ns, seq, world = (getattr(header, name, 0) for name in ("stamp_ns", "seq", "world"))
+    if isinstance(header, MapUpdateHeader):
+        return Envelope(row.name, source, stamp_ns, seq, world=world, T_map_world=header.T_map_world or ())
+    if not isinstance(header, FrameHeader):
+        return Envelope(row.name, source, stamp_ns, seq)
+    return Envelope(
+        topic=row.name,
+        source=source,
+        stamp_ns=stamp_ns,
+        seq=seq,
+        T_world_camera=header.T_world_camera,
+        world=world,
+        has_depth=header.depth is not None,
+        has_label=header.label is not None,
+        rgb_encoding=header.rgb.encoding,
+        depth_scale=header.depth.scale if header.depth else 0.0,
+        has_computed_depth=header.depth_sigma is not None,
+        has_pseudo_label=header.pseudo_label and header.label is not None,
+    )
 
 
 def encode_request(kind: str, request: Request) -> list[bytes]:
@@ -501,87 +608,66 @@ def decode_answer(kind: str, answer: type[AnswerT], parts: Parts) -> AnswerT:
     return _decode_query(fields, specs, parts, answer, what)
 
 
-def _pack(header: Mapping[str, Any], kind: type[object], what: str) -> bytes:
+def _pack(header: dict[str, Any], kind: type[object], what: str) -> bytes:
     """A header, checked as its reader will check it."""
+    _leave_out_zeros(header)
     _read(header, kind, what)
     return pack_header(header, what)
 
 
-def _pack_frame_header(header: FrameHeader) -> bytes:
-    plain = to_plain(header, header.name)
-    _leave_out_zeros(plain)
-    return _pack(plain, FrameHeader, header.name)
+def _pack_struct(header: FrameHeader | MapUpdateHeader) -> bytes:
+    return _pack(to_plain(header, header.name), type(header), header.name)
 
 
 def _read(header: Mapping[str, Any], kind: type[WireT], what: str) -> WireT:
-    """Plain fields -> struct; intrinsics and label sets among them become what they are in Python."""
-    try:
-        restored = {
-            name: msgspec.convert(value, _FORMS[name]) if name in _FORMS else value for name, value in header.items()
-        }
-        if (lens := restored.get("intrinsics")) is not None:
-            restored["intrinsics"] = lens.to_intrinsics()
-        if (cameras := restored.get("cameras")) is not None:
-            restored["cameras"] = {name: lens.to_intrinsics(f"camera '{name}': ") for name, lens in cameras.items()}
-        if (labels := restored.get("label_set")) is not None:
-            restored["label_set"] = labels.to_label_set()
-    except ValueError as error:  # msgspec's, and those of the core types
-        raise CodecError(f"{what}: bad header: {error}") from error
-    return check_header(restored, kind, what)
+    """Plain fields -> struct; a label set among them becomes what it is in Python."""
+    if header.get("label_set") is not None and kind is not ErrorAnswer:
+        form = check_header(header["label_set"], LabelSetForm, f"{what}: label_set")
+        try:
+            header = {**header, "label_set": form.to_label_set()}
+        except errors.LabelError as error:
+            raise CodecError(f"{what}: bad header: {error}") from error
+    return check_header(header, kind, what)
 
 
-def _open(parts: Parts, name: str, kind: type[WireT]) -> WireT:
-    """Header of a message that must be of topic ``name``; its buffers are left alone."""
+def _open(parts: Parts) -> tuple[Topic, Any, Parts]:
+    """Row of the topic, header and buffers of any message; the sizes of the buffers are checked, not what is in them.
+
+    Of a keyframe the buffers are the parts of its frame; of weights the header is the message.
+    """
     row, source = read_topic(parts)
-    if row.name != name:
-        raise CodecError(f"expected a message of topic '{name}', got '{row.name}'")
-    what = f"{name} message"
-    header = _read(unpack_header(parts[1], what), kind, what)
-    _check_source(row, source, header)
-    return header
-
-
-def _check_source(row: Topic, source: str, header: object) -> None:
+    what = f"{row.name} message"
+    fields = unpack_header(parts[1], what)
+    if row.message is WeightsUpdate:  # the size of the file stands in the place of the file
+        size = check_header(fields.get("bytes"), cast("type[int]", _WeightsBytes), f"{what}: bytes")
+        (data,) = check_buffers(parts, [size], what)
+        fields["bytes"] = bytes(data)
+    header = cast(Any, _read(fields, _HEADERS.get(row.name, row.message), what))
     if row.source and getattr(header, row.source) != source:
         raise CodecError(f"topic '{row.name}/{source}/' carries a message of '{getattr(header, row.source)}'")
+    match header:
+        case FrameHeader() | MapUpdateHeader():
+            specs = [getattr(header, name) for name in header.IMAGES]
+            return row, header, check_buffers(parts, [s.bytes for s in specs if s is not None], header.name)
+        case KeyframeHeader():
+            return row, header, _open_keyframe(header, parts)
+        case WeightsUpdate():
+            return row, header, ()
+        case _:
+            return row, header, check_buffers(parts, (), what)
 
 
-def _open_plain(parts: Parts, row: Topic) -> Any:
-    """A message without buffers."""
-    message = _open(parts, row.name, row.message)
-    check_buffers(parts, (), f"{row.name} message")
-    return message
+def _open_as(kind: type[WireT], parts: Parts) -> tuple[WireT, Parts]:
+    row, header, buffers = _open(parts)
+    if not isinstance(header, kind):
+        raise CodecError(f"expected a {kind.__name__}, got the header of topic '{row.name}'")
+    return header, buffers
 
 
-def _open_frame(parts: Parts) -> tuple[FrameHeader, Parts]:
-    header = _open(parts, "frame", FrameHeader)
-    if header.depth_sigma is not None and header.depth is None:
-        raise CodecError(f"{header.name}: has a spread of its depth, and no depth")
-    specs = [getattr(header, name) for name in _FRAME_BUFFERS]
-    return header, check_buffers(parts, [s.bytes for s in specs if s is not None], header.name)
-
-
-def _named(header: FrameHeader, buffers: Parts) -> dict[str, Buffer]:
+def _by_name(header: FrameHeader, buffers: Parts) -> dict[str, Buffer]:
     """The buffers of a frame by the fields of its header."""
-    names = [name for name in _FRAME_BUFFERS if getattr(header, name) is not None]
+    names = [name for name in FrameHeader.IMAGES if getattr(header, name) is not None]
     return dict(zip(names, buffers, strict=True))
-
-
-def _frame_envelope(topic: str, header: FrameHeader) -> Envelope:
-    return Envelope(
-        topic=topic,
-        source=header.camera_id,
-        stamp_ns=header.stamp_ns,
-        seq=header.seq,
-        T_world_camera=header.T_world_camera,
-        world=header.world,
-        has_depth=header.depth is not None,
-        has_label=header.label is not None,
-        rgb_encoding=header.rgb.encoding,
-        depth_scale=header.depth.scale if header.depth and header.depth.encoding == "u16_delta_planes_zstd" else 0.0,
-        has_computed_depth=header.depth_sigma is not None,
-        has_pseudo_label=header.pseudo_label and header.label is not None,
-    )
 
 
 def _decode_rgb(header: FrameHeader, buffer: Buffer) -> UInt8:
@@ -592,7 +678,7 @@ def _decode_rgb(header: FrameHeader, buffer: Buffer) -> UInt8:
 
 
 def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
-    size, what, data = header.size, header.name, _named(header, buffers)
+    size, what, data = header.size, header.name, _by_name(header, buffers)
     sigma = header.depth_sigma
     return PosedFrame(
         stamp_ns=header.stamp_ns,
@@ -600,7 +686,7 @@ def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
         camera_id=header.camera_id,
         rgb=_decode_rgb(header, data["rgb"]),
         depth_m=None if header.depth is None else decode_depth(header.depth, data["depth"], size, what),
-        label=None if header.label is None else decode_label(data["label"], size, what),
+        label=None if header.label is None else decode_uint8(data["label"], size, f"{what}: label"),
         intrinsics=header.intrinsics,
         T_world_camera=np.array(header.T_world_camera, np.float64).reshape(4, 4),
         pose_source=header.pose_source,
@@ -614,43 +700,39 @@ def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
 def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
     height, width = update.label.shape
     what = f"map of camera '{update.camera_id}' seq={update.seq}"
-    if update.confidence.shape != (height, width) or update.depth_m.shape != (height, width):
-        raise CodecError(
-            f"{what}: label {update.label.shape}, confidence {update.confidence.shape} and depth_m "
-            f"{update.depth_m.shape} must have one size"
-        )
-    label_spec, label = encode_label(update.label, options)
-    confidence_spec, confidence = encode_confidence(update.confidence, options)
-    depth_spec, depth = encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options)
-    fields = {name: getattr(update, name) for name in MapUpdateHeader.__struct_fields__ if name in _UPDATE_SCALARS}
-    specs = {"label": label_spec, "confidence": confidence_spec, "depth": depth_spec}
-    buffers = [label, confidence, depth]
-    if update.moving is not None and update.moving.shape != (height, width):
-        raise CodecError(f"{what}: moving {update.moving.shape} must have the size of label, {update.label.shape}")
+    images = {"confidence": update.confidence, "depth_m": update.depth_m, "moving": update.moving}
+    for name, image in images.items():
+        if image is not None and image.shape != (height, width):
+            raise CodecError(f"{what}: {name} {image.shape} must have the size of label, {update.label.shape}")
+    if not bool(np.all((update.confidence >= 0) & (update.confidence <= 1 + 1e-5))):
+        raise CodecError(f"{what}: confidence must lie in [0, 1]")
+    packed: dict[str, tuple[Wire, bytes]] = {
+        "label": encode_uint8(update.label),
+        "confidence": encode_uint8(np.rint(np.minimum(update.confidence, 1) * 255).astype(np.uint8)),
+        "depth": encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options.depth_scale),
+    }
     if update.moving is not None and update.moving.any():
-        specs["moving"], data = encode_label(update.moving.astype(np.uint8), options)
-        buffers.append(data)
-    T = None if np.array_equal(update.T_map_world, np.eye(4)) else tuple(update.T_map_world.ravel().tolist())
-    header = to_plain(MapUpdateHeader(width=width, height=height, T_map_world=T, **fields, **specs), what)
-    _leave_out_zeros(header)
-    return [topic_bytes("map", update.camera_id), _pack(header, MapUpdateHeader, what), *buffers]
-
-
-def _open_map_update(parts: Parts) -> tuple[MapUpdateHeader, Parts]:
-    header = _open(parts, "map", MapUpdateHeader)
-    specs = (header.label, header.confidence, header.depth, header.moving)
-    return header, check_buffers(parts, [s.bytes for s in specs if s is not None], header.name)
+        packed["moving"] = encode_uint8(update.moving.astype(np.uint8))
+    header = MapUpdateHeader(
+        width=width,
+        height=height,
+        T_map_world=None
+        if np.array_equal(update.T_map_world, np.eye(4))
+        else tuple(update.T_map_world.ravel().tolist()),
+        **{name: getattr(update, name) for name in _UPDATE_SCALARS},
+        **{name: cast(Any, spec) for name, (spec, _) in packed.items()},
+    )
+    return [topic_bytes("map", update.camera_id), _pack_struct(header), *(data for _, data in packed.values())]
 
 
 def _decode_map_update(header: MapUpdateHeader, buffers: Parts) -> MapUpdate:
-    size, what = (header.height, header.width), header.name
+    size, what, T = (header.height, header.width), header.name, header.T_map_world
     label, confidence, depth, *moving = buffers
-    T = header.T_map_world
     return MapUpdate(
-        label=decode_label(label, size, what),
-        confidence=decode_confidence(header.confidence, confidence, size, what),
+        label=decode_uint8(label, size, f"{what}: label"),
+        confidence=decode_uint8(confidence, size, f"{what}: confidence").astype(np.float32) / np.float32(255),
         depth_m=decode_depth(header.depth, depth, size, what),
-        moving=decode_label(moving[0], size, what) > 0 if moving else None,
+        moving=decode_uint8(moving[0], size, f"{what}: moving") > 0 if moving else None,
         T_map_world=np.eye(4) if T is None else np.array(T, np.float64).reshape(4, 4),
         **{name: getattr(header, name) for name in _UPDATE_SCALARS},
     )
@@ -664,27 +746,23 @@ def _encode_keyframe(keyframe: LabelledKeyframe, options: CodecOptions) -> list[
     _check_keyframe_size(frame.intrinsics, (), what)
     labels = to_plain(LabelSetForm.of(keyframe.label_set), what)
     header = {"camera_id": frame.camera_id, "teacher": keyframe.teacher, "label_set": labels}
-    parts = [
-        topic_bytes("keyframe", frame.camera_id),
-        _pack(header, KeyframeHeader, what),
-        *encode_frame(frame, options)[1:],
-    ]
+    packed = _pack(header, KeyframeHeader, what)
+    parts = [topic_bytes("keyframe", frame.camera_id), packed, *encode_frame(frame, options)[1:]]
     _check_keyframe_size(frame.intrinsics, parts, what)
     return parts
 
 
-def _open_keyframe(parts: Parts) -> tuple[KeyframeHeader, tuple[FrameHeader, Parts]]:
-    """Its header, and that of its frame with buffers."""
-    header = _open(parts, "keyframe", KeyframeHeader)
+def _open_keyframe(header: KeyframeHeader, parts: Parts) -> Parts:
+    """The parts of its frame, whose header and sizes are checked."""
     inner = [topic_bytes("frame", header.camera_id), *parts[2:]]
     if len(inner) < 2:
         raise CodecError(f"keyframe of camera '{header.camera_id}': has no frame")
-    frame, buffers = _open_frame(inner)
+    frame, _ = _open_as(FrameHeader, inner)
     what = f"keyframe of camera '{frame.camera_id}' seq={frame.seq}"
     if frame.label is None:
         raise CodecError(f"{what}: has no label image")
     _check_keyframe_size(frame.intrinsics, parts, what)
-    return header, (frame, buffers)
+    return inner
 
 
 def _check_keyframe_size(lens: CameraIntrinsics, parts: Parts, what: str) -> None:
@@ -694,31 +772,6 @@ def _check_keyframe_size(lens: CameraIntrinsics, parts: Parts, what: str) -> Non
         raise CodecError(f"{what}: image of {width}x{height}; a keyframe has at most {MAX_KEYFRAME_PIXELS} pixels")
     if size > MAX_KEYFRAME_BYTES:
         raise CodecError(f"{what}: {size} bytes in all; a keyframe has at most {MAX_KEYFRAME_BYTES}")
-
-
-def _weights_name(update: WeightsUpdate) -> str:
-    return f"weights {update.version} of '{update.node}'"
-
-
-def _encode_weights(update: WeightsUpdate) -> list[bytes]:
-    what = _weights_name(update)
-    if len(update.data) > MAX_WEIGHTS_BYTES:
-        raise CodecError(f"{what}: a file of {len(update.data)} bytes; at most {MAX_WEIGHTS_BYTES} can be sent")
-    header = to_plain(update, what)
-    _read(header, WeightsUpdate, what)
-    packed = pack_header({**header, "bytes": len(update.data)}, what)
-    return [topic_bytes("weights", update.node), packed, update.data]
-
-
-def _open_weights(parts: Parts) -> WeightsUpdate:
-    """In the header stands the size of the file; whether the file is that of the digest is not checked."""
-    row, source = read_topic(parts)
-    fields = unpack_header(parts[1], "weights message")
-    size = check_header(fields.get("bytes"), cast("type[int]", _WeightsBytes), "weights message: bytes")
-    (data,) = check_buffers(parts, [size], "weights message")
-    update = _read({**fields, "bytes": bytes(data)}, WeightsUpdate, "weights message")
-    _check_source(row, source, update)
-    return update
 
 
 def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list[bytes], tuple[ArraySpec, ...]]:
@@ -733,7 +786,7 @@ def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list
         if array.nbytes > MAX_PART_BYTES:  # before it is copied; the rest is checked when all are there
             raise CodecError(f"{what}: {name} of {array.nbytes} bytes, at most {MAX_PART_BYTES} can be sent")
         data = array.tobytes()
-        buffers.append(zstd_compress(data, _ZSTD_LEVEL) if form.is_compressed else data)
+        buffers.append(zstd_compress(data) if form.is_compressed else data)
         specs.append(ArraySpec(array.shape, len(buffers[-1])))
     _check_specs(forms, specs, what)
     scalars = {name: getattr(message, name) for name in message.__struct_fields__ if name not in forms}

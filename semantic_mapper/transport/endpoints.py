@@ -22,7 +22,7 @@ import zmq
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import open_unlinked
-from semantic_mapper.transport.security import Keys, ServerIdentity
+from semantic_mapper.transport.keys import Keys, ServerIdentity
 
 _umask_lock = threading.Lock()
 _MAX_IPC_PATH = 100  # the kernel takes 107 bytes, lock suffix aside

@@ -1,32 +1,37 @@
 """Images of messages as buffers: colour, depth, labels, confidence; and how the header says each is packed.
 
-Of colour images size and completeness are read from the file's own marks before decoding.
+Depth and labels are packed without loss: differences along rows, byte planes, zstd. Sizes are checked before anything
+is decoded; of colour images they, and whether the file is complete, are read from the file's own marks.
 """
 
 from __future__ import annotations
 
+import math
 import struct
+import threading
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+import zstandard
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError
-from semantic_mapper.transport import compression
-from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.transport.headers import PartBytes, Wire
+from semantic_mapper.transport.messages import Buffer, PartBytes, Wire
 from semantic_mapper.types import Float32, UInt8
 
 ImageEncoding = Literal["raw", "png", "jpeg"]
 
+_ZSTD_LEVEL = 1  # ten times faster than PNG on depth
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start-of-frame marks; the three are tables
 _JPEG_SCAN, _JPEG_END = 0xDA, b"\xff\xd9"
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # poses belong to the pixels as stored, not as turned by EXIF
+_thread = threading.local()  # zstd contexts must not be shared between threads, and cost too much to make each time
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,19 +41,13 @@ class CodecOptions:
     Args:
         rgb: "png" (lossless, small), "raw" (lossless, fast), "jpeg" (lossy).
         jpeg_quality: 1 to 100.
-        depth: "auto": uint16 where ``depth_m`` is exactly uint16 / ``depth_scale``, else float32, both compressed and
-            both bit exact; "raw": float32 as it is.
-        depth_scale: Units a metre tried by "auto".
-        confidence: Of map updates; "u8" rounds to the nearest 1/255, "f32" is exact.
-        zstd_level: 1 is ten times faster than PNG on depth.
+        depth_scale: Units a metre: depth that is exactly uint16 / ``depth_scale`` is sent as these units, other depth
+            as float32; either way it is bit exact.
     """
 
     rgb: ImageEncoding = "png"
     jpeg_quality: int = 92
-    depth: Literal["auto", "raw"] = "auto"
     depth_scale: float = 1000.0
-    confidence: Literal["u8", "f32"] = "u8"
-    zstd_level: int = 1
 
 
 class RgbSpec(Wire, frozen=True):
@@ -61,32 +60,113 @@ class RgbSpec(Wire, frozen=True):
 class DepthSpec(Wire, frozen=True):
     """How a depth buffer is packed; ``scale`` in units a metre for uint16, else 0."""
 
-    encoding: Literal["f32", "f32_planes_zstd", "u16_delta_planes_zstd"]
+    encoding: Literal["f32_planes_zstd", "u16_delta_planes_zstd"]
     bytes: PartBytes
     scale: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
 
 
-class LabelSpec(Wire, frozen=True):
-    """How a label buffer is packed."""
+class Uint8Spec(Wire, frozen=True):
+    """How a buffer of class ids, of a mask or of confidence in 255ths is packed."""
 
     encoding: Literal["u8_zstd"]
     bytes: PartBytes
 
 
-class ConfidenceSpec(Wire, frozen=True):
-    """How a confidence buffer is packed; "u8_zstd" rounds to the nearest 1/255."""
+def zstd_compress(data: Buffer) -> bytes:
+    """Compress; the size stands in the result, which ``zstd_decompress`` relies on."""
+    compressor: zstandard.ZstdCompressor | None = getattr(_thread, "compressor", None)
+    if compressor is None:
+        compressor = _thread.compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL, write_content_size=True)
+    return compressor.compress(data)
 
-    encoding: Literal["u8_zstd", "f32_planes_zstd"]
-    bytes: PartBytes
+
+def zstd_decompress(data: Buffer, size: int, what: str) -> bytes:
+    """Decompress exactly ``size`` bytes.
+
+    Raises:
+        CodecError: damaged, or not of that size.
+    """
+    try:
+        announced = zstandard.frame_content_size(data)
+        if announced != size:
+            raise CodecError(f"{what}: compressed data announce {announced} bytes, the header means {size}")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
+    except (zstandard.ZstdError, ValueError) as error:
+        if isinstance(error, CodecError):
+            raise
+        raise CodecError(f"{what}: cannot be decompressed: {error}") from error
 
 
-def encode_depth(depth_m: Float32, options: CodecOptions) -> tuple[DepthSpec, bytes]:
-    """Depth (H, W) -> how it is packed, and the bytes; always bit exact."""
-    if options.depth == "raw":
-        data = np.ascontiguousarray(depth_m, "<f4").tobytes()
-        return DepthSpec("f32", len(data)), data
-    scale, data = compression.pack_depth(depth_m, (options.depth_scale,), options.zstd_level)
-    return DepthSpec("u16_delta_planes_zstd" if scale else "f32_planes_zstd", len(data), float(scale)), data
+def depth_from_uint16(raw: NDArray[np.uint16], scale: float) -> Float32:
+    """Sensor units -> metres, ``raw / scale`` in float32. Every importer and driver must use this one.
+
+    Args:
+        raw: (H, W) uint16, 0 = no measurement.
+        scale: Units a metre, e.g. 1000.
+    """
+    return raw.astype(np.float32) / np.float32(scale)
+
+
+def depth_to_uint16(depth_m: Float32, scale: float) -> NDArray[np.uint16] | None:
+    """The sensor units that give exactly ``depth_m`` back, bit for bit; None where there are none."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        raw = np.rint(depth_m * np.float32(scale))
+        if not bool(np.all((raw >= 0) & (raw <= 65535))):  # NaN compares False
+            return None
+    units = raw.astype(np.uint16)
+    metres = depth_from_uint16(units, scale)
+    same = np.array_equal(metres.view(np.uint32), np.ascontiguousarray(depth_m).view(np.uint32))
+    return units if same else None
+
+
+def pack_depth(depth_m: Float32, *scales: float) -> tuple[float, bytes]:
+    """(H, W) float32 metres -> the first of the scales whose units give exactly these metres, and the packed units.
+
+    Where no scale does, 0 and the packed floats. Either way it is bit exact, NaN included.
+    """
+    for scale in scales:
+        units = depth_to_uint16(depth_m, scale)
+        if units is not None:
+            delta = units.copy()
+            delta[:, 1:] -= units[:, :-1]  # modulo 2^16, undone exactly by the running sum
+            planes = delta.astype("<u2", copy=False).view(np.uint8).reshape(-1, 2).T  # low bytes before high bytes
+            return scale, zstd_compress(planes.tobytes())
+    return 0.0, pack_float32(depth_m)
+
+
+def unpack_depth(data: Buffer, scale: float, size: tuple[int, int], what: str) -> Float32:
+    """Inverse of ``pack_depth``.
+
+    Raises:
+        CodecError: damaged, or not of ``size`` (height, width).
+    """
+    if scale == 0:
+        return unpack_float32(data, size, what)
+    planes = np.frombuffer(zstd_decompress(data, 2 * size[0] * size[1], what), np.uint8).reshape(2, *size)
+    delta = planes[0] | (planes[1].astype(np.uint16) << 8)
+    return depth_from_uint16(np.cumsum(delta, axis=1, dtype=np.uint16), scale)
+
+
+def pack_float32(values: Float32) -> bytes:
+    """Float32 of any shape -> four byte planes, zstd. Bit exact, NaN included."""
+    planes = np.ascontiguousarray(values, dtype="<f4").view(np.uint8).reshape(-1, 4).T
+    return zstd_compress(planes.tobytes())
+
+
+def unpack_float32(data: Buffer, shape: tuple[int, ...], what: str) -> Float32:
+    """Inverse of ``pack_float32``.
+
+    Raises:
+        CodecError: damaged, or not of that shape.
+    """
+    planes = np.frombuffer(zstd_decompress(data, 4 * math.prod(shape), what), np.uint8).reshape(4, -1)
+    return np.ascontiguousarray(planes.T).view("<f4").reshape(shape).astype(np.float32, copy=False)
+
+
+def encode_depth(depth_m: Float32, scale: float) -> tuple[DepthSpec, bytes]:
+    """Depth (H, W) in metres -> how it is packed, and the bytes; see ``pack_depth``."""
+    used, data = pack_depth(depth_m, scale)
+    return DepthSpec("u16_delta_planes_zstd" if used else "f32_planes_zstd", len(data), float(used)), data
 
 
 def decode_depth(spec: DepthSpec, data: Buffer, size: tuple[int, int], what: str) -> Float32:
@@ -95,58 +175,25 @@ def decode_depth(spec: DepthSpec, data: Buffer, size: tuple[int, int], what: str
     Raises:
         CodecError: damaged, or not of ``size`` (height, width).
     """
-    what = f"{what}: depth"
-    if spec.encoding == "f32":
-        if len(data) != 4 * size[0] * size[1]:
-            raise CodecError(f"{what}: {size[1]}x{size[0]} needs {4 * size[0] * size[1]} bytes, got {len(data)}")
-        return np.frombuffer(data, "<f4").reshape(size).astype(np.float32)
-    if spec.encoding == "f32_planes_zstd":
-        return compression.unpack_depth(data, 0.0, *size, what)
-    if np.float32(spec.scale) <= 0:
-        raise CodecError(f"{what}: scale must be positive, got {spec.scale}")
-    return compression.unpack_depth(data, spec.scale, *size, what)
+    units = spec.encoding == "u16_delta_planes_zstd"
+    if units and np.float32(spec.scale) <= 0:
+        raise CodecError(f"{what}: scale of depth must be positive, got {spec.scale}")
+    return unpack_depth(data, spec.scale if units else 0.0, size, f"{what}: depth")
 
 
-def encode_label(label: UInt8, options: CodecOptions) -> tuple[LabelSpec, bytes]:
-    """Class ids (H, W) -> how they are packed, and the bytes."""
-    data = compression.pack_uint8(label, options.zstd_level)
-    return LabelSpec("u8_zstd", len(data)), data
+def encode_uint8(image: UInt8) -> tuple[Uint8Spec, bytes]:
+    """Class ids or a mask (H, W) -> how they are packed, and the bytes."""
+    data = zstd_compress(np.ascontiguousarray(image).tobytes())
+    return Uint8Spec("u8_zstd", len(data)), data
 
 
-def decode_label(data: Buffer, size: tuple[int, int], what: str) -> UInt8:
-    """Inverse of ``encode_label``.
+def decode_uint8(data: Buffer, size: tuple[int, int], what: str) -> UInt8:
+    """Inverse of ``encode_uint8``: (H, W).
 
     Raises:
         CodecError: damaged, or not of ``size`` (height, width).
     """
-    return compression.unpack_uint8(data, *size, f"{what}: label")
-
-
-def encode_confidence(confidence: Float32, options: CodecOptions) -> tuple[ConfidenceSpec, bytes]:
-    """Confidence (H, W) -> how it is packed, and the bytes.
-
-    Raises:
-        CodecError: "u8" cannot hold values outside [0, 1].
-    """
-    if options.confidence == "f32":
-        data = compression.pack_float32(confidence, options.zstd_level)
-        return ConfidenceSpec("f32_planes_zstd", len(data)), data
-    if not bool(np.all((confidence >= 0) & (confidence <= 1 + 1e-5))):
-        raise CodecError("confidence must lie in [0, 1]; send it as float32 if it may be anything else")
-    data = compression.pack_uint8(np.rint(np.minimum(confidence, 1) * 255).astype(np.uint8), options.zstd_level)
-    return ConfidenceSpec("u8_zstd", len(data)), data
-
-
-def decode_confidence(spec: ConfidenceSpec, data: Buffer, size: tuple[int, int], what: str) -> Float32:
-    """Inverse of ``encode_confidence``.
-
-    Raises:
-        CodecError: damaged, or not of ``size`` (height, width).
-    """
-    what = f"{what}: confidence"
-    if spec.encoding == "f32_planes_zstd":
-        return compression.unpack_float32(data, *size, what)
-    return compression.unpack_uint8(data, *size, what).astype(np.float32) / np.float32(255)
+    return np.frombuffer(zstd_decompress(data, size[0] * size[1], what), np.uint8).reshape(size).copy()
 
 
 def encode_rgb(rgb: UInt8, encoding: ImageEncoding, jpeg_quality: int) -> bytes:

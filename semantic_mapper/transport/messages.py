@@ -1,37 +1,53 @@
-"""What travels on topics: one struct a message, whose types say what its fields may hold. ``codec`` makes bytes of it.
+"""What travels: limits, types of header fields, one struct a message, and the one table of topics.
 
-``PosedFrame`` and ``MapUpdate`` travel, too; they are core types (``semantic_mapper.types``). Bounds are checked when a
-message is sent and when one is received.
+``codec`` makes bytes of messages. ``PosedFrame`` and ``MapUpdate`` are messages, too; they are core types
+(``semantic_mapper.types``). Bounds are checked when a message is sent and when one is received. A topic on the wire is
+``name/source/``, so that a subscription matches whole words only.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 from msgspec.structs import force_setattr
 
+from semantic_mapper.errors import CodecError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.transport.framing import MAX_KEYFRAME_PIXELS, Buffer
-from semantic_mapper.transport.headers import (
-    MAX_COUNT,
-    MAX_HEADER_BYTES,
-    Count,
-    Digest,
-    Finite,
-    Sentence,
-    Source,
-    Stamp,
-    UnitInterval,
-    Wire,
-    Word,
-)
-from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
+from semantic_mapper.types import MAX_PIXELS, MAX_SIDE, MAX_STAMP_NS, CameraIntrinsics, MapUpdate, PosedFrame
+
+Buffer = bytes | bytearray | memoryview
+Parts = Sequence[Buffer]
+
+MAX_PARTS = 8
+MAX_KEYFRAME_PIXELS = 1 << 23  # 4096 x 2048: dozens of them are kept while a finetuner learns
+MAX_PART_BYTES = 4 * MAX_PIXELS + (1 << 16)  # one float32 image and some room for a codec's overhead
+MAX_HEADER_BYTES = 1 << 18
+MAX_TOPIC_BYTES = 96
+MAX_ENTRIES = 1024  # of one list in a header
+
+SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # camera ids and node names, as they stand in topics
+Source = Annotated[str, Meta(pattern=SOURCE_PATTERN)]
+Stamp = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+CaptureStamp = Annotated[int, Meta(ge=0, le=MAX_STAMP_NS)]
+MAX_COUNT = 2**63 - 1
+Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
+Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
+PartBytes = Annotated[int, Meta(ge=0, le=MAX_PART_BYTES)]
+Word = Annotated[str, Meta(max_length=128)]
+Sentence = Annotated[str, Meta(max_length=4096)]
+ClassId = Annotated[int, Meta(ge=0, le=255)]
+Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]  # SHA-256
+# Every number of a header is of this type or has bounds of its own: NaN and infinity are refused by comparison.
+Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+UnitInterval = Annotated[float, Meta(ge=0, le=1)]
 
 NodeState = Literal["starting", "running", "degraded", "stopping", "ended"]
 EndReason = Literal["end", "stopped", "error"]
@@ -45,6 +61,41 @@ _MAX_NUMBERS, _MAX_SENTENCES = 256, 64  # of a status
 # Metadata of a stream whose lengths are not metres, as poses from pictures alone give them; without it they are.
 SCALE_KEY, SCALE_UNKNOWN = "scale", "unknown"
 SCENE_DEPTH_KEY = "scene_depth"  # median depth of what poses from pictures were found by, in the unit of the poses
+
+
+class Wire(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all structs that travel."""
+
+
+class ClassForm(Wire, frozen=True):
+    """One class of a label set."""
+
+    id: ClassId
+    name: Word
+    color: tuple[ClassId, ClassId, ClassId]
+
+
+class LabelSetForm(Wire, frozen=True):
+    """``LabelSet`` in a header."""
+
+    name: Word
+    classes: Annotated[tuple[ClassForm, ...], Meta(min_length=1, max_length=256)]
+    ignore_id: ClassId
+
+    @classmethod
+    def of(cls, labels: LabelSet) -> LabelSetForm:
+        """A label set as it travels."""
+        classes = tuple(map(ClassForm, labels.ids, labels.names, labels.colors))
+        return cls(labels.name, classes, labels.ignore_id)
+
+    def to_label_set(self) -> LabelSet:
+        """The core type.
+
+        Raises:
+            LabelError: a class or id twice, or a class that is the ignore id.
+        """
+        ids, names, colors = zip(*((c.id, c.name, c.color) for c in self.classes), strict=True)
+        return LabelSet(self.name, ids, names, colors, self.ignore_id)
 
 
 class StreamInfo(Wire, frozen=True):
@@ -233,3 +284,84 @@ def _finite(number: float) -> float:
 def digest_of(data: Buffer) -> str:
     """SHA-256, hexadecimal."""
     return hashlib.sha256(data).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One kind of message.
+
+    Args:
+        name: First word of the topic on the wire.
+        message: Type of the decoded message.
+        source: Field of the header that is the second word of the topic; empty where any sender may stand there.
+        logged: Whether the recorder keeps it.
+        queue: "newest": an unread message gives way to a newer one of the same source; "all": nothing is dropped.
+        latched: The last one is sent again to every new subscriber.
+        closes: Topic of what it ends: its latched message comes after that one's, and holds until there is a new one.
+    """
+
+    name: str
+    message: type[Message]
+    source: str
+    logged: bool
+    queue: Literal["newest", "all"]
+    latched: bool = False
+    closes: str = ""
+
+
+TOPICS = {
+    topic.name: topic
+    for topic in (
+        Topic("info", StreamInfo, "", logged=True, queue="all", latched=True),
+        Topic("frame", PosedFrame, "camera_id", logged=True, queue="newest"),
+        Topic("end", EndOfStream, "source", logged=False, queue="all", latched=True, closes="info"),
+        Topic("map", MapUpdate, "camera_id", logged=False, queue="newest"),
+        Topic("refused", FrameRefused, "camera_id", logged=True, queue="all"),
+        Topic("status", Status, "node", logged=True, queue="newest", latched=True),
+        Topic("keyframe", LabelledKeyframe, "camera_id", logged=False, queue="all"),
+        Topic("weights", WeightsUpdate, "node", logged=False, queue="all", latched=True),
+        Topic("in_use", WeightsInUse, "node", logged=False, queue="all", latched=True),
+    )
+}
+
+
+def topic_bytes(name: str, source: str) -> bytes:
+    """Topic as it stands on the wire, ``name/source/``.
+
+    Raises:
+        CodecError: the source has characters that a topic cannot hold.
+    """
+    if not re.match(SOURCE_PATTERN, source):
+        raise CodecError(
+            f"'{source}' cannot be the name of a camera or node: use 1 to 64 letters, digits and any of _ . : -"
+        )
+    return f"{name}/{source}/".encode()
+
+
+def subscription(name: str, source: str | None = None) -> bytes:
+    """Prefix that matches all messages of a topic, or those of one source."""
+    return f"{name}/".encode() if source is None else topic_bytes(name, source)
+
+
+def parse_topic(topic: bytes) -> tuple[Topic, str]:
+    """Topic on the wire -> its row of the table and the source.
+
+    Raises:
+        CodecError: not one of ours.
+    """
+    if len(topic) <= MAX_TOPIC_BYTES:
+        words = topic.decode("ascii", errors="replace").split("/")
+        if len(words) == 3 and words[0] in TOPICS and re.match(SOURCE_PATTERN, words[1]) and not words[2]:
+            return TOPICS[words[0]], words[1]
+    raise CodecError(f"unknown topic {topic[:40]!r}; topics read '<name>/<source>/' with a name of {', '.join(TOPICS)}")
+
+
+def read_topic(parts: Parts) -> tuple[Topic, str]:
+    """Topic and source of a message.
+
+    Raises:
+        CodecError: too few or too many parts, or an unknown topic.
+    """
+    if not 2 <= len(parts) <= MAX_PARTS:
+        raise CodecError(f"a message has 2 to {MAX_PARTS} parts, got {len(parts)}")
+    return parse_topic(bytes(parts[0][: MAX_TOPIC_BYTES + 1]))

@@ -22,16 +22,8 @@ from msgspec import Meta
 
 from semantic_mapper.errors import CodecError
 from semantic_mapper.geometry import pose_matrix
-from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.transport.headers import (
-    CaptureStamp,
-    Finite,
-    Wire,
-    check_header,
-    pack_header,
-    to_plain,
-    unpack_header,
-)
+from semantic_mapper.transport.codec import check_header, pack_header, to_plain, unpack_header
+from semantic_mapper.transport.messages import Buffer, CaptureStamp, Finite, Wire
 from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64
 
 MAX_POSE_BYTES = 2048

@@ -12,9 +12,9 @@ import zmq
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.transport.codec import encode_error
 from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
-from semantic_mapper.transport.framing import MAX_PART_BYTES, MAX_PARTS, Buffer
-from semantic_mapper.transport.receiving import receive_bounded
-from semantic_mapper.transport.security import Keys, ServerIdentity, secure_client, secure_server
+from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
+from semantic_mapper.transport.messages import MAX_PART_BYTES, MAX_PARTS, Buffer
+from semantic_mapper.transport.sockets import receive_bounded
 
 MAX_REQUEST_BYTES = 1 << 23  # of a part; who sends more is cut off. Twice that of all parts
 _ENVELOPE_PARTS = 2  # who asks, and the empty part that REQ sockets put first

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import threading
 import time
@@ -9,21 +10,32 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Literal
+from typing import Literal, cast
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.codec import decode, read_envelope
-from semantic_mapper.transport.connections import Connections
 from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
-from semantic_mapper.transport.framing import MAX_PART_BYTES, Parts
-from semantic_mapper.transport.messages import Message
-from semantic_mapper.transport.receiving import max_bytes, receive_bounded
-from semantic_mapper.transport.security import Keys, ServerIdentity, secure_client, secure_server
-from semantic_mapper.transport.topics import TOPICS, Topic, subscription
+from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
+from semantic_mapper.transport.messages import (
+    MAX_HEADER_BYTES,
+    MAX_KEYFRAME_BYTES,
+    MAX_PART_BYTES,
+    MAX_PARTS,
+    MAX_WEIGHTS_BYTES,
+    TOPICS,
+    Message,
+    Parts,
+    Topic,
+    subscription,
+)
+from semantic_mapper.types import MAX_PIXELS
 
+MAX_MESSAGE_BYTES = 10 * MAX_PIXELS + 2 * MAX_HEADER_BYTES  # a frame's colours, depth and labels, none packed
+_OF_TOPIC = {"keyframe": MAX_KEYFRAME_BYTES, "weights": MAX_WEIGHTS_BYTES + 2 * MAX_HEADER_BYTES}
 SYNC_PREFIX = b"sync/"  # a subscription to sync/TOKEN/ is answered by that very topic: "I have heard you"
 _PUMP_PERIOD_S = 0.02
 _SEND_SLICE_MS = 100
@@ -34,8 +46,40 @@ _POLL_MS = 50
 # A machine that is gone is found out within 5 s; a process that is gone at once, by the kernel.
 _KEEPALIVE = ((zmq.TCP_KEEPALIVE_IDLE, 2), (zmq.TCP_KEEPALIVE_INTVL, 1), (zmq.TCP_KEEPALIVE_CNT, 3))
 _MAX_SLOTS = 256  # cameras and nodes that a mailbox serves; an unknown client's invented ones stop here
+_GIVEN_UP_S = 0.3  # ZeroMQ says at once whether it tries again
+_TRIES_AGAIN = (zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED)
+_EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_TRIES_AGAIN)
+
 
 log = get_logger(__name__)
+
+
+def max_bytes(topic: str) -> int:
+    """What a message of a topic, or of one that begins so, may take, all of its parts together."""
+    return _OF_TOPIC.get(topic.partition("/")[0], MAX_MESSAGE_BYTES)
+
+
+def receive_bounded(
+    socket: zmq.Socket[bytes], *, max_parts: int = MAX_PARTS, max_bytes: int = MAX_MESSAGE_BYTES, flags: int = 0
+) -> tuple[list[bytes], str]:
+    """The next message, all of which is taken off the socket.
+
+    Returns:
+        Its parts and an empty text; of a message beyond the limits those before the first that is too much, and why.
+
+    Raises:
+        zmq.Again: there is none, and the flags say not to wait.
+    """
+    parts: list[bytes] = []
+    count = size = 0
+    while not count or socket.getsockopt(zmq.RCVMORE):
+        part = cast(bytes, socket.recv(flags))
+        count, size = count + 1, size + len(part)
+        if count <= max_parts and size <= max_bytes:
+            parts.append(part)
+    if len(parts) == count:
+        return parts, ""
+    return parts, f"{count} parts of {size} bytes in all; a message has at most {max_parts} and {max_bytes} bytes"
 
 
 class Publisher:
@@ -605,3 +649,61 @@ def _prefix(topic: str) -> bytes:
     if name not in TOPICS:
         raise CodecError(f"no topic '{name}'; there are {', '.join(TOPICS)}")
     return subscription(name, source or None)
+
+
+class Connections:
+    """Watches the connections that a socket makes. To be used by the thread that uses the socket.
+
+    Args:
+        socket: Not connected yet.
+    """
+
+    def __init__(self, socket: zmq.Socket[bytes]) -> None:
+        self._socket = socket
+        address = f"inproc://connections-{uuid.uuid4().hex}"
+        socket.monitor(address, _EVENTS)
+        self._monitor = socket.context.socket(zmq.PAIR)
+        self._monitor.setsockopt(zmq.LINGER, 0)
+        self._monitor.setsockopt(zmq.RCVHWM, 0)  # ZeroMQ's own thread would wait for us
+        self._monitor.connect(address)
+        self._lost: dict[str, float] = {}  # connections that are not tried again, and since when
+        self._count = 0
+        self.renewed = 0
+
+    def connected(self) -> int:
+        """How many publishers are connected right now; falls at once when one dies."""
+        self._listen()
+        return max(0, self._count)
+
+    def mend(self) -> None:
+        """Make those again that ZeroMQ has given up; often called, costs nothing."""
+        self._listen()
+        now = time.monotonic()
+        for endpoint in [e for e, since in self._lost.items() if now - since > _GIVEN_UP_S]:
+            del self._lost[endpoint]
+            self.renewed += 1
+            try:
+                self._socket.disconnect(endpoint)
+            except zmq.ZMQError as error:
+                if error.errno != errno.ENOENT:  # it knows nothing of that connection any more
+                    raise
+            self._socket.connect(endpoint)
+            if is_power_of_two(self.renewed):
+                log.warning("connection_renewed", endpoint=endpoint, renewed=self.renewed)
+
+    def close(self) -> None:
+        """Before the socket is closed."""
+        self._socket.disable_monitor()
+        self._monitor.close(linger=0)
+
+    def _listen(self) -> None:
+        while self._monitor.poll(0):
+            report = recv_monitor_message(self._monitor)
+            event, endpoint = report["event"], report["endpoint"].decode(errors="replace")
+            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._count += 1
+            elif event == zmq.EVENT_DISCONNECTED:
+                self._count -= 1
+                self._lost[endpoint] = time.monotonic()
+            else:
+                self._lost.pop(endpoint, None)

@@ -31,7 +31,6 @@ import semantic_mapper.drivers.poses.config
 import semantic_mapper.drivers.realsense.config
 import semantic_mapper.drivers.stereo.config
 import semantic_mapper.drivers.v4l2.config
-from semantic_mapper.benchmark.config import SuiteConfig
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig, SRayConfig, convert_config, load_config
 from semantic_mapper.drivers.calibration import CalibrationFile, load_calibration, load_mount
@@ -42,7 +41,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli
-from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore, Progress
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import (
@@ -55,38 +54,34 @@ from semantic_mapper.nodes.options import (
     ZenohOptions,
 )
 from semantic_mapper.nodes.supervisor.launch_config import LaunchFile, NodeEntry, load_launch
-from semantic_mapper.replay.compare.tolerances import Tolerances
+from semantic_mapper.replay.compare import Tolerances
 from semantic_mapper.replay.corrected_poses import read_corrections
 from semantic_mapper.replay.importers.base import RenameConfig
 from semantic_mapper.replay.log.format import LogReader, LogWriter
-from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig, room_frames
 from semantic_mapper.testing import LogReplays
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
-from semantic_mapper.training.nesf import NesfTrainConfig
 from semantic_mapper.training.online import OnlineConfig
-from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.transport import codec, pose_message, query_messages
-from semantic_mapper.transport.headers import LabelSetForm
 from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.keys import load_keys
 from semantic_mapper.transport.messages import (
+    TOPICS,
     EndOfStream,
     FrameRefused,
     LabelledKeyframe,
+    LabelSetForm,
     Status,
     StreamInfo,
     WeightsInUse,
     WeightsUpdate,
 )
-from semantic_mapper.transport.security import load_keys
-from semantic_mapper.transport.topics import TOPICS
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 __all__ = [
     "COMMAND",
     "ROOMS",
     "TOPICS",
-    "VALIDATION_SEEDS",
     "CameraIntrinsics",
     "Checkpoint",
     "CodecOptions",
@@ -103,8 +98,6 @@ __all__ = [
     "LogWriter",
     "MapUpdate",
     "MapperConfig",
-    "NesfTrainConfig",
-    "NoiseConfig",
     "OnlineConfig",
     "PosedFrame",
     "SRay",
@@ -112,9 +105,7 @@ __all__ = [
     "SemanticMapperError",
     "Status",
     "StreamInfo",
-    "SuiteConfig",
     "Tolerances",
-    "TrainConfig",
     "VoxelMap",
     "WeightsInUse",
     "WeightsUpdate",
@@ -129,12 +120,12 @@ __all__ = [
     "load_launch",
     "load_mount",
     "read_corrections",
-    "room_frames",
     "save_checkpoint",
 ]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-LAUNCH, RECIPES = REPOSITORY / "launch", REPOSITORY / "recipes"
+LAUNCH = REPOSITORY / "launch"
+CLASS_FILES = REPOSITORY / "replay" / "importers" / "classes"
 COMMAND = Path(sys.executable).parent / "semantic-mapper"
 TIMEOUT_S = 300.0  # kernels may have to be compiled, on a busy machine
 
@@ -279,8 +270,6 @@ SETTINGS: dict[str, tuple[type[msgspec.Struct], dict[str, Any]]] = {
     "mapper": (MapperConfig, {}),
     "online": (OnlineConfig, {}),
     "finetune": (FinetuneConfig, {}),
-    "train": (TrainConfig, {}),
-    "suite": (SuiteConfig, {}),
     "tolerances": (Tolerances, {}),
     "calibrate": (CalibrationSettings, {}),
     "rename": (RenameConfig, {"classes": {"couch": "sofa"}}),

@@ -59,7 +59,6 @@ def messages() -> dict[str, tuple[str, Any, dict[str, Any]]]:
     data = b"safetensors" * 9
     weights = api.WeightsUpdate("learner", 2, data, hashlib.sha256(data).hexdigest(), "cd" * 32, 0.8, 0.5, 9, 3)
     cameras = {"front:left-1": LENS}
-    raw = {"rgb": "raw", "depth": "raw"}
     return {
         "info": ("info", api.StreamInfo("folder Küche", cameras, LABELS, 200, 6.5, {"place": "lab"}), {}),
         "info_live": ("info", api.StreamInfo("a camera"), {}),
@@ -68,11 +67,10 @@ def messages() -> dict[str, tuple[str, Any, dict[str, Any]]]:
         "frame_without_label": ("frame", frame(label=False), {}),
         "frame_without_both": ("frame", frame(depth=False, label=False), {}),
         "frame_float_depth": ("frame", frame(exact_mm=False), {}),
-        "frame_raw": ("frame", frame(), raw),
+        "frame_raw": ("frame", frame(), {"rgb": "raw"}),
         "frame_jpeg": ("frame", frame(), {"rgb": "jpeg"}),
         "end": ("end", api.EndOfStream("player", "error", 200, "disk gone", ("bytes 5 to 9",)), {}),
         "map": ("map", map_update(), {}),
-        "map_float": ("map", map_update(), {"confidence": "f32", "depth": "raw"}),
         "refused": ("refused", api.FrameRefused(4, 5, "front", "pose holds NaN"), {}),
         "status": ("status", api.Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU",)), {}),
         "keyframe": ("keyframe", api.LabelledKeyframe(frame(), LABELS, "a person"), {}),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from semantic_mapper.nodes.frame_gaps import MAX_MISSED, Gaps
-from semantic_mapper.transport.headers import MAX_COUNT
+from semantic_mapper.transport.messages import MAX_COUNT
 
 
 def test_gaps_between_numbers_are_counted_camera_by_camera() -> None:

@@ -27,8 +27,8 @@ from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
-from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from tests.nodes.support import write_config, write_weights
 from tests.small import INTRINSICS, tiny_frames

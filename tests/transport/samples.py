@@ -10,8 +10,7 @@ import numpy as np
 
 from semantic_mapper.labels import NYU40
 from semantic_mapper.transport.codec import encode, encode_frame
-from semantic_mapper.transport.compression import depth_from_uint16
-from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.images import CodecOptions, depth_from_uint16
 from semantic_mapper.transport.messages import (
     EndOfStream,
     FrameRefused,
@@ -100,7 +99,7 @@ def frame_variants() -> list[list[bytes]]:
     """Frames in every packing."""
     options = [
         CodecOptions(),
-        CodecOptions(rgb="raw", depth="raw"),
+        CodecOptions(rgb="raw"),
         CodecOptions(rgb="jpeg", depth_scale=999.0),
     ]
     frames = [make_frame(), make_frame(depth=False), make_frame(label=False), make_frame(depth=False, label=False)]

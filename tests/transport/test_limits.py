@@ -12,8 +12,7 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.codec import encode_frame
 from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, LabelledKeyframe
 from semantic_mapper.transport.query_sockets import QueryServer, QuerySocket
-from semantic_mapper.transport.receiving import MAX_MESSAGE_BYTES, receive_bounded
-from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
+from semantic_mapper.transport.sockets import MAX_MESSAGE_BYTES, LosslessSubscriber, NewestSubscriber, receive_bounded
 from semantic_mapper.types import PosedFrame
 
 from . import samples

@@ -19,8 +19,8 @@ from semantic_mapper.drivers.poses import topic
 from semantic_mapper.drivers.poses.config import TopicPoses
 from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import CameraError
+from semantic_mapper.transport.keys import allow, forget, make_keys, secure_server
 from semantic_mapper.transport.pose_message import PoseMessage, encode_pose
-from semantic_mapper.transport.security import allow, forget, make_keys, secure_server
 
 from .images import MS, image, rigid
 

@@ -17,8 +17,8 @@ from semantic_mapper.nodes.options import BridgeOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.messages import EndOfStream, Status
-from semantic_mapper.transport.security import Keys
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 from tests.nodes.mapper.test_query_service import a_folder, answering

@@ -9,7 +9,7 @@ import pytest
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
-from semantic_mapper.transport.security import ServerIdentity, load_keys
+from semantic_mapper.transport.keys import ServerIdentity, load_keys
 from tests.nodes.mapper.test_query_service import answering
 from tests.nodes.support import run, run_here
 from tests.queries.scene import whole_map

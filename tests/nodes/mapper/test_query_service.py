@@ -32,8 +32,8 @@ from semantic_mapper.queries.occupancy import State, distance_field, occupancy
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import encode_request
+from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
-from semantic_mapper.transport.security import Keys
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_moving import THING_M as PASSES_AT_M
 from tests.mapping.test_moving import scene as passer_by

@@ -24,8 +24,8 @@ import pytest
 import rerun.chunk
 
 from semantic_mapper.errors import MapError, TransportError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.view import _find_live, _Page
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
 from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote
@@ -36,8 +36,8 @@ from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
-from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import MapUpdate
 from tests.nodes.mapper.test_query_service import answering

@@ -20,8 +20,7 @@ from semantic_mapper.labels import NYU40
 from semantic_mapper.nodes.cli.log_info import describe_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recover import recover
-from semantic_mapper.transport.codec import encode, encode_frame
-from semantic_mapper.transport.framing import pack_parts
+from semantic_mapper.transport.codec import encode, encode_frame, pack_parts
 from semantic_mapper.transport.messages import StreamInfo
 from tests.replay.conftest import FRAMES
 from tests.transport import samples
