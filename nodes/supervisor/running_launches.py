@@ -97,7 +97,7 @@ def node_endpoints(folder: Path) -> dict[str, str]:
     Raises:
         TransportError: the launcher says nothing, or not all nodes have come to run in time.
     """
-    from semantic_mapper.nodes.cli.top_table import LaunchView
+    from semantic_mapper.nodes.supervisor.launch_view import LaunchView
     from semantic_mapper.transport.sockets import NewestSubscriber
 
     view, deadline = LaunchView(), time.monotonic() + START_S

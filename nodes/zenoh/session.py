@@ -24,7 +24,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.feed import Subject
 from semantic_mapper.nodes.bridge.packing import describe_pose, moving_mask, pack_points, to_jpeg, to_png
-from semantic_mapper.nodes.cli.map_answers import answer_graph
+from semantic_mapper.nodes.map_answers import answer_graph
 from semantic_mapper.nodes.options import ZenohOptions
 from semantic_mapper.nodes.zenoh.addresses import zenoh_settings
 from semantic_mapper.nodes.zenoh.sdk import zenoh
