@@ -41,8 +41,12 @@ def label(
             "by default the one that runs here.",
         ),
     ] = "",
-    teacher: Annotated[str, typer.Option(help="Who has labelled them, for the log of the finetuner.")] = "",
-    timeout: Annotated[float, typer.Option(min=0, help="How long the finetuner may take to be there, seconds.")] = 30.0,
+    teacher: Annotated[
+        str, typer.Option(hidden=True, help="Who has labelled them, for the log of the finetuner.")
+    ] = "",
+    timeout: Annotated[
+        float, typer.Option(min=0, hidden=True, help="How long the finetuner may take to be there, seconds.")
+    ] = 30.0,
     suggest: Annotated[
         int | None,
         typer.Option("--suggest", metavar="N", min=1, help="Say which N frames to label next, and send nothing."),
@@ -78,8 +82,8 @@ def label(
     another one, tunnel its port.
 
     Without these, labelled frames are sent to a running finetuner: those that together show most of what the log shows.
-    Frames must be in the world that the mapper maps. `semantic-mapper top --once --json` tells what became of them,
-    `semantic-mapper weights` which weights came of it.
+    Frames must be in the world that the mapper maps. `semantic-mapper view --status --once --json` tells what became
+    of them, `semantic-mapper info live` which weights came of it.
 
     Example: semantic-mapper label kitchen.mcap --suggest 8
     Example: semantic-mapper label kitchen.mcap --serve --classes classes.txt --out kitchen-labels
@@ -137,7 +141,7 @@ def _check_options(suggest: bool, serve: bool, given: dict[str, object]) -> None
 
 def _suggest(output: Output, log: Path, count: int, images: Path | None, weights: Path | None, json: bool) -> None:
     from semantic_mapper.errors import LogError
-    from semantic_mapper.nodes.cli.labelling_page import open_images, suggest_for_log, suggestion_table
+    from semantic_mapper.nodes.cli.labelling import open_images, suggest_for_log, suggestion_table
     from semantic_mapper.replay.log.sequence import open_log
 
     if images is not None and not images.is_dir():
@@ -165,7 +169,7 @@ def _serve(
     port: int,
 ) -> int:
     from semantic_mapper.errors import LogError
-    from semantic_mapper.nodes.cli.labelling_page import open_images, page_folder, page_order, suggest_for_log
+    from semantic_mapper.nodes.cli.labelling import open_images, page_folder, page_order, suggest_for_log
     from semantic_mapper.nodes.labeller.server import LabelServer
     from semantic_mapper.nodes.labeller.session import LabelSession
     from semantic_mapper.replay.log.sequence import open_log

@@ -12,7 +12,7 @@ from semantic_mapper.replay.log.format import LogReader
 
 @dataclass(frozen=True, slots=True)
 class RecoverReport:
-    """What ``recover`` saved and what it could not.
+    """What recovering saved and what it could not.
 
     Args:
         frames, messages: In the new log.
