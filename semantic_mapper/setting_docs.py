@@ -9,6 +9,7 @@ import ast
 import functools
 import inspect
 import io
+import textwrap
 import tokenize
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -87,7 +88,7 @@ def comments_of(kind: type[msgspec.Struct]) -> dict[str, str]:
     for part in reversed(kind.__mro__):
         if not (issubclass(part, msgspec.Struct) and part.__module__.startswith("semantic_mapper")):
             continue
-        source = inspect.cleandoc(inspect.getsource(part))
+        source = textwrap.dedent(inspect.getsource(part))
         comments = {
             token.start[0]: token.string.lstrip("#").strip()
             for token in tokenize.generate_tokens(io.StringIO(source).readline)

@@ -41,6 +41,7 @@ class FilmFlags(DataOptions):
         typer.Option(
             "--scale",
             min=0,
+            hidden=True,
             help="Film, transforms, colmap, opensfm: metres per unit of its map without scale. 0 = by GPS, if any.",
         ),
     ] = 0.0
@@ -54,7 +55,9 @@ class FilmFlags(DataOptions):
     ] = ""
     square_mm: Annotated[
         float,
-        typer.Option("--square-mm", min=0, help="Film: side of a square of the printed board that is seen in it."),
+        typer.Option(
+            "--square-mm", min=0, hidden=True, help="Film: side of a square of the printed board that is seen in it."
+        ),
     ] = 0.0
     board: Annotated[
         Path | None,

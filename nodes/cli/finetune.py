@@ -41,7 +41,9 @@ def finetune(
     weights: Annotated[
         Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
     ] = None,
-    from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
+    from_scratch: Annotated[
+        bool, typer.Option("--from-scratch", hidden=True, help="Start from random weights.")
+    ] = False,
     kind: Annotated[
         str | None,
         typer.Option(
@@ -50,18 +52,22 @@ def finetune(
         ),
     ] = None,
     frames: Annotated[
-        str, typer.Option(metavar="N,N,...", help="Numbers of the labelled frames in the log, in place of --keyframes.")
+        str,
+        typer.Option(
+            metavar="N,N,...", hidden=True, help="Numbers of the labelled frames in the log, in place of --keyframes."
+        ),
     ] = "",
     unlabelled: Annotated[
         int | None,
         typer.Option(
             min=0,
+            hidden=True,
             help="--kind, or its weights: frames without labels to use at most; 0 = all.  [default: 300]",
         ),
     ] = None,
     variant: Annotated[
         Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
-        typer.Option(help="--kind irt, or its weights: what reads the classes.  [default: BC]"),
+        typer.Option(hidden=True, help="--kind irt, or its weights: what reads the classes.  [default: BC]"),
     ] = None,
     boxes: Annotated[
         Path | None,
@@ -81,8 +87,9 @@ def finetune(
     uncovered: Annotated[
         Literal["stuff", "empty"] | None,
         typer.Option(
+            hidden=True,
             help="--kind panoptic: what is outside of all boxes. stuff: classes that are no things, or that no box "
-            "has. empty: nothing.  [default: stuff]"
+            "has. empty: nothing.  [default: stuff]",
         ),
     ] = None,
     depth: Annotated[
@@ -116,7 +123,6 @@ def finetune(
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --strokes --out kitchen.safetensors
-    Example: semantic-mapper finetune kitchen.mcap --kind irt --keyframes 4 --out kitchen.safetensors
     Example: semantic-mapper finetune yard.mcap --kind panoptic --boxes boxes.json --out yard.safetensors
     """
     scene = kind is not None

@@ -82,7 +82,6 @@ def import_(
     Of a damaged or unfinished log every intact message is kept.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
-    Example: semantic-mapper import robot.bag robot.mcap --topic image=/front/color/image_raw
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
     Example: semantic-mapper import cut-off.mcap clean.mcap
     """

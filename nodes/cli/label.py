@@ -71,7 +71,9 @@ def label(
         Path | None,
         typer.Option(help="--suggest, --serve: weights whose keyframes count as labelled; also their classes."),
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="--serve: of the page; 0 = any that is free.")] = 9092,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, hidden=True, help="--serve: of the page; 0 = any that is free.")
+    ] = 9092,
     json: Annotated[bool, typer.Option("--json", help="--suggest: print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
     """Label frames of a log by hand (--serve), say which to label (--suggest), or send labelled ones to a finetuner.
@@ -88,7 +90,6 @@ def label(
     Example: semantic-mapper label kitchen.mcap --suggest 8
     Example: semantic-mapper label kitchen.mcap --serve --classes classes.txt --out kitchen-labels
     Example: semantic-mapper label kitchen.mcap --keyframes 12
-    Example: semantic-mapper label kitchen.mcap --images corrected/ --to ipc:///run/robot/labels
     """
     numbers = frame_numbers(frames)
     _check_options(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,16 +50,14 @@ class SettingOptions(OptionGroup):
     options: ClassVar[Mapping[str, str]]  # names of settings by option
 
     @classmethod
-    @functools.cache
     def parameters(cls) -> list[inspect.Parameter]:
         """As of ``OptionGroup``."""
         declared = {setting.name: setting for setting in settings_of(cls.kind)}
         found: list[inspect.Parameter] = []
         for option, name in cls.options.items():
             setting = declared[name]
-            bounds = {"min": setting.low, "max": setting.high} if setting.type in (int, float) else {}
             text = f"{setting.text[:1].upper()}{setting.text[1:]}  [default: {_shown(setting.default)}]"
-            info = typer.Option(option, help=text, show_default=False, **bounds)
+            info = typer.Option(option, help=text, show_default=False, min=setting.low, max=setting.high)
             found.append(_parameter(option.removeprefix("--").replace("-", "_"), setting.type | None, info))
         listed = typer.Option("--config", help="TOML file with settings; docs/settings.md lists all.")
         found.append(_parameter("config", Path | None, listed))
@@ -118,7 +115,6 @@ class DataOptions(OptionGroup):
     """Base of groups that are dataclasses: each field is an option."""
 
     @classmethod
-    @functools.cache
     def parameters(cls) -> list[inspect.Parameter]:
         """As of ``OptionGroup``."""
         hints = get_type_hints(cls, include_extras=True)

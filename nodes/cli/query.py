@@ -87,7 +87,10 @@ def query(
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
     ] = 0.0,
     gone: Annotated[
-        bool, typer.Option("--gone", help="Running mapper, instances: also those of earlier answers that have gone.")
+        bool,
+        typer.Option(
+            "--gone", hidden=True, help="Running mapper, instances: also those of earlier answers that have gone."
+        ),
     ] = False,
     picture: Annotated[
         Path | None, typer.Option(metavar="PNG", help="graph: also draw rooms, doors and objects from above.")
@@ -125,14 +128,9 @@ def query(
     exchanges the map when the corrected one is ready. A pose goes to the frame nearest in time, within 5 ms.
 
     Example: semantic-mapper query runs/demo info
-    Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
-    Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
-    Example: semantic-mapper query live nearest chair 0 0 1 --json
-    Example: semantic-mapper query live instances --gone --json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
-    Example: semantic-mapper query s3://maps/house nearest chair 0 0 1
     Example: semantic-mapper query live correct optimised.tum
     """
     if question is Question.CORRECT:
@@ -183,7 +181,7 @@ def ask_file(source: str, request: Request) -> dict[str, Any]:
             by = map_answers.CONNECTED if snapshot.instances is None else map_answers.LEARNED
             up = request.up or _find_up(snapshot)
             return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot), by)
-        case Question.GRAPH:
+        case _:  # the graph
             return _answer_graph(source, GraphTracker(request.up).update(snapshot), request.picture)
 
 
@@ -214,7 +212,7 @@ def ask_tiles(source: str, request: Request) -> dict[str, Any]:
                 except MapError:
                     up = map_answers.UP
             return map_answers.answer_instances(up, tiled.instances(up=up), map_answers.CONNECTED)
-        case Question.GRAPH:
+        case _:  # the graph
             snapshot = MapMirror.of(tiled.load()).snapshot()
             return _answer_graph(source, GraphTracker(request.up).update(snapshot), request.picture)
 
@@ -246,7 +244,7 @@ def ask_mapper(source: str, request: Request) -> dict[str, Any]:
             case Question.INSTANCES:
                 up = request.up or map_answers.UP
                 return map_answers.answer_instances(up, client.instances(up, gone=request.gone), map_answers.CONNECTED)
-            case Question.GRAPH:
+            case _:  # the graph
                 return _answer_graph(source, client.graph(request.up), request.picture)
 
 

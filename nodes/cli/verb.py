@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import structlog
 import typer
 from rich.text import Text
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperOption
 
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.nodes.cli.options import OptionGroup
@@ -50,7 +50,7 @@ class VerbCommand(TyperCommand):
         """As of Click."""
         if "--help-all" in args:
             for parameter in self.params:
-                if isinstance(parameter, typer.core.TyperOption):
+                if isinstance(parameter, TyperOption):
                     parameter.hidden = False
             args = ["--help"]
         return super().parse_args(ctx, args)
@@ -68,12 +68,13 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     A parameter whose type is an ``OptionGroup`` stands for the options of the group.
     """
     signature = inspect.signature(function, eval_str=True)
-    groups: dict[str, type[OptionGroup]] = {}
+    groups: dict[str, tuple[type[OptionGroup], list[str]]] = {}
     parameters: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
         if isinstance(parameter.annotation, type) and issubclass(parameter.annotation, OptionGroup):
-            groups[parameter.name] = parameter.annotation
-            parameters += parameter.annotation.parameters()
+            options = parameter.annotation.parameters()
+            groups[parameter.name] = parameter.annotation, [option.name for option in options]
+            parameters += options
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
 
@@ -82,8 +83,8 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
         prepare_process(verbose=Settings.verbose)
         _check_values(kwargs)
         try:
-            for name, group in groups.items():
-                kwargs[name] = group(**{p.name: kwargs.pop(p.name) for p in group.parameters()})
+            for name, (group, options) in groups.items():
+                kwargs[name] = group(**{option: kwargs.pop(option) for option in options})
             code = function(**kwargs)
         except SemanticMapperError as error:
             if Settings.verbose:

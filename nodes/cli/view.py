@@ -49,12 +49,13 @@ def view(
     ] = "",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of the web page; 0 = any that is free.")] = 9090,
     data_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Of the data that the page shows; 0 = any that is free.")
+        int, typer.Option(min=0, max=65535, hidden=True, help="Of the data that the page shows; 0 = any that is free.")
     ] = 9876,
     memory: Annotated[
-        int, typer.Option(metavar="MB", min=LEAST_MEMORY_MB, help="For what is shown; then the oldest goes.")
+        int,
+        typer.Option(metavar="MB", min=LEAST_MEMORY_MB, hidden=True, help="For what is shown; then the oldest goes."),
     ] = 512,
-    refresh: Annotated[float, typer.Option(metavar="S", min=0.2, help="Seconds between two maps.")] = 2.0,
+    refresh: Annotated[float, typer.Option(metavar="S", min=0.2, hidden=True, help="Seconds between two maps.")] = 2.0,
     query: Annotated[str, typer.Option(hidden=True, help="Launch: name of the mapper's `query` endpoint.")] = "query",
     weights: WeightsOption = None,
     config: Annotated[Path | None, typer.Option(help="Log: TOML file with settings of the mapper.")] = None,
@@ -72,18 +73,14 @@ def view(
     surroundings last changed while they were watched (a saved map has none). A log is mapped while it is shown. The
     page is served on this machine alone, and sends nothing anywhere; to see it from another one, tunnel both ports.
 
-    With --status, twice a second: states, restarts, memory, rates, ages and what was lost of each node. frames/s: that
-    a camera published, that came to the mapper, or that were recorded. mapped/s: fused. step: mean time to map one.
-    frame: since the last one. age: of the last one when it was mapped. lost: of a camera, images that became no frame;
-    of the mapper, frames that never came or could not be used; of the recorder, what never came or had no room. beat:
-    since the last sign of life. A launch on another machine is named by its endpoint (`publish` of the launch file).
+    With --status, twice a second: states, restarts, memory, rates, ages and losses of each node. frame: time since the
+    last one; age: of the last one when it was mapped; beat: since the last sign of life. A launch on another machine is
+    named by its endpoint (`publish` of the launch file).
 
     Example: semantic-mapper view
-    Example: semantic-mapper view runs/demo
     Example: semantic-mapper view kitchen.mcap --weights kitchen.safetensors
     Example: semantic-mapper view tcp://robot:5570 --server robot
     Example: semantic-mapper view --status
-    Example: semantic-mapper view --status tcp://robot:5562 --server robot
     Example: ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 robot semantic-mapper view
     """
     if (once and not status) or (json and not once):
