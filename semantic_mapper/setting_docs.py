@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import msgspec
 
-
 BOUNDLESS = 1e6  # an upper bound that only keeps out what nothing can be computed with
 
 

@@ -101,7 +101,7 @@ def evaluate(
         stderr_console().print(note, soft_wrap=True)
     found: dict[str, Any] = {"replays": print_results(output, folders), "logs": {}}
     if mesh is not None:
-        from semantic_mapper.replay.compare.surface import compare_with_mesh
+        from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
 
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
