@@ -11,6 +11,7 @@ import typer
 from semantic_mapper.nodes.cli.options import MapperSettings, WeightsOption
 from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.replay.log.demo import demo_log
 
 
 @verb
@@ -34,7 +35,6 @@ def bench(
     output = Output.guarded()
     from semantic_mapper.replay.artifacts import versions
     from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
-    from semantic_mapper.replay.log.demo import demo_log
 
     output.quiet = json
     log = log or demo_log()
