@@ -114,7 +114,7 @@ def finish_session(
 
 def clear_results(out: Path) -> None:
     """Take away what an earlier run left beside its map: beside the next one, it would be of another map."""
-    for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html", "compare.png"):
+    for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html"):
         (out / name).unlink(missing_ok=True)
 
 

@@ -18,6 +18,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import msgspec
 
+BOUNDLESS = 1e6  # an upper bound that only keeps out what nothing can be computed with
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:
@@ -46,7 +48,7 @@ class Setting:
         names = {bool: "true or false", int: "whole number", float: "number", str: "text"}
         if self.type in names:
             low = "" if self.low is None else f" from {self.low:g}"
-            high = "" if self.high is None else f" to {self.high:g}"
+            high = "" if self.high is None or self.high >= BOUNDLESS else f" to {self.high:g}"
             return names[self.type] + low + high
         return "list" if get_origin(self.type) in (tuple, list) else "table or text"
 
@@ -86,7 +88,7 @@ def comments_of(kind: type[msgspec.Struct]) -> dict[str, str]:
     """The comments above and behind the fields of a struct, by field; those that it inherits, too."""
     found: dict[str, str] = {}
     for part in reversed(kind.__mro__):
-        if not (issubclass(part, msgspec.Struct) and part.__module__.startswith("semantic_mapper")):
+        if part is msgspec.Struct or not issubclass(part, msgspec.Struct):
             continue
         source = textwrap.dedent(inspect.getsource(part))
         comments = {

@@ -13,6 +13,8 @@ from semantic_mapper.nodes.cli.replay import show_replay
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.run_folder import prepare_folder
 
 
 @verb
@@ -29,8 +31,6 @@ def demo(
     """
     output = Output.guarded()
     from semantic_mapper.replay.jobs import ReplayRequest, replay_log
-    from semantic_mapper.replay.log.demo import demo_log
-    from semantic_mapper.replay.run_folder import prepare_folder
 
     began = time.monotonic()
     prepare_folder(out)

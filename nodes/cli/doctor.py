@@ -11,8 +11,11 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from semantic_mapper.drivers.registry import KINDS, find_cameras
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, verb
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.doctor.machine import examine
+from semantic_mapper.nodes.supervisor.packaged_files import find_launch
 
 _STYLES = {"ok": "green", "note": "yellow", "bad": "bold red"}
 
@@ -51,8 +54,6 @@ def doctor(
     if cameras:
         _list_cameras(output, kind or (), json)
         return 0
-    from semantic_mapper.nodes.doctor.machine import examine
-    from semantic_mapper.nodes.supervisor.packaged_files import find_launch
 
     checks = examine(find_launch(launch) if launch else None, settings or ())
     if json:
@@ -68,7 +69,6 @@ def doctor(
 
 
 def _list_cameras(output: Output, kinds: Sequence[str], json: bool) -> None:
-    from semantic_mapper.drivers.registry import KINDS, find_cameras
 
     found, unknown = find_cameras(tuple(kinds) or KINDS)
     if json:

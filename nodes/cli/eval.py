@@ -14,6 +14,8 @@ from semantic_mapper.files import write_json
 from semantic_mapper.nodes.cli.options import MapperSettings, MaxFramesOption
 from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, results_file, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
+from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
 from semantic_mapper.replay.run_folder import MAP_SUFFIX, is_log, prepare_file
 from semantic_mapper.replay.summary import notes, read_summary, result_lines, summary_table
 
@@ -101,12 +103,9 @@ def evaluate(
         stderr_console().print(note, soft_wrap=True)
     found: dict[str, Any] = {"replays": print_results(output, folders), "logs": {}}
     if mesh is not None:
-        from semantic_mapper.replay.compare.surface import compare_with_mesh
-
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
             output.print(f"{name}: {_surface_line(figures)}")
-    from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
     from semantic_mapper.replay.jobs import EvaluateRequest, evaluate_log
 
     settings = mapper.load()

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.mapping.files.merge import count_empty
+from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
+from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
+from semantic_mapper.queries.tiles import TiledMap
+from semantic_mapper.replay.exporters import LogExportRequest, export_log, log_format_of
+from semantic_mapper.replay.exporters.map_files import ExportRequest, export_map, format_of, parse_transform, parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import (
     holds_tiles,
@@ -21,10 +28,6 @@ from semantic_mapper.replay.run_folder import (
     prepare_folder,
     refuse_overwriting,
 )
-
-if TYPE_CHECKING:
-    from semantic_mapper.replay.exporters.map_files import ExportRequest
-
 
 LISTED = 10  # frames left out that are shown one by one
 
@@ -88,8 +91,6 @@ def export(
         given |= {"--up": up != "auto", "--min-weight": min_weight is not None, "--min-confidence": min_confidence > 0}
         map_options = [name for name, value in given.items() if value]
         return export_recording(output, source, out, format, camera, max_frames, map_options)
-    from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
-    from semantic_mapper.replay.exporters.map_files import ExportRequest, format_of, parse_up
 
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
@@ -100,9 +101,6 @@ def export(
 
 
 def _export_map(output: Output, folder_or_map: Path, out: Path, request: ExportRequest) -> None:
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.queries.tiles import TiledMap
-    from semantic_mapper.replay.exporters.map_files import export_map
 
     if holds_tiles(str(folder_or_map)):
         prepare_file(out)
@@ -140,10 +138,6 @@ def merge(
     Example: semantic-mapper merge runs/east runs/west --transform "3.2 0 0 90" --out house.npz
     """
     output = Output.guarded()
-    from semantic_mapper.mapping.files.merge import count_empty
-    from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.replay.exporters.map_files import parse_transform
 
     T_a_b = None if transform == "find" else parse_transform(transform)
     sources = map_path(a), map_path(b)
@@ -193,8 +187,6 @@ def export_recording(
         ConfigError: options that do not go together.
         LogError: the log cannot be read, or the result not be written.
     """
-    from semantic_mapper.replay.exporters import LogExportRequest, export_log, log_format_of
-
     if map_options:
         raise ConfigError(f"{', '.join(map_options)}: for saved maps only; {source} is a log")
     request = LogExportRequest(log_format_of(out, format_name), camera, max_frames)

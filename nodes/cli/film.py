@@ -6,17 +6,22 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.mapping.map_scale import length_unit
+from semantic_mapper.nodes.cli.calibrate import board_settings
 from semantic_mapper.nodes.cli.options import DataOptions
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
 from semantic_mapper.plain_text import counted
-
-if TYPE_CHECKING:
-    from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport
+from semantic_mapper.plots import new_figure, rendered
+from semantic_mapper.replay.importers import is_recording
+from semantic_mapper.replay.page import Section, picture, table_of, write_page
+from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
+from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
+from semantic_mapper.replay.sfm.scale import ScaleHint, parse_distance
 
 LISTED = 30  # stretches of the film that are left out
 
@@ -94,9 +99,6 @@ class FilmFlags(DataOptions):
             )
         if self.calibration is not None and self.focal_prior:
             raise typer.BadParameter("--calibration and --focal-prior: the focal length is given or guessed, not both")
-        from semantic_mapper.nodes.cli.calibrate import board_settings
-        from semantic_mapper.replay.sfm.reconstruct import FilmOptions
-        from semantic_mapper.replay.sfm.scale import ScaleHint, parse_distance
 
         board = board_settings(self.board, self.square_mm).board if self.board or self.square_mm else None
         hint = ScaleHint(
@@ -123,9 +125,6 @@ class FilmFlags(DataOptions):
 
 def is_film(source: Path) -> bool:
     """Whether poses have to be found: of a film, or of a folder of pictures that is no recording of a known format."""
-    from semantic_mapper.replay.importers import is_recording
-    from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
-
     if source.is_file():
         return source.suffix.lower() in FILM_SUFFIXES
     return source.is_dir() and not is_recording(source) and bool(pictures_of(source))
@@ -140,8 +139,6 @@ def import_film_log(source: Path, log: Path, options: FilmOptions, *, overwrite:
     Raises:
         SemanticMapperError: see ``import_film``.
     """
-    from semantic_mapper.replay.sfm.reconstruct import import_film
-
     page = log.with_suffix(".html")
     if page.exists() and not overwrite:
         raise ConfigError(f"{page}: exists already; choose another name, or --overwrite it")
@@ -168,8 +165,6 @@ def write_film_report(report: FilmReport, path: Path) -> None:
     Raises:
         ConfigError: it cannot be written.
     """
-    from semantic_mapper.replay.page import Section, picture, table_of, write_page
-
     spans = [(f"{p.start_s:.2f}", f"{p.end_s:.2f}", str(p.frames), p.reason) for p in report.left_out[:LISTED]]
     counts = [(reason, str(count)) for reason, count in report.left_out_counts.items()]
     sections = [
@@ -192,7 +187,6 @@ def write_film_report(report: FilmReport, path: Path) -> None:
 
 
 def _figures(report: FilmReport) -> Mapping[str, str]:
-    from semantic_mapper.mapping.map_scale import length_unit
 
     unit = length_unit(bool(report.scale))
     lens = ", ".join(f"{value:.4f}" for value in report.distortion)
@@ -214,8 +208,6 @@ def _figures(report: FilmReport) -> Mapping[str, str]:
 def _draw_plan(report: FilmReport) -> Any:
     """The path and the points from above, as a picture (H, W, 3)."""
     import numpy as np
-
-    from semantic_mapper.plots import new_figure, rendered
 
     @rendered
     def draw() -> Any:

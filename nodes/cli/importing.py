@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
+from semantic_mapper.config import load_config
 from semantic_mapper.nodes.cli.film import FilmFlags, RotateOption, import_film_log, is_film, print_film
 from semantic_mapper.nodes.cli.options import MaxFramesOption
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers import ImportOptions, ImportReport, RenameConfig, import_recording
+from semantic_mapper.replay.log.recover import recover
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
-
-if TYPE_CHECKING:
-    from semantic_mapper.replay.importers import ImportOptions, ImportReport
 
 LISTED = 10  # skipped files and losses that are shown one by one
 
@@ -89,8 +89,6 @@ def import_(
     if format is None and source.suffix == LOG_SUFFIX:
         _recover(output, source, log)
         return
-    from semantic_mapper.config import load_config
-    from semantic_mapper.replay.importers import ImportOptions, RenameConfig
 
     renames = load_config(rename, RenameConfig).classes if rename is not None else None
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -125,8 +123,6 @@ def import_source(
         SemanticMapperError: it cannot be imported.
     """
     from dataclasses import replace
-
-    from semantic_mapper.replay.importers import ImportOptions, import_recording
 
     if format_name is None and is_film(source):
         found, page = import_film_log(source, log, film.film_options(quarters), overwrite=overwrite)
@@ -182,7 +178,6 @@ def _depth_line(report: ImportReport) -> str:
 
 
 def _recover(output: Output, source: Path, log: Path) -> None:
-    from semantic_mapper.replay.log.recover import recover
 
     report = recover(source, log)
     output.print(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -13,6 +13,7 @@ from msgspec import to_builtins
 from rich.box import SIMPLE
 from rich.table import Table
 
+from semantic_mapper.client import MapClient, Weights
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.files.map_file import describe_map
@@ -22,15 +23,15 @@ from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 from semantic_mapper.plain_text import counted
+from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.box_picture import draw_boxes
+from semantic_mapper.replay.box_times import with_times
 from semantic_mapper.replay.boxes import BoxFile, load_boxes
 from semantic_mapper.replay.log.gaps import find_gaps, gaps_text
 from semantic_mapper.replay.log.sequence import LogSequence, open_log, read_part
 from semantic_mapper.replay.run_folder import is_map, map_path, prepare_file
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
-
-if TYPE_CHECKING:
-    from semantic_mapper.client import Weights
 
 BOX_FILES = (".json", ".xml")
 LISTED = 10  # damages that are shown one by one
@@ -300,8 +301,6 @@ def _weights_info(output: Output, endpoint: str, remote: Remote) -> dict[str, An
     Raises:
         TransportError: nobody answers there.
     """
-    from semantic_mapper.client import MapClient
-
     with MapClient(endpoint, identity=remote.identity()) as client:
         state = client.weights()
     output.print(_weights_table(state))
@@ -357,10 +356,6 @@ def _same_file(a: Path, b: Path) -> bool:
 
 
 def _draw(found: BoxFile, log_path: Path, file: Path, out: Path) -> str:
-    from semantic_mapper.plots import write_picture
-    from semantic_mapper.replay.box_picture import draw_boxes
-    from semantic_mapper.replay.box_times import with_times
-    from semantic_mapper.replay.log.sequence import open_log
 
     if _same_file(out, file):
         raise ConfigError(f"{out}: is the file of boxes; give the picture another name")

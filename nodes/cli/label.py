@@ -8,10 +8,16 @@ from typing import Annotated
 
 import typer
 
+from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.labeller.server import LabelServer
+from semantic_mapper.nodes.labeller.session import LabelSession
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.launch_note import NOTE, read_launch_note
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.transport.messages import LabelledKeyframe
 
 FRAMES_TO_LABEL = 8  # that the page shows where nobody says how many
 POLL_S = 0.2
@@ -141,9 +147,7 @@ def _check_options(suggest: bool, serve: bool, given: dict[str, object]) -> None
 
 
 def _suggest(output: Output, log: Path, count: int, images: Path | None, weights: Path | None, json: bool) -> None:
-    from semantic_mapper.errors import LogError
     from semantic_mapper.nodes.cli.labelling import open_images, suggest_for_log, suggestion_table
-    from semantic_mapper.replay.log.sequence import open_log
 
     if images is not None and not images.is_dir():
         raise LogError(f"--images {images}: no such folder")
@@ -169,11 +173,7 @@ def _serve(
     weights: Path | None,
     port: int,
 ) -> int:
-    from semantic_mapper.errors import LogError
     from semantic_mapper.nodes.cli.labelling import open_images, page_folder, page_order, suggest_for_log
-    from semantic_mapper.nodes.labeller.server import LabelServer
-    from semantic_mapper.nodes.labeller.session import LabelSession
-    from semantic_mapper.replay.log.sequence import open_log
 
     with StopRequest() as stop, open_log(log) as opened:
         folder = page_folder(opened, out, classes, weights)
@@ -208,7 +208,6 @@ def _send(
     timeout: float,
 ) -> None:
     from semantic_mapper.nodes.cli.labelling import choose_keyframes, labels_endpoint, sending
-    from semantic_mapper.transport.messages import LabelledKeyframe
 
     endpoint = labels_endpoint(to)
     if "://" not in to:
@@ -229,9 +228,6 @@ def _refuse_without_finetuner(folder: Path) -> None:
     Raises:
         TransportError: the launch has no finetuner.
     """
-    from semantic_mapper.errors import TransportError
-    from semantic_mapper.nodes.supervisor.launch_note import NOTE, read_launch_note
-
     if not (folder / NOTE).exists():
         return
     note = read_launch_note(folder)

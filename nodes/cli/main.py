@@ -36,6 +36,7 @@ VERBS: Mapping[str, tuple[str, str]] = {
     "autolabel": ("autolabel:autolabel", "Label every frame of a log with weights, into a new log."),
     "label": ("label:label", "Label frames of a log by hand, suggest which, or send labelled ones to a finetuner."),
     "eval": ("eval:evaluate", "Score runs and logs: a table of figures, also as JSON and as a page of HTML."),
+    "bench": ("bench:bench", "Measure speed on this machine, on frames of 640x480."),
     "fleet": ("fleet:app", "Replay, score, label, finetune and merge many logs, on this machine or a Ray cluster."),
     "keys": ("keys:keys", "Make, show or exchange the keys by which machines know each other."),
     "doctor": ("doctor:doctor", "Look for what this machine lacks, with a fix for each thing; or list its cameras."),

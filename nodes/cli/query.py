@@ -13,18 +13,23 @@ import typer
 from semantic_mapper.client import Correction, MapClient
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import write_json
+from semantic_mapper.mapping.correction.pose_correction import ALWAYS
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file, verb
 from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.fleet.tile_reading import open_tiles
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
+from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
+from semantic_mapper.queries.graph_picture import draw_graph
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 from semantic_mapper.replay.run_folder import holds_tiles, map_path, prepare_file
 
 POLL_S = 0.2
@@ -192,8 +197,6 @@ def ask_tiles(source: str, request: Request) -> dict[str, Any]:
         ConfigError, MapError, LabelError: no tiles there, or a question that cannot be answered.
         StoreError: the store cannot be reached.
     """
-    from semantic_mapper.nodes.fleet.tile_reading import open_tiles
-
     tiled = open_tiles(source)
     match request.question:
         case Question.INFO:
@@ -255,9 +258,6 @@ def _answer_graph(source: str, graph: SceneGraph, picture: Path | None) -> dict[
         MapError: there is no floor to draw.
     """
     if picture is not None:
-        from semantic_mapper.plots import write_picture
-        from semantic_mapper.queries.graph_picture import draw_graph
-
         if not graph.floors:
             raise MapError(f"{source}: there is nothing to draw: {map_answers.NO_FLOOR}")
         write_picture(picture, draw_graph(source, graph))
@@ -295,8 +295,6 @@ def _correct(
         MapError, TransportError: the mapper is not there, or refuses them.
     """
     output = Output.guarded()
-    from semantic_mapper.mapping.correction.pose_correction import ALWAYS
-    from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 
     if "://" not in endpoint and Path(endpoint).exists():
         raise ConfigError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import typer
 
@@ -14,13 +14,16 @@ from semantic_mapper.errors import ConfigError, LogError
 from semantic_mapper.nodes.cli.options import SettingOptions
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
+from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.recorder.node import Recorder
+from semantic_mapper.nodes.recorder.node import record as record_until_end
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
+from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
+from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 from semantic_mapper.plain_text import counted
-
-if TYPE_CHECKING:
-    from semantic_mapper.nodes.node import NodeContext
-    from semantic_mapper.nodes.recorder.node import Recorder
+from semantic_mapper.replay.run_folder import prepare_file
 
 HEAR_S = 10.0  # how long the nodes, which run already, may take to answer
 
@@ -74,9 +77,6 @@ def record(
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.recorder.node import record as record_until_end
-    from semantic_mapper.nodes.supervisor.running_launches import launch_folder
-    from semantic_mapper.replay.run_folder import prepare_file
 
     prepare_file(log)
     wanted = {
@@ -146,10 +146,6 @@ def _join(
         TransportError: the launch does not say what it is.
         ConfigError: a source that is none of its nodes, or options that do not go together.
     """
-    from semantic_mapper.nodes.node import NodeContext
-    from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-    from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
-
     note = read_launch_note(folder)
     names = [node.name for node in note.nodes]
     for name in sources:

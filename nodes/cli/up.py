@@ -9,10 +9,17 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.errors import LogError
+from semantic_mapper.nodes.cli.eval import print_results
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.launch_config import load_launch
+from semantic_mapper.nodes.supervisor.launcher import Launcher
+from semantic_mapper.nodes.supervisor.packaged_files import find_launch
+from semantic_mapper.nodes.supervisor.systemd import Notifier
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.run_folder import hold_folder
 
 LaunchArgument = Annotated[
     Path,
@@ -45,13 +52,6 @@ def up(
     Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.eval import print_results
-    from semantic_mapper.nodes.options import MapperOptions
-    from semantic_mapper.nodes.supervisor.launch_config import load_launch
-    from semantic_mapper.nodes.supervisor.launcher import Launcher
-    from semantic_mapper.nodes.supervisor.packaged_files import find_launch
-    from semantic_mapper.nodes.supervisor.systemd import Notifier
-    from semantic_mapper.replay.run_folder import hold_folder
 
     checked = load_launch(find_launch(launch), settings or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]

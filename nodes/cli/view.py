@@ -20,13 +20,13 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
 from semantic_mapper.nodes.supervisor.launch_view import LaunchView
 from semantic_mapper.nodes.supervisor.running_launches import launch_folder, node_endpoints, status_endpoint
+from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.replay.run_folder import is_log, is_map, map_path
 from semantic_mapper.transport.sockets import NewestSubscriber
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-    from semantic_mapper.nodes.viewer.server import WebViewer
     from semantic_mapper.nodes.viewer.sources import Live
 
 LEAST_MEMORY_MB = 64
@@ -137,7 +137,6 @@ class _Page:
         Raises:
             DependencyError, TransportError: see ``WebViewer``.
         """
-        from semantic_mapper.nodes.viewer.server import WebViewer
         from semantic_mapper.replay.exporters.rerun_log import recording_server
 
         self._viewer = self._ends.enter_context(WebViewer(*self._settings))

@@ -15,7 +15,7 @@ app = typer.Typer(
 )
 app.command("train")(train.train)
 app.command("suite")(benchmark.benchmark)
-app.command("bench")(bench.bench)
+app.add_typer(bench.app, name="bench")
 
 
 @app.callback()

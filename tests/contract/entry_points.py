@@ -54,7 +54,7 @@ from semantic_mapper.nodes.options import (
     ZenohOptions,
 )
 from semantic_mapper.nodes.supervisor.launch_config import LaunchFile, NodeEntry, load_launch
-from semantic_mapper.replay.compare.tolerances import Tolerances
+from semantic_mapper.replay.compare import Tolerances
 from semantic_mapper.replay.corrected_poses import read_corrections
 from semantic_mapper.replay.importers.base import RenameConfig
 from semantic_mapper.replay.log.format import LogReader, LogWriter

@@ -14,7 +14,7 @@ from semantic_mapper.replay.log.atomic_file import AtomicFile
 from semantic_mapper.replay.run_folder import hold_folder
 from tests.nodes.support import run_here
 
-RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html", "compare.png")
+RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html")
 
 
 def test_no_result_is_written_through_a_link(

@@ -13,7 +13,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.artifacts import finish_session
-from semantic_mapper.replay.compare.runs import Run
+from semantic_mapper.replay.compare import Run
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import PosedFrame
 from tests.mapping import rendered_views as views

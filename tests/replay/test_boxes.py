@@ -214,7 +214,7 @@ def test_an_outline_or_mesh_is_where_it_is_drawn_wherever_its_origin_is(tmp_path
 
 
 def test_the_example_of_the_docs_is_a_file_of_boxes(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "panoptic.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text()
     (tmp_path / "boxes.json").write_text(text.split("```json")[1].split("```")[0])
     car, road = load_boxes(tmp_path / "boxes.json").primitives
     assert (car.thing, road.thing) == (True, False)

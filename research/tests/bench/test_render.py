@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-import research.bench.fusion as bench_map
 import research.bench.render as bench
-from research.bench.fusion import bench_fusion, bench_pipeline, bench_qualities
-from research.bench.plots import draw_pipeline, step_parts
 from research.bench.render import bench_render, log_scenes, room_scenes
-from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.sray_streaming import StreamingSRay
@@ -73,38 +69,3 @@ def test_views_of_a_log_are_rendered_from_the_frames_round_them(tmp_path):
     assert [f.seq for f in scenes[0].sources] == [0, 1, 2, 3, 5, 6, 7, 8]
     with pytest.raises(LogError, match="2 scenes need 42 frames, the log has 14"):
         log_scenes(path, 2)
-
-
-def test_fusion_is_measured_against_open3d():
-    found = bench_fusion(frames=1, voxel_size_m=0.08)
-    assert found["ratio_20"] == pytest.approx(found["ms_20"] / found["open3d_ms"], rel=0.1)
-    assert found["ratio_40"] > 0
-    assert found["blocks"] >= 0.9 * found["open3d_blocks"] > 0  # Open3D looks at every fourth pixel
-
-
-def test_the_stages_of_a_step_are_drawn_by_quality(monkeypatch):
-    measured = []
-    stages = {"encode": 29.0, "render": 100.0, "choose": 0.2}
-
-    def bench(weights, config, frames):
-        measured.append((config.quality, config.sampling.guided, frames))
-        return {"size": "640x480", "p50_ms": 140.0, "stages_ms": stages}
-
-    monkeypatch.setattr(bench_map, "bench_pipeline", bench)
-    known = {"size": "640x480", "p50_ms": 90.0, "stages_ms": stages}
-    found = bench_qualities(None, MapperConfig(quality="fast"), 7, known)
-    assert list(found) == ["fast", "balanced"] and found["fast"] is known
-    assert measured == [("balanced", 4, 7)]
-    assert step_parts(found["balanced"]) == {"encode": 29.0, "render": 100.0, "rest": pytest.approx(11.0)}
-    assert step_parts(known) == {"encode": 29.0, "render": 100.0}, "medians may add up to more than the median"
-    assert draw_pipeline(found).shape[1] > 900
-
-
-def test_pipeline_reports_its_rate_its_stages_and_what_the_labels_are_worth():
-    config = with_quality(MapperConfig(quality="fast"))
-    found = bench_pipeline(None, config, frames=1)
-    assert found["hz"] > 0 and found["p95_ms"] >= found["p50_ms"]
-    assert {"encode", "render", "lift", "fuse"} <= set(found["stages_ms"])
-    assert sum(found["stages_ms"].values()) <= found["p95_ms"] * 1.05
-    assert 0.1 < found["miou"] <= 1
-    assert 1200 <= found["rays"] <= 0.2 * 160 * 120

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-import research.bench.growth as bench_growth_module
 import research.bench.plots as plots_module
 import research.bench.walk as bench_walk_module
-from research.bench.growth import bench_growth
-from research.bench.plots import GROWTH_LABELS, draw_growth, draw_walk
+from research.bench.plots import draw_walk
 from research.bench.walk import WalkPlan, bench_walk, first_and_last, slope_percent
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.pipeline import MappingPipeline
@@ -111,52 +109,11 @@ def test_what_comes_back_is_what_a_map_without_a_limit_holds() -> None:
     assert paged.block_state(some)["evidence"].tobytes() == one["evidence"][::7].tobytes()
 
 
-def test_growth_changes_one_setting_at_a_time(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    axes = {
-        "classes": (3,),
-        "voxel_cm": (10, 5),
-        "views": (2, 6),
-        "samples": (4,),
-        "ray_share": (0.3, 1.0),
-        "blocks": (0, 2),
-    }
-    monkeypatch.setattr(bench_growth_module, "AXES", axes)
-    done: list[int] = []
-    found = {(run["axis"], run["value"]): run for run in bench_growth(weights, CONFIG, 1, 96, done.append)}
-    assert done == list(range(1, 11)) and len(found) == 10
-    assert 2 * found["voxel_cm", 10]["blocks"] < found["voxel_cm", 5]["blocks"]
-    assert found["ray_share", 0.3]["rays"] < found["ray_share", 1.0]["rays"] == 24 * 18
-    (filled,) = (run for (axis, value), run in found.items() if axis == "blocks" and value > 0)
-    alone = found["blocks", 0]["blocks"]
-    assert filled["value"] == pytest.approx(2 * alone, rel=0.1) and filled["blocks"] == pytest.approx(
-        3 * alone, rel=0.1
-    )
-    assert all(0 < run["fuse_ms"] < run["step_ms"] for run in found.values())
-    assert all(run["cpu_ms"] > 0 and 1 <= run["views"] <= 2 for run in found.values() if run["value"] != 6)
-    assert found["views", 2]["views"] == 2 and found["views", 6]["views"] > 4, "as many as are allowed, or nearly"
-
-
 def drawn_panels(monkeypatch: pytest.MonkeyPatch) -> list[Panel]:
     """Filled with the panels that are drawn."""
     panels: list[Panel] = []
     monkeypatch.setattr(plots_module, "draw_panels", lambda title, drawn: panels.extend(drawn))
     return panels
-
-
-def test_growth_is_drawn_with_a_panel_for_each_setting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs may come in any order; a setting without runs has an empty panel."""
-    assert set(GROWTH_LABELS) == set(bench_growth_module.AXES)
-    times = {"cpu_ms": 3.0, "render_ms": 2.0, "fuse_ms": 1.0}
-    runs = [
-        {"axis": axis, "value": value, "step_ms": 10.0 * value, **times} for axis in GROWTH_LABELS for value in (2, 1)
-    ]
-    assert draw_growth(runs, "growth").shape[1] > 1000
-    panels = drawn_panels(monkeypatch)
-    draw_growth(runs[:-2], "growth")
-    assert [panel.x_label for panel in panels] == list(GROWTH_LABELS.values()) and not panels[-1].curves
-    for panel in panels[:-1]:
-        curves = {curve.name: list(curve.points) for curve in panel.curves}
-        assert curves["step"] == [(1, 10), (2, 20)] and curves["rendering"] == [(1, 2), (2, 2)]
 
 
 def test_slopes_are_in_percent_of_the_mean() -> None:

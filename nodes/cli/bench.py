@@ -1,0 +1,68 @@
+"""``semantic-mapper bench``: measure speed on this machine, as ratios between things measured in one run."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from semantic_mapper.nodes.cli.options import MapperSettings, WeightsOption
+from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
+from semantic_mapper.nodes.console import Output
+from semantic_mapper.replay.log.demo import demo_log
+
+
+@verb
+def bench(
+    mapper: MapperSettings,
+    part: Annotated[Literal["fusion", "pipeline"], typer.Argument(help="What to measure.")] = "pipeline",
+    log: Annotated[Path | None, typer.Option(help="Log with depth to measure on; without it that of `demo`.")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 20,
+    weights: WeightsOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Measure speed on this machine, on frames of 640x480.
+
+    fusion: frames into 2 cm voxels, ours with 20 and 40 classes against Open3D's own without any. pipeline: whole
+    steps, frames in, the semantic map out. Quote ratios, not seconds: seconds depend on the machine and its load.
+
+    Example: semantic-mapper bench pipeline --frames 30 --quality fast
+    Example: semantic-mapper bench fusion --json
+    """
+    must_be_there(*(path for path in (log, mapper.path) if path is not None))
+    output = Output.guarded()
+    from semantic_mapper.replay.artifacts import versions
+    from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
+
+    output.quiet = json
+    log = log or demo_log()
+    found: dict[str, Any]
+    if part == "fusion":
+        found = bench_fusion(log, frames)
+        output.print(
+            f"fusion of 640x480 into {found['voxel_size_m'] * 100:g} cm voxels: Open3D {found['open3d_ms']} ms a frame "
+            f"without classes, ours {found['ms_20']} ms with 20 ({found['ratio_20']} times) and {found['ms_40']} ms "
+            f"with 40 ({found['ratio_40']} times)"
+        )
+    else:
+        found = bench_pipeline(log, weights, mapper.load(), frames)
+        stages = ", ".join(f"{name} {value}" for name, value in found["stages_ms"].items())
+        score = "" if found["miou"] is None else f"mIoU {found['miou'] * 100:.1f} %; "
+        output.print(
+            f"pipeline at {found['size']}, {found['depth']} depth: {found['hz']} frames/s, a step {found['p50_ms']} ms "
+            f"(p50), {found['p95_ms']} ms (p95); {score}stages in ms: {stages}"
+        )
+    found["machine"] = {"cpu": cpu_name(), "versions": versions()}
+    output.print(f"on {found['machine']['cpu']}")
+    if json:
+        output.json(found)
+
+
+def cpu_name() -> str:
+    """Model name of the processor."""
+    for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
+    return platform.machine()
