@@ -36,7 +36,7 @@ def compare(
     exact: Annotated[bool, typer.Option("--exact", help="The maps must be the same, byte for byte.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
-    """Compare two runs of one log: counts of frames, scores, and how far the maps are apart.
+    """Compare two runs of one log: counts, scores, and how far the maps are apart.
 
     Exit codes: 0 equal, 1 different, 2 wrong usage, or something that cannot be read.
 

@@ -82,7 +82,7 @@ def label(
     ] = 9092,
     json: Annotated[bool, typer.Option("--json", help="--suggest: print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
-    """Label frames of a log by hand (--serve), say which to label (--suggest), or send labelled ones to a finetuner.
+    """Label frames of a log by hand (--serve), or say which to label (--suggest); or send labelled ones to a finetuner.
 
     --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a
     person paints on them, saves each stroke at once, and shows what strokes grow to. `finetune --labels DIR --strokes`

@@ -22,9 +22,9 @@ class _Inner(Config, frozen=True):
 class _Outer(Config, frozen=True):
     """With a table."""
 
+    path: str
     inner: _Inner = _Inner()
     names: tuple[str, ...] = ()  # of all
-    path: str
 
 
 def test_the_page_is_that_of_the_declarations() -> None:

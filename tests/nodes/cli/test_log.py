@@ -143,7 +143,7 @@ def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> Non
     damaged.write_bytes(content[: len(content) * 9 // 10])
     told = run("info", damaged)
     assert told.returncode == 1
-    assert "damaged:" in told.stdout and "semantic-mapper recover" in told.stdout
+    assert "damaged:" in told.stdout and "semantic-mapper import" in told.stdout
     clean = tmp_path / "clean.mcap"
     done = run("import", damaged, clean)
     assert done.returncode == 0, done.stderr

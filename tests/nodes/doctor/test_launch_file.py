@@ -39,7 +39,7 @@ def test_addresses_are_told_with_who_has_them() -> None:
         taken = f"tcp://127.0.0.1:{other.getsockname()[1]}"
         found = of(ROBOT, f"query={taken}", "status=tcp://127.0.0.1:0", "publish=tcp://127.0.0.1:0")
         everywhere = taken.replace("127.0.0.1", "0.0.0.0")
-        assert doctor_launch.port_is_taken(int(taken.rpartition(":")[2]), "0.0.0.0")
+        assert doctor_launch._port_is_taken(int(taken.rpartition(":")[2]), "0.0.0.0")
     assert [(c.state, c.found) for c in found["address"]] == [
         ("ok", "tcp://127.0.0.1:0"),
         ("note", f"{taken} is in use (by this very launch, if it runs)"),
