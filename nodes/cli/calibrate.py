@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from semantic_mapper.config import load_config
-from semantic_mapper.drivers.calibrating.sheet import sheet_png
-from semantic_mapper.drivers.calibrating.solve import Calibration, solve
+from semantic_mapper.drivers.calibrating.rig import Calibration, solve
+from semantic_mapper.drivers.poses.board import sheet_png
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.calibration.report import (
     CalibrationSettings,
@@ -19,8 +19,7 @@ from semantic_mapper.nodes.calibration.report import (
     write_stereo,
     write_whole,
 )
-from semantic_mapper.nodes.calibration.run import Gathering
-from semantic_mapper.nodes.calibration.sources import check_places, parse_sources, parse_stereo
+from semantic_mapper.nodes.calibration.sources import Gathering, check_places, parse_sources, parse_stereo
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest

@@ -14,7 +14,7 @@ from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers import ImportOptions, ImportReport, RenameConfig, import_recording
-from semantic_mapper.replay.log.recover import recover
+from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 
 LISTED = 10  # skipped files and losses that are shown one by one

@@ -26,8 +26,7 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.box_picture import draw_boxes
-from semantic_mapper.replay.box_times import with_times
-from semantic_mapper.replay.boxes import BoxFile, load_boxes
+from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_times
 from semantic_mapper.replay.log.gaps import find_gaps, gaps_text
 from semantic_mapper.replay.log.sequence import LogSequence, open_log, read_part
 from semantic_mapper.replay.run_folder import is_map, map_path, prepare_file
@@ -385,8 +384,7 @@ def _describe_boxes(found: BoxFile) -> dict[str, Any]:
         for box in found.primitives
     ]
     merge = {name: list(rest) for name, rest in found.merge.items()}
-    bad = [{"number": b.number, "id": b.id, "problem": b.problem} for b in found.bad]
-    return {"boxes": listed, "merge": merge, "left_out": found.left_out, "bad": bad}
+    return {"boxes": listed, "merge": merge, "left_out": found.left_out, "bad": list(found.bad)}
 
 
 def _box_table(title: str, found: BoxFile) -> Table:

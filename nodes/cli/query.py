@@ -14,12 +14,10 @@ from semantic_mapper.client import Correction, MapClient
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import write_json
 from semantic_mapper.mapping.correction.pose_correction import ALWAYS
-from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file, verb
 from semantic_mapper.nodes.console import Output, frame_progress
-from semantic_mapper.nodes.fleet.tile_reading import open_tiles
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
@@ -30,7 +28,7 @@ from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
-from semantic_mapper.replay.run_folder import holds_tiles, map_path, prepare_file
+from semantic_mapper.replay.run_folder import map_path, prepare_file
 
 POLL_S = 0.2
 
@@ -68,8 +66,7 @@ def query(
         str,
         typer.Argument(
             metavar="MAP",
-            help="Saved map, folder of results, `live` for the launch that runs here, ipc://PATH, tcp://HOST:PORT, or "
-            "folder or URL of tiles (`fleet merge`).",
+            help="Saved map, folder of results, `live` for the launch that runs here, ipc://PATH or tcp://HOST:PORT.",
         ),
     ],
     question: Annotated[
@@ -125,8 +122,7 @@ def query(
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
     things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
     that `refine` has told things apart in, those. graph: floors, their rooms, which part at doors, the doors between
-    them, and the same things with their rooms. Of a map in tiles, only tiles that an answer needs are in memory; graph
-    needs all.
+    them, and the same things with their rooms.
 
     correct moves the map of a running mapper to corrected poses (TUM: stamp tx ty tz qx qy qz qw), such as after a
     loop closure. The mapper has to keep its frames (`history.max_frames` in its config). It goes on mapping, and
@@ -142,8 +138,7 @@ def query(
         (file,) = _arguments_of(question, arguments or [])
         return _correct(source, Path(file), camera, apply_until, remote, wait=wait, json=json)
     class_name, point = _read_arguments(question, arguments or [])
-    in_tiles = holds_tiles(source)
-    endpoint = "" if in_tiles else map_endpoint(source)
+    endpoint = map_endpoint(source)
     if gone and not (endpoint and question is Question.INSTANCES):
         raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
     if picture is not None and question is not Question.GRAPH:
@@ -153,7 +148,7 @@ def query(
     for path in (out, picture):
         if path is not None:
             prepare_file(path)
-    ask = ask_tiles if in_tiles else ask_mapper if endpoint else ask_file
+    ask = ask_mapper if endpoint else ask_file
     request = Request(question, class_name, point, up, min_confidence, remote, gone, picture)
     found = {"map": source, **ask(endpoint or source, request)}
     if out is not None:
@@ -187,36 +182,6 @@ def ask_file(source: str, request: Request) -> dict[str, Any]:
             up = request.up or _find_up(snapshot)
             return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot), by)
         case _:  # the graph
-            return _answer_graph(source, GraphTracker(request.up).update(snapshot), request.picture)
-
-
-def ask_tiles(source: str, request: Request) -> dict[str, Any]:
-    """The same of a map in tiles.
-
-    Raises:
-        ConfigError, MapError, LabelError: no tiles there, or a question that cannot be answered.
-        StoreError: the store cannot be reached.
-    """
-    tiled = open_tiles(source)
-    match request.question:
-        case Question.INFO:
-            return map_answers.describe_tiles(tiled.manifest)
-        case Question.AT:
-            return map_answers.answer_at(tiled.manifest.label_set, request.point, tiled.at([request.point]))
-        case Question.NEAREST:
-            hit = tiled.nearest(request.class_name, request.point, request.min_confidence)
-            return map_answers.answer_nearest(request.class_name, request.point, hit)
-        case Question.INSTANCES:
-            up = request.up
-            if up is None:
-                points = tiled.points()
-                try:
-                    up = tuple(find_up(points, tiled.manifest.label_set).tolist())
-                except MapError:
-                    up = map_answers.UP
-            return map_answers.answer_instances(up, tiled.instances(up=up), map_answers.CONNECTED)
-        case _:  # the graph
-            snapshot = MapMirror.of(tiled.load()).snapshot()
             return _answer_graph(source, GraphTracker(request.up).update(snapshot), request.picture)
 
 
