@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from benchmarks.foxglove_client import FoxgloveClient
 from semantic_mapper.nodes.bridge.feed import lower_priority
-from semantic_mapper.nodes.supervisor.heartbeat import end_with_launcher
+from semantic_mapper.nodes.launcher.liveness import end_with_launcher
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import StreamInfo

@@ -33,8 +33,8 @@ from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes, default_checkpoint_path, load_checkpoint
 from semantic_mapper.files import write_json
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.nodes.launcher.processes import NodeProcess
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
 from semantic_mapper.replay.evaluate.truth import TruthMapper
 from semantic_mapper.replay.log.format import LogReader

@@ -59,7 +59,7 @@ def correct(
     output = Output.guarded()
     from semantic_mapper.client import MapClient
     from semantic_mapper.mapping.correction.pose_correction import ALWAYS
-    from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
+    from semantic_mapper.nodes.launcher.running import map_endpoint
     from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 
     if "://" not in endpoint and Path(endpoint).exists():

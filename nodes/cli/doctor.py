@@ -29,14 +29,14 @@ def doctor(
     """Look for what this machine lacks, with a mend for each thing; exit code 1 where something needed is missing.
 
     Example: semantic-mapper doctor
-    Example: semantic-mapper doctor launch/headless-onboard.toml --set keys=~/.config/semantic-mapper/keys
+    Example: semantic-mapper doctor onboard --set keys=~/.config/semantic-mapper/keys
     """
     output = Output.guarded()
     from rich.table import Table
     from rich.text import Text
 
     from semantic_mapper.nodes.doctor.machine import examine
-    from semantic_mapper.nodes.supervisor.packaged_files import find_launch
+    from semantic_mapper.nodes.launcher.launch_file import find_launch
 
     checks = examine(find_launch(launch) if launch else None, settings or ())
     if json:

@@ -225,7 +225,7 @@ def _refuse_without_finetuner(folder: Path) -> None:
         TransportError: the launch has no finetuner.
     """
     from semantic_mapper.errors import TransportError
-    from semantic_mapper.nodes.supervisor.launch_note import NOTE, read_launch_note
+    from semantic_mapper.nodes.launcher.running import NOTE, read_launch_note
 
     if not (folder / NOTE).exists():
         return

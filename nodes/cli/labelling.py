@@ -11,8 +11,8 @@ from semantic_mapper.errors import LabelError, LogError, TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, choose_labelled
+from semantic_mapper.nodes.launcher.running import running_launches
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.running_launches import running_launches
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.finetune import FinetuneConfig

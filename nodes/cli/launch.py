@@ -34,7 +34,7 @@ def list_(
     from rich.box import SIMPLE
     from rich.table import Table
 
-    from semantic_mapper.nodes.supervisor.packaged_files import launch_files
+    from semantic_mapper.nodes.launcher.launch_file import launch_files
 
     files = launch_files()
     if json:
@@ -66,7 +66,7 @@ def copy(
 ) -> None:
     """Copy a launch file, to change it.
 
-    Example: semantic-mapper launch copy oak robot.toml
+    Example: semantic-mapper launch copy camera robot.toml
     """
     output = Output.guarded()
     from semantic_mapper.errors import ConfigError
@@ -82,7 +82,7 @@ def copy(
 
 
 def _find(name: str) -> Path:
-    from semantic_mapper.nodes.supervisor.packaged_files import find_launch, launch_files
+    from semantic_mapper.nodes.launcher.launch_file import find_launch, launch_files
 
     files = launch_files()
     return files[name] if name in files else find_launch(Path(name))

@@ -13,7 +13,7 @@ from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
-from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
+from semantic_mapper.nodes.launcher.running import map_endpoint
 
 if TYPE_CHECKING:
     from semantic_mapper.queries.graph import SceneGraph

@@ -51,14 +51,14 @@ def record(
 
     The log keeps the calibration and the launch's settings as attachments. Exit code 1 where something is missing,
     such as where the disk was full; what was written is whole. A launch can also have a recorder of its own
-    (launch/record.toml).
+    (`--set recorder.enabled=true`).
 
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
     output = Output.guarded()
     from semantic_mapper.nodes.cli.outputs import prepare_file
+    from semantic_mapper.nodes.launcher.running import launch_folder
     from semantic_mapper.nodes.recorder.node import record as record_until_end
-    from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 
     prepare_file(log)
     wanted = {
@@ -133,10 +133,10 @@ def _join(
     """
     from semantic_mapper.config import convert_config
     from semantic_mapper.errors import ConfigError
+    from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
+    from semantic_mapper.nodes.launcher.running import read_launch_note
     from semantic_mapper.nodes.node import NodeContext
     from semantic_mapper.nodes.options import RecorderOptions
-    from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-    from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
 
     note = read_launch_note(folder)
     names = [node.name for node in note.nodes]

@@ -52,7 +52,7 @@ def top(
         raise typer.BadParameter("--json goes with --once")
     output = Output.guarded()
     from semantic_mapper.nodes.cli.top_table import LaunchView
-    from semantic_mapper.nodes.supervisor.running_launches import status_endpoint
+    from semantic_mapper.nodes.launcher.running import status_endpoint
     from semantic_mapper.transport.sockets import NewestSubscriber
 
     if not output.console.is_terminal:

@@ -10,7 +10,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
-from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
+from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.plain_text import visible
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber

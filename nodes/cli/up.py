@@ -24,7 +24,11 @@ def up(
     launch: LaunchArgument,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Replace a value of the file's [set] table; may be repeated."),
+        typer.Option(
+            "--set",
+            metavar="NODE.OPTION=VALUE",
+            help="Set an option of a node, or `out`, `restart`, ...; may be repeated.",
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results; the same as --set out=DIR.")
@@ -37,17 +41,16 @@ def up(
     where the launch file says so it is restarted first (`restart`). The exit code is 1, too, where a recorder knows at
     its end that frames are not in its log. `semantic-mapper top` shows how the nodes are.
 
-    Example: semantic-mapper up replay --set log=kitchen.mcap --out runs/up
-    Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
+    Example: semantic-mapper up replay --set camera.log=kitchen.mcap --out runs/up
+    Example: semantic-mapper up camera --set camera.kind=oak
     """
     output = Output.guarded()
     from semantic_mapper.nodes.cli.outputs import hold_folder
     from semantic_mapper.nodes.cli.results import print_results
+    from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
+    from semantic_mapper.nodes.launcher.launcher import Launcher
+    from semantic_mapper.nodes.launcher.systemd import Notifier
     from semantic_mapper.nodes.options import MapperOptions
-    from semantic_mapper.nodes.supervisor.launch_config import load_launch
-    from semantic_mapper.nodes.supervisor.launcher import Launcher
-    from semantic_mapper.nodes.supervisor.packaged_files import find_launch
-    from semantic_mapper.nodes.supervisor.systemd import Notifier
 
     checked = load_launch(find_launch(launch), settings or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]

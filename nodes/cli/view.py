@@ -161,8 +161,7 @@ def _find_live(source: str, query: str, server: str, keys: Path | None) -> Live:
     Raises:
         TransportError: none runs here, several do, or the folder is none of a launch.
     """
-    from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
-    from semantic_mapper.nodes.supervisor.running_launches import launch_folder, node_endpoints
+    from semantic_mapper.nodes.launcher.running import launch_folder, node_endpoints, read_launch_note
 
     folder = None if "://" in source else launch_folder(source)
     from semantic_mapper.nodes.viewer.sources import Live

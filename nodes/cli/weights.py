@@ -49,7 +49,7 @@ def weights(
     """
     output = Output.guarded()
     from semantic_mapper.client import MapClient
-    from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
+    from semantic_mapper.nodes.launcher.running import map_endpoint
 
     endpoint = map_endpoint(endpoint) or endpoint
     with MapClient(endpoint, identity=server_identity(server, keys)) as client:

@@ -24,8 +24,8 @@ OAK_VENDOR = "03e7"  # USB id of what an OAK is before and after its start
 OAK_RULE = f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{OAK_VENDOR}", MODE="0666"'
 REALSENSE_VENDOR = "8086"
 REALSENSE_RULE = f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{REALSENSE_VENDOR}", MODE="0666"'
-# Of the launch files: poses, questions, status, updates, the remote viewer, Zenoh, Foxglove; of `view`: page and data.
-PORTS = (5560, 5561, 5562, 5563, 5570, 7447, 8765, WEB_PORT, DATA_PORT)
+# Of the launch files: poses, questions, status, updates, the remote viewer, Foxglove; of `view`: page and data.
+PORTS = (5560, 5561, 5562, 5563, 5570, 8765, WEB_PORT, DATA_PORT)
 LEAST_FILES = 1024
 LEAST_SHM_MB = 64
 TIMESYNC = Path("/run/systemd/timesync")

@@ -21,8 +21,8 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.nesf import find_nesf
 from semantic_mapper.mapping.refine import shared_classes
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.launcher.processes import node_environment
 from semantic_mapper.nodes.mapper.refining import REFINED_NAME, Job, read_changes
-from semantic_mapper.nodes.supervisor.node_process import node_environment
 from semantic_mapper.queries.mirror import MapMirror
 
 FINISH_S = 60.0  # for the map at the end

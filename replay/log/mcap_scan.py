@@ -186,7 +186,7 @@ def scan(fd: int, where: str) -> Scan:
     if sum(x == y for x, y in zip(magic, MAGIC, strict=False)) < len(MAGIC) - 1:  # one damaged byte is no reason
         raise LogError(
             f"{where}: not an MCAP log ({_what_is(os.pread(fd, 16, 0))}); make one with `semantic-mapper import` or by "
-            "`semantic-mapper up launch/record.toml`"
+            "`semantic-mapper up replay --set recorder.enabled=true`"
         )
     heads = _Heads(fd)
     at = sure = len(MAGIC)

@@ -15,7 +15,7 @@ import yaml
 
 from benchmarks.ray_nodes import free_port, ray_nodes
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.supervisor.packaged_files import LAUNCH_FOLDER
+from semantic_mapper.nodes.launcher.launch_file import LAUNCH_FOLDER
 
 ray = pytest.importorskip("ray")
 

@@ -192,8 +192,14 @@ def test_a_mapper_that_does_not_refine_says_so() -> None:
 def test_a_launch_maps_the_same_with_it(tmp_path: Path, log: Path, weights: Path, config: Path) -> None:
     text = REPLAY_LAUNCH.read_text(encoding="utf-8")
     launch = tmp_path / "refining.toml"
-    launch.write_text(text.replace('query = "{query}"\n', 'query = "{query}"\nrefine_every_s = 0.01\n'))
-    sets = [f"log={log}", f"weights={weights}", f"config={config}", "save_every=0.1", "query="]
+    launch.write_text(text.replace('delivery = "all"\n', 'delivery = "all"\nrefine_every_s = 0.01\n'))
+    sets = [
+        f"camera.log={log}",
+        f"mapper.weights={weights}",
+        f"mapper.config={config}",
+        "mapper.save_every_s=0.1",
+        "mapper.query=",
+    ]
     words = [w for s in sets for w in ("--set", s)]
     for name, file in (("with", launch), ("without", REPLAY_LAUNCH)):
         with Running("up", file, *words, "--out", tmp_path / name) as running:

@@ -32,13 +32,12 @@ from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, r
 from semantic_mapper.nodes.cli.saved_maps import is_log
 from semantic_mapper.nodes.cli.scoring import ScoreRequest, score_log
 from semantic_mapper.nodes.frame_gaps import MAX_MISSED
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
+from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote, read_launch_note
-from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
