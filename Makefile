@@ -19,7 +19,7 @@ PYTEST := OMP_NUM_THREADS=1 $(TESTS)
 # Without bytecode, each process that a test starts would compile its packages again: seconds of CPU.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-loaded test-slow test-all test-v4l2 test-web check bench wheels docs format lock clean
+.PHONY: help setup demo test test-loaded test-slow test-research nightly test-v4l2 test-web check bench wheels docs format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -43,14 +43,19 @@ test-loaded: $(READY)  ## run the quick tests beside two busy processes, then on
 test-slow: $(READY)  ## run the slow tests: crash rounds, launches, learning, training
 	$(PYTEST) -m slow
 
-test-all: $(READY)  ## run all tests
+test-research: $(READY)  ## run the tests of research/
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest research/tests -n 2 --dist worksteal --max-worker-restart 0
+
+nightly: $(READY)  ## run all tests, those of research, and everything on a bare machine
 	$(PYTEST)
+	$(MAKE) test-research
+	tools/bare_machine.sh "make demo && make test"
 
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
-	.venv/bin/python -m benchmarks.v4l2_machine
+	.venv/bin/python -m research.experiments.v4l2_machine
 
 test-web: $(READY)  ## look at the viewer and the labelling page in a headless browser
-	.venv/bin/python -m benchmarks.web_viewer_check
+	.venv/bin/python -m research.experiments.web_viewer_check
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests/nodes/labeller/test_page.py
 
 check: $(READY)  ## formatting, lint, types, import contracts

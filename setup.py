@@ -46,8 +46,8 @@ def source_digest() -> str:
     return digest.hexdigest()
 
 
-def build_kernels(folder: Path, machine: str) -> list[Path]:
-    """Compile all C sources into one shared library a variant; returns the libraries in ``folder``."""
+def build_kernels(folder: Path, machine: str, sources: Path = SOURCES, headers: tuple[Path, ...] = ()) -> list[Path]:
+    """Compile all C of a folder into one shared library a variant; returns the libraries in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     built: list[Path] = []
     with tempfile.TemporaryDirectory() as cache:  # also where the home folder cannot be written to
@@ -57,7 +57,7 @@ def build_kernels(folder: Path, machine: str) -> list[Path]:
             partial = Path(cache) / library.name
             command = [sys.executable, "-m", "ziglang", "cc", f"--target={machine}-linux-gnu.{GLIBC}"]
             command += [f"-mcpu={processor}", *FLAGS, f'-DSOURCE_DIGEST="{source_digest()}"', "-o", str(partial)]
-            command += [*map(str, sorted(SOURCES.glob("*.c"))), "-lm"]
+            command += [*(f"-I{path}" for path in headers), *map(str, sorted(sources.glob("*.c"))), "-lm"]
             subprocess.run(command, env=environment, check=True)
             beside = library.with_suffix(".new")
             beside.write_bytes(partial.read_bytes())

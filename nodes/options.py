@@ -115,11 +115,6 @@ class MapperOptions(Config, frozen=True):
     # process leaves. It costs one frame the time to copy what it touches (some 20 ms), and the next ones up to half of
     # a core while it is written. 0 = only at the end.
     save_every_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
-    # Refine what was saved (`semantic-mapper refine`) every n seconds, in a process of its own that computes only while
-    # nobody else wants the processor, and once more at the end: to ``refined.npz`` in ``out``, and for clients that ask
-    # for it (``MapClient(refined=True)``). Mapping goes on from the raw votes. Needs save_every_s. 0 = never.
-    refine_every_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
-    refine_weights: str = ""  # as `refine --weights`; empty = those that ship, where the classes are theirs
     # Where questions about the map are answered: a name, or an endpoint (ipc://PATH, tcp://127.0.0.1:PORT; with keys
     # also tcp://0.0.0.0:PORT, for other machines); empty = nowhere. A name stands for a socket among those of the
     # launch, or of this user where the node is started by hand.
@@ -138,12 +133,6 @@ class MapperOptions(Config, frozen=True):
     # Folder of keys (`semantic-mapper keys`): questions and what is published are encrypted, and for its peers alone;
     # empty = none.
     keys: str = ""
-
-    def __post_init__(self) -> None:
-        if self.refine_every_s and not self.save_every_s:
-            raise ValueError("refine_every_s refines what save_every_s saves: give both")
-        if self.refine_weights and not self.refine_every_s:
-            raise ValueError("refine_weights goes with refine_every_s")
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""

@@ -18,7 +18,7 @@ from semantic_mapper.evaluation.overview import ViewStrip, draw_overview
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.files.formats.ply import write_ply
+from semantic_mapper.mapping.files.formats import write_ply
 from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
@@ -94,7 +94,7 @@ def write_artifacts(
 
 def clear_results(out: Path) -> None:
     """Take away what an earlier run left beside its map: beside the next one, it would be of another map."""
-    for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html", "compare.png"):
+    for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html"):
         (out / name).unlink(missing_ok=True)
 
 

@@ -1,7 +1,4 @@
-"""Replays inside tests: a log goes through the very pipeline of a robot, and the map is there to be asserted on.
-
-Importing this loads nothing heavy: PyTorch and Open3D come with the first replay.
-"""
+"""Replays inside tests: a log goes through the very pipeline of a robot, and the map is there to be asserted on."""
 
 from __future__ import annotations
 
@@ -10,18 +7,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml
 from semantic_mapper.errors import LogError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from semantic_mapper.config import MapperConfig
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.queries.nearest import NearestSurface
-    from semantic_mapper.queries.snapshot import MapSnapshot
-    from semantic_mapper.replay.compare.runs import Comparison
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.nearest import NearestSurface, nearest
+from semantic_mapper.queries.occupancy import State, occupancy
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.replay.compare import MAP_FILE, Comparison, Run, Tolerances, compare_runs, read_run
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.session import MapSession
+from semantic_mapper.replay.summary import SUMMARY_FILE
+from semantic_mapper.types import PosedFrame
 
 UPDATE_OPTION = "--update-runs"
 
@@ -53,8 +57,6 @@ class ReplayedMap:
     @cached_property
     def snapshot(self) -> MapSnapshot:
         """For all queries of ``semantic_mapper.queries``."""
-        from semantic_mapper.queries.mirror import MapMirror
-
         return MapMirror.of(self.voxel_map).snapshot()
 
     def class_at(self, point: ArrayLike, radius_m: float | None = None) -> str | None:
@@ -63,10 +65,6 @@ class ReplayedMap:
         Raises:
             MapError: not a point, or a radius beyond what ``queries.lookup.at`` takes.
         """
-        import numpy as np
-
-        from semantic_mapper.queries.lookup import at
-
         labels, found = self.snapshot.label_set, int(at(self.snapshot, np.asarray(point)[None], radius_m).label[0])
         return None if found == labels.ignore_id else labels.names[labels.ids.index(found)]
 
@@ -77,8 +75,6 @@ class ReplayedMap:
             LabelError: no such class; lists those there are.
             MapError: not a point.
         """
-        from semantic_mapper.queries.nearest import nearest
-
         return nearest(self.snapshot, class_name, point, min_confidence)
 
     def is_free(self, point: ArrayLike) -> bool:
@@ -87,10 +83,6 @@ class ReplayedMap:
         Raises:
             MapError: not a point.
         """
-        import numpy as np
-
-        from semantic_mapper.queries.occupancy import State, occupancy
-
         return int(occupancy(self.snapshot, np.asarray(point)[None])[0]) == State.FREE
 
     @property
@@ -131,17 +123,12 @@ class ReplayedMap:
 
         Args:
             stored: The run; a relative path begins at pytest's root folder.
-            tolerances: By field, as of ``semantic_mapper.replay.compare.tolerances.Tolerances``.
+            tolerances: As of ``semantic_mapper.replay.compare.Tolerances``: score, surface_m, labels.
 
         Raises:
             ConfigError: no such field, or a folder without a run.
             MapError: no such map, or a damaged one.
         """
-        from semantic_mapper.config import convert_config
-        from semantic_mapper.replay.compare.runs import compare_runs
-        from semantic_mapper.replay.compare.tolerances import Tolerances
-        from semantic_mapper.replay.run_folder import Run, read_run
-
         allowed = convert_config(tolerances, Tolerances, "tolerances")
         earlier = read_run(self.root / stored)
         return compare_runs(earlier, Run(str(self.folder), self.voxel_map, self.summary), allowed)
@@ -152,9 +139,6 @@ class ReplayedMap:
         Raises:
             OSError: it cannot be written.
         """
-        from semantic_mapper.replay.run_folder import MAP_FILE
-        from semantic_mapper.replay.summary import SUMMARY_FILE
-
         folder = self.root / target
         folder.mkdir(parents=True, exist_ok=True)
         for name in (MAP_FILE, SUMMARY_FILE):
@@ -163,14 +147,11 @@ class ReplayedMap:
     def assert_like(self, stored: Path | str, **tolerances: float) -> None:
         """Fail where this run is not as an earlier one within tolerances; see ``compare``.
 
-        ``pytest --update-runs`` stores this run there instead. A failure names what differs, and a picture of it.
+        ``pytest --update-runs`` stores this run there instead. A failure names what differs.
 
         Raises:
             AssertionError: it differs, or no run is stored there.
         """
-        from semantic_mapper.plots import write_picture
-        from semantic_mapper.replay.compare.picture import draw_comparison
-
         target = self.root / stored
         if self.update:
             self.store(target)
@@ -179,10 +160,8 @@ class ReplayedMap:
             raise AssertionError(f"no run is stored at {target}; look at {self.folder}, then `pytest {UPDATE_OPTION}`")
         comparison = self.compare(stored, **tolerances)
         if not comparison.equal:
-            picture = self.folder / "compare.png"
-            write_picture(picture, draw_comparison(comparison))
-            lines = [f"the map is not as {target}; see {picture}", *comparison.differences(), *comparison.notes]
-            raise AssertionError("\n  ".join(lines))
+            lines = [f"the map is not as {target}; see {self.folder}", *map(str, comparison.differences)]
+            raise AssertionError("\n  ".join([*lines, *comparison.notes]))
 
     def _score(self, name: str) -> float:
         value = self.summary["metrics"][name]
@@ -239,8 +218,6 @@ class LogReplays:
         return self._done[key]
 
     def _read_config(self, config: Settings, quality: Quality) -> MapperConfig:
-        from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml
-
         data = dict(config) if isinstance(config, Mapping) else read_toml(self._root / config) if config else {}
         where = "config of the replay" if isinstance(config, Mapping) else str(config)
         data |= {} if quality is None else {"quality": quality}
@@ -249,11 +226,6 @@ class LogReplays:
         return mapper
 
     def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
-        from semantic_mapper.mapper import Mapper
-        from semantic_mapper.replay.log.sequence import open_log
-        from semantic_mapper.replay.session import MapSession
-        from semantic_mapper.types import PosedFrame
-
         with open_log(path) as log:
             bundle = Mapper.load(weights, config)
             session = MapSession(

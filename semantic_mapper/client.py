@@ -130,9 +130,6 @@ class MapClient:
         timeout_s: How long to wait for an answer before asking again.
         attempts: How often to ask.
         identity: Of a mapper that has keys (``transport.keys``), as those on other machines have.
-        refined: Ask for the map as it was refined last (option `refine_every_s` of the mapper) instead: its classes are
-            those that refining found, its ``version`` is the one that was refined, and lags behind. ``MapError`` until
-            there is one. ``occupancy`` and ``distance_field``, which no class enters, are of the map itself.
 
     Raises:
         TransportError: an invalid endpoint, or a mapper that is not among the peers.
@@ -145,9 +142,7 @@ class MapClient:
         timeout_s: float = 5.0,
         attempts: int = 3,
         identity: ServerIdentity | None = None,
-        refined: bool = False,
     ) -> None:
-        self._refined = refined
         self._asker, self._timeout_s = uuid.uuid4().hex, timeout_s
         self._socket = QuerySocket(
             endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts, identity=identity
@@ -339,8 +334,6 @@ class MapClient:
 
     def _send(self, kind: str, request: messages.Request) -> list[bytes]:
         request = replace(request, asker=self._asker, waits_s=min(self._timeout_s, messages.MAX_WAIT_S))
-        if isinstance(request, messages.LabelsRequest):
-            request = replace(request, refined=self._refined)
         return self._socket.ask(encode_request(kind, request))
 
     def _correction(self, kind: str, request: messages.Request) -> Correction:

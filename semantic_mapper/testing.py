@@ -7,24 +7,35 @@
         kitchen.assert_like("runs/kitchen", labels=0.02)  # stored by `pytest --update-runs`
 
 pytest finds it by itself where semantic-mapper is installed (``-p no:semantic_mapper.testing`` leaves it out), and it
-costs nothing until a test asks for the fixture. This is the name under which others import
-``semantic_mapper.replay.testing``; nothing
-of this project imports it.
+costs nothing until a test requests the fixture: PyTorch and Open3D are loaded then.
 """
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 import pytest
 
-from semantic_mapper.replay.testing import UPDATE_OPTION, LogReplays, ReplayedMap
+if TYPE_CHECKING:
+    from semantic_mapper.replay.testing import LogReplays, ReplayedMap
 
 __all__ = ["LogReplays", "ReplayedMap", "replay_log"]
+
+_UPDATE = "--update-runs"
+
+
+def __getattr__(name: str) -> Any:
+    """``LogReplays`` and ``ReplayedMap``, loaded when they are first used."""
+    if name in ("LogReplays", "ReplayedMap"):
+        return getattr(importlib.import_module("semantic_mapper.replay.testing"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--update-runs``."""
     group = parser.getgroup("semantic-mapper")
-    group.addoption(UPDATE_OPTION, action="store_true", help="Store runs where `assert_like` would compare with them.")
+    group.addoption(_UPDATE, action="store_true", help="Store runs where `assert_like` would compare with them.")
 
 
 @pytest.fixture(scope="session")
@@ -33,9 +44,10 @@ def replay_log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
 
     Relative paths begin at pytest's root folder.
     """
+    make = importlib.import_module("semantic_mapper.replay.testing").LogReplays
     config = request.config
-    return LogReplays(
+    return make(
         config.rootpath,
         lambda name: tmp_path_factory.mktemp(f"replay-{name}-"),
-        update=bool(config.getoption(UPDATE_OPTION)),
+        update=bool(config.getoption(_UPDATE)),
     )

@@ -6,11 +6,11 @@ from functools import cache
 
 import torch
 
+from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import EncoderConfig, MapperConfig, SRayConfig, convert_config
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, LabelSet
-from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 

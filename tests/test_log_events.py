@@ -54,10 +54,10 @@ def test_structlog_that_the_program_sets_up_later_is_used_as_it_is() -> None:
 
 def test_library_code_says_nothing_on_stdout() -> None:
     done = run(
-        "import semantic_mapper.training.rooms, semantic_mapper.replay.log.recording\n"
+        "import research.train.rooms, semantic_mapper.replay.log.recording\n"
         "import semantic_mapper.replay.session, semantic_mapper.drivers.live\n"
         "from semantic_mapper.transport.sockets import log\n"
-        "from semantic_mapper.benchmark.store import RecordStore\n"
+        "from research.suites.store import RecordStore\n"
         "import pathlib, tempfile\n"
         "path = pathlib.Path(tempfile.mkdtemp()) / 'records.jsonl'\n"
         "path.write_text('cut')\n"

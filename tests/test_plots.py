@@ -129,7 +129,7 @@ def test_matplotlib_is_imported_when_something_is_drawn() -> None:
     """The command line starts without it, and machines that only train lack it."""
     code = (
         "import sys; import semantic_mapper.nodes.cli.main, semantic_mapper.nodes.cli.report, semantic_mapper.plots; "
-        "import semantic_mapper.training.train_log, semantic_mapper.benchmark.run; "
+        "import research.train.train_log, research.suites.run; "
         "print({'matplotlib', 'PIL'} & set(sys.modules)); "
         "semantic_mapper.plots.draw_panels('', [semantic_mapper.plots.Panel('', '', '', [])]); "
         "print('matplotlib.pyplot' in sys.modules)"

@@ -20,9 +20,7 @@ FOLDERS = ("semantic_mapper", "drivers", "replay", "nodes")
 
 def sources() -> list[Path]:
     return [
-        path
-        for package in (*FOLDERS, "benchmarks", "tools", "tests")
-        for path in sorted((ROOT / package).rglob("*.py"))
+        path for package in (*FOLDERS, "research", "tools", "tests") for path in sorted((ROOT / package).rglob("*.py"))
     ]
 
 
@@ -98,7 +96,7 @@ def test_every_target_sets_up_what_it_needs(target: str) -> None:
 
 def test_every_relative_link_of_the_documentation_leads_somewhere() -> None:
     broken = []
-    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "benchmarks" / "README.md"):
+    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "research").rglob("*.md")):
         for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
             if "://" in target:
                 continue

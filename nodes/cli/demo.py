@@ -1,4 +1,4 @@
-"""``semantic-mapper demo``: an embedded scene goes the whole way, from camera frames to a map."""
+"""``semantic-mapper demo``: a recorded log goes the whole way, from camera frames to a map."""
 
 from __future__ import annotations
 
@@ -17,36 +17,29 @@ from semantic_mapper.nodes.process import StopRequest
 @verb
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")] = Path("runs/demo"),
-    frames: Annotated[int, typer.Option(min=4, max=2000, help="How many frames to make.")] = 40,
-    room: Annotated[int, typer.Option(min=0, max=19, help="Which of the 20 validation rooms.")] = 0,
     weights: WeightsOption = None,
     voxel_size: VoxelSizeOption = None,
 ) -> int:
-    """Map an embedded scene: a furnished room is filmed, recorded to a log, and replayed.
+    """Map a recorded log that comes with the package: a depth camera in a furnished room.
 
     Ends with a map, a picture and a summary in OUT. Needs no camera, no data and no network.
 
     Example: semantic-mapper demo --out runs/demo
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.demo_log import write_room_log
     from semantic_mapper.nodes.cli.outputs import prepare_folder
     from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
     from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
+    from semantic_mapper.replay.log.demo import demo_log
 
     began = time.monotonic()
     prepare_folder(out)
     with StopRequest() as stop:
-        log = out / "demo.mcap"
-        with frame_progress("film the room", frames) as bar:
-            write_room_log(log, room, frames, stop, bar.advance)
-        if stop:
-            return stop.exit_code
-        request = ReplayRequest(log, out, weights, mapper_config(None, voxel_size))
+        request = ReplayRequest(demo_log(), out, weights, mapper_config(None, voxel_size))
         with frame_progress("map", None) as bar:
             summary = replay_log(request, stop, bar.start, bar.set)
         output.print(summary_table({"demo": summary}))
-        for line in (*notes(summary), *result_lines(out), f"  {log}  (the log it was made from)"):
+        for line in (*notes(summary), *result_lines(out), f"  {demo_log()}  (the log it was made from)"):
             output.print(line)
         ended = "stopped after" if stop else "done in"
         stderr_console().print(f"{ended} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`")

@@ -127,7 +127,7 @@ def _evaluate_targets(
     if folders:
         found["replays"] = print_results(output, folders)
     if mesh is not None:
-        from semantic_mapper.replay.compare.surface import compare_with_mesh
+        from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
 
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():

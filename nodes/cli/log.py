@@ -98,7 +98,7 @@ def import_(
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
     Example: semantic-mapper import robot.bag robot.mcap --topic image=/front/color/image_raw
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
-    Example: semantic-mapper import path/to/adt flat.mcap --rotate 90 --rename recipes/classes/adt-to-rooms.toml
+    Example: semantic-mapper import path/to/adt flat.mcap --rotate 90 --rename adt-to-rooms.toml
     """
     output = Output.guarded()
     from semantic_mapper.config import load_config

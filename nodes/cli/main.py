@@ -12,7 +12,6 @@ from typer.core import TyperGroup
 from semantic_mapper import __version__
 from semantic_mapper.nodes.cli import autolabel as cli_autolabel
 from semantic_mapper.nodes.cli import bench as cli_bench
-from semantic_mapper.nodes.cli import benchmark as cli_benchmark
 from semantic_mapper.nodes.cli import boxes as cli_boxes
 from semantic_mapper.nodes.cli import calibrate as cli_calibrate
 from semantic_mapper.nodes.cli import cameras as cli_cameras
@@ -35,7 +34,6 @@ from semantic_mapper.nodes.cli import refine as cli_refine
 from semantic_mapper.nodes.cli import relocalize as cli_relocalize
 from semantic_mapper.nodes.cli import replay as cli_replay
 from semantic_mapper.nodes.cli import top as cli_top
-from semantic_mapper.nodes.cli import train as cli_train
 from semantic_mapper.nodes.cli import up as cli_up
 from semantic_mapper.nodes.cli import view as cli_view
 from semantic_mapper.nodes.cli import weights as cli_weights
@@ -112,8 +110,6 @@ app.command("eval")(cli_eval.evaluate)
 # Coordinates below 0 look like options.
 app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)
 app.command("boxes")(cli_boxes.boxes)
-app.command("train")(cli_train.train)
-app.command("benchmark")(cli_benchmark.benchmark)
 app.command("bench")(cli_bench.bench)
 
 

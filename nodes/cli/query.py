@@ -43,7 +43,6 @@ class Asked(NamedTuple):
     min_confidence: float = 0.0
     server: str = ""
     keys: Path | None = None
-    refined: bool = False
     gone: bool = False
     picture: Path | None = None
 
@@ -73,9 +72,6 @@ def query(
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
     ] = 0.0,
-    refined: Annotated[
-        bool, typer.Option("--refined", help="Running mapper: the map as it was refined last (`refine_every_s`).")
-    ] = False,
     gone: Annotated[
         bool, typer.Option("--gone", help="Running mapper, instances: also those of earlier answers that have gone.")
     ] = False,
@@ -102,7 +98,6 @@ def query(
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
     Example: semantic-mapper query live nearest chair 0 0 1 --json
-    Example: semantic-mapper query live nearest chair 0 0 1 --refined
     Example: semantic-mapper query live instances --gone --json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     Example: semantic-mapper query s3://maps/house nearest chair 0 0 1
@@ -112,8 +107,6 @@ def query(
 
     in_tiles = holds_tiles(source)
     endpoint = "" if in_tiles else map_endpoint(source)
-    if refined and not endpoint:
-        raise typer.BadParameter("goes with a running mapper; name the refined file itself", param_hint="--refined")
     if gone and not (endpoint and question is Question.INSTANCES):
         raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
     if picture is not None and question is not Question.GRAPH:
@@ -127,7 +120,7 @@ def query(
         if path is not None:
             prepare_file(path)
     ask = ask_tiles if in_tiles else ask_mapper if endpoint else ask_file
-    asked = Asked(question, class_name, point, up, min_confidence, server, keys, refined, gone, picture)
+    asked = Asked(question, class_name, point, up, min_confidence, server, keys, gone, picture)
     found = {"map": source, **ask(endpoint or source, asked)}
     if out is not None:
         write_json(out, found)
@@ -227,7 +220,7 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
     from semantic_mapper.client import MapClient
     from semantic_mapper.nodes.cli import map_answers
 
-    with MapClient(source, identity=server_identity(asked.server, asked.keys), refined=asked.refined) as client:
+    with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
         match asked.question:
             case Question.INFO:
                 return map_answers.describe_map(client.mirror().snapshot())
@@ -237,10 +230,8 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
                 hit = client.nearest(asked.class_name, asked.point, asked.min_confidence)
                 return map_answers.answer_nearest(asked.class_name, asked.point, hit)
             case Question.INSTANCES:
-                # A map that grows has no things of its own; of a refined one the answer does not say.
-                by = "" if asked.refined else map_answers.CONNECTED
                 up = asked.up or map_answers.UP
-                return map_answers.answer_instances(up, client.instances(up, gone=asked.gone), by)
+                return map_answers.answer_instances(up, client.instances(up, gone=asked.gone), map_answers.CONNECTED)
             case Question.GRAPH:
                 return _answer_graph(source, client.graph(asked.up), asked.picture)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Self
@@ -55,9 +54,6 @@ def view(
     weights: WeightsOption = None,
     config: ConfigOption = None,
     max_frames: MaxFramesOption = 0,
-    refined: Annotated[
-        bool, typer.Option("--refined", help="Launch: the map as its mapper refined it last (`refine_every_s`).")
-    ] = False,
     server: ServerOption = "",
     keys: KeysOption = None,
 ) -> None:
@@ -79,14 +75,12 @@ def view(
         raise typer.BadParameter("go with a log", param_hint="--weights, --config, --max-frames")
     if server and "://" not in source:
         raise typer.BadParameter("goes with an endpoint such as tcp://robot:5570", param_hint="--server")
-    if refined and (log or (source and "://" not in source and _saved_map(path, source) is not None)):
-        raise typer.BadParameter("goes with a launch; a refined map is shown by its name", param_hint="--refined")
     output = Output.guarded()
     saved = None if log else _saved_map(path, source)
     if source and "://" not in source and not path.exists():
         other = "" if log or saved else ", and no socket folder of a launch"
         raise ConfigError(f"{path}: no such file{other}; without a name, `view` shows the one launch that runs here")
-    live = None if log or saved else replace(_find_live(source, query, server, keys), refined=refined)
+    live = None if log or saved else _find_live(source, query, server, keys)
     with StopRequest() as stop, _Page(port, data_port, memory, output) as page:
         if saved is not None:
             from semantic_mapper.nodes.viewer.sources import show_saved

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -36,10 +37,29 @@ def code_digest() -> str:
 @cache
 def code_version() -> str:
     """Version and, in a checkout, git revision, such as ``0.1.0+g1a2b3c4d`` or ``0.1.0+g1a2b3c4d-dirty``."""
-    from semantic_mapper.training.recipe import git_revision
-
     revision = git_revision(_PACKAGE)
     if revision is None:
         return semantic_mapper.__version__
     commit, _, dirty = revision.partition("-")
     return f"{semantic_mapper.__version__}+g{commit[:8]}{'-dirty' if dirty else ''}"
+
+
+def git_revision(package: Path) -> str | None:
+    """Commit of the checkout whose top folder holds ``package``, with "-dirty" where files differ from it.
+
+    None where the package is installed rather than checked out, or where git is missing.
+    """
+    top = _git(package, "rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != package.parent:
+        return None
+    return _git(package, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False, timeout=30
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import structlog
@@ -32,7 +31,6 @@ class Autosave:
         voxel_map: To be saved, where it has changed.
         path: The file; replaced each time.
         every_s: From the beginning of one save to the next; the first ones come sooner.
-        on_saved: Called after each, in its thread, with version and epoch of what was saved.
     """
 
     def __init__(
@@ -40,14 +38,12 @@ class Autosave:
         voxel_map: VoxelMap,
         path: Path,
         every_s: float,
-        on_saved: Callable[[int, int], object] = lambda version, epoch: None,
     ) -> None:
         self.saves = 0
         self.failure = ""  # of the last save; empty where it went well
         self._map = voxel_map
         self._path = path
         self._every_s = every_s
-        self._on_saved = on_saved
         self._begun = time.monotonic()
         self._begins = 0  # of saves
         self._saved_version = voxel_map.version
@@ -58,7 +54,7 @@ class Autosave:
         """Begin a save if it is time; to be called between two frames."""
         if self._ending.is_set():
             return
-        version, epoch = self._map.version, self._map.epoch
+        version = self._map.version
         pause_s = min(self._every_s, FIRST_S * 2**self._begins)
         if time.monotonic() - self._begun < pause_s or self._saved_version == version:
             return
@@ -67,7 +63,7 @@ class Autosave:
         self._begun = time.monotonic()
         self._begins = min(self._begins + 1, 30)
         saving = self._map.begin_save()
-        self._thread = threading.Thread(target=self._save, args=(saving, version, epoch), name="autosave", daemon=True)
+        self._thread = threading.Thread(target=self._save, args=(saving, version), name="autosave", daemon=True)
         self._thread.start()
 
     def end(self, why: str) -> None:
@@ -82,7 +78,7 @@ class Autosave:
         if self._thread is not None:
             self._thread.join()
 
-    def _save(self, saving: MapSaving, version: int, epoch: int) -> None:
+    def _save(self, saving: MapSaving, version: int) -> None:
         worked_since = time.monotonic()
 
         def rest() -> None:
@@ -104,7 +100,6 @@ class Autosave:
             self._saved_version = version
             self.saves += 1
             self.failure = ""
-            self._on_saved(version, epoch)
 
     def _fail(self, reason: str) -> None:
         self.failure = reason

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from semantic_mapper.mapper import Mapper
     from semantic_mapper.nodes.mapper.autosave import Autosave
     from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
-    from semantic_mapper.nodes.mapper.live_refinement import LiveRefinement
     from semantic_mapper.nodes.mapper.live_weights import LiveWeights
     from semantic_mapper.nodes.mapper.query_service import QueryService
     from semantic_mapper.replay.session import MapSession
@@ -80,14 +79,13 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         PublicPublisher(context.endpoint(context.name), options.publish, options.keys) as publisher,
         subscribe([context.endpoint(name) for name in options.cameras], ("info", "frame", "end")) as frames,
         taking_weights(context, options, bundle, publisher) as weights,
-        _refining(options, bundle) as refinement,
-        _answering(context, options, bundle, correction, weights, refinement) as queries,
+        _answering(context, options, bundle, correction, weights) as queries,
     ):
-        autosave = _saving(options, bundle, refinement)
+        autosave = _saving(options, bundle)
         _log.info(
             "ready", weights=bundle.weights_path.name, input=", ".join(options.cameras), delivery=options.delivery
         )
-        parts = (queries, correction, weights, autosave, refinement)
+        parts = (queries, correction, weights, autosave)
         mapper = _Mapper(context, options, bundle, exclude, publisher, frames, *parts, taken_up)
         context.heartbeat.ready()
         try:
@@ -115,7 +113,6 @@ def _answering(
     bundle: Mapper,
     correction: LiveCorrection,
     weights: LiveWeights | None,
-    refinement: LiveRefinement | None,
 ) -> QueryService | nullcontext[None]:
     """The query service, or nothing where none is wanted."""
     from semantic_mapper.nodes.mapper.query_service import QueryService
@@ -125,36 +122,19 @@ def _answering(
         return nullcontext()
     endpoint = options.query if "://" in options.query else context.endpoint(options.query)
     keys = load_keys(Path(options.keys).expanduser()) if options.keys else None
-    refined = None if refinement is None else refinement.mirror
     pipeline = bundle.pipeline
-    beside = (refined, pipeline.moving.space, pipeline.whereabouts)
-    return QueryService(endpoint, pipeline.voxel_map, correction, keys, weights, *beside)
+    return QueryService(
+        endpoint, pipeline.voxel_map, correction, keys, weights, pipeline.moving.space, pipeline.whereabouts
+    )
 
 
-def _refining(options: MapperOptions, bundle: Mapper) -> LiveRefinement | nullcontext[None]:
-    """What refines saved maps, or nothing where that is not wanted.
-
-    Raises:
-        WeightsError: they cannot be read, or are of other classes.
-    """
-    from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
-    from semantic_mapper.nodes.mapper.live_refinement import LiveRefinement
-
-    if not options.refine_every_s:
-        return nullcontext()
-    weights = Path(options.refine_weights) if options.refine_weights else None
-    path = Path(options.out) / MAP_NAME
-    return LiveRefinement(bundle.pipeline.voxel_map, path, options.refine_every_s, weights)
-
-
-def _saving(options: MapperOptions, bundle: Mapper, refinement: LiveRefinement | None) -> Autosave | None:
+def _saving(options: MapperOptions, bundle: Mapper) -> Autosave | None:
     from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
     from semantic_mapper.nodes.mapper.autosave import Autosave
 
     if not options.save_every_s:
         return None
-    follow = (refinement.follow,) if refinement is not None else ()
-    return Autosave(bundle.pipeline.voxel_map, Path(options.out) / MAP_NAME, options.save_every_s, *follow)
+    return Autosave(bundle.pipeline.voxel_map, Path(options.out) / MAP_NAME, options.save_every_s)
 
 
 class _Mapper:
@@ -172,7 +152,6 @@ class _Mapper:
         correction: LiveCorrection,
         weights: LiveWeights | None,
         autosave: Autosave | None,
-        refinement: LiveRefinement | None,
         taken_up: str,
     ) -> None:
         self._context = context
@@ -185,7 +164,6 @@ class _Mapper:
         self._correction = correction
         self._weights = weights
         self._autosave = autosave
-        self._refinement = refinement
         self._taken_up = taken_up  # see ``resuming.take_up``
         self._session: MapSession | None = None
         self._streams = Streams(len(options.cameras))
@@ -252,8 +230,6 @@ class _Mapper:
         self._publish_status("stopping", now=True)
         if self._autosave is not None:
             self._autosave.close()
-        if self._refinement is not None:
-            self._refinement.give_up("the mapper ends")
         self._correction.finish(self._session, lambda: bool(self._context.stop), self._while_stopping)
         if self._queries is not None and not self._queries.hand_over_all(HAND_OVER_S) and self._queries.asked:
             _log.warning("questions_lag_behind", reason=f"the map could not be handed over in {HAND_OVER_S:g} s")
@@ -262,8 +238,6 @@ class _Mapper:
         out = Path(self._options.out)
         summary = finish_session(self._session, out, self._ended_by, self._taken_up, self._step_of_finish)
         _log.info("map_written", out=str(out), **summary["frames"])
-        if self._refinement is not None:
-            self._refinement.finish(self._step_of_finish)
         self._publish_status("ended", now=True)
 
     def _step_of_finish(self) -> None:
@@ -412,9 +386,6 @@ class _Mapper:
             counters["saves"] = self._autosave.saves
             if self._autosave.failure:
                 degraded += (f"the map was not saved: {self._autosave.failure}",)
-        if self._refinement is not None:
-            counters |= self._refinement.counters
-            degraded += self._refinement.degraded
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, degraded)
         publish_status(self._publisher, status)
 

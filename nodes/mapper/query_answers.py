@@ -77,7 +77,6 @@ class Answers:
         mirror: Of the map.
         correction: Takes corrected poses; without it they are refused.
         weights: Says which weights are in use, and exchanges them; without it such questions are refused.
-        refined: Mirror of the map as it was refined last; without it questions about that are refused.
         moving: Where something moves now that is left out of the map.
         whereabouts: Of the last frame.
     """
@@ -87,7 +86,6 @@ class Answers:
         mirror: MapMirror,
         correction: LiveCorrection | None = None,
         weights: LiveWeights | None = None,
-        refined: MapMirror | None = None,
         moving: MovingSpace | None = None,
         whereabouts: Whereabouts | None = None,
     ) -> None:
@@ -95,11 +93,9 @@ class Answers:
         self._mirror = mirror
         self._correction = correction
         self._weights = weights
-        self._refined = refined
         self._moving = moving
         self._whereabouts = whereabouts or Whereabouts()
-        # By direction, and whether of the refined map; the last one asked stands last.
-        self._tracked: dict[tuple[messages.Point, bool], _Tracked] = {}
+        self._tracked: dict[messages.Point, _Tracked] = {}  # by direction; the last one asked stands last
 
     def read(self, parts: Parts) -> Question:
         """Parts of a question -> what answers it."""
@@ -111,7 +107,7 @@ class Answers:
             return Question(lambda: refusal, messages.Request(), takes_long=False, about_map=False)
         correction = messages.CorrectPosesRequest | messages.CorrectionRequest
         beside = correction | messages.WeightsRequest | messages.PoseRequest
-        about_map = not isinstance(request, beside) and not _of_refined(request)
+        about_map = not isinstance(request, beside)
         return Question(lambda: self._encoded(kind, request), request, takes_long, about_map)
 
     def _encoded(self, kind: str, request: messages.Request) -> list[bytes]:
@@ -124,7 +120,7 @@ class Answers:
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
 
     def _answer(self, request: messages.Request) -> messages.Answer:
-        snapshot = self._refined_snapshot() if _of_refined(request) else self._mirror.snapshot()
+        snapshot = self._mirror.snapshot()
         match request:
             case messages.InfoRequest():
                 return self._describe(snapshot)
@@ -170,14 +166,6 @@ class Answers:
 
     def _with_moving(self, snapshot: MapSnapshot) -> MapSnapshot:
         return snapshot if self._moving is None else snapshot.with_moving(self._moving.points)
-
-    def _refined_snapshot(self) -> MapSnapshot:
-        if self._refined is None:
-            raise MapError("this mapper refines nothing while it runs (option `refine_every_s`)")
-        snapshot = self._refined.snapshot()
-        if not snapshot.version:
-            raise MapError("the map has not been refined yet; ask again later (the mapper's status says if that fails)")
-        return snapshot
 
     def _correct(
         self,
@@ -231,14 +219,12 @@ class Answers:
         )
 
     def _instances(self, snapshot: MapSnapshot, request: messages.InstancesRequest) -> messages.Answer:
-        up, which = request.up, (request.up, request.refined)
-        tracked = self._tracked.pop(
-            which, None
-        )  # out of here while it updates: one that fails half way is not used again
+        up = request.up
+        tracked = self._tracked.pop(up, None)  # out of here while it updates: one that fails half way is not used again
         if tracked is None or tracked.version != snapshot.version:
             tracker = tracked.tracker if tracked else InstanceTracker(up=up)
             tracked = _Tracked(tracker, snapshot.version, tracker.update(snapshot), tracker.gone)
-        self._tracked[which] = tracked
+        self._tracked[up] = tracked
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
         arrays = _thing_arrays((*tracked.things, *tracked.gone) if request.gone else tracked.things, gone=request.gone)
@@ -317,10 +303,6 @@ def _thing_arrays(things: Sequence[Instance], *, gone: bool) -> dict[str, Any]:
         "measured": np.array(measured) if gone or min(measured, default=1.0) < 1 else None,
         "gone_ns": np.array([-1 if t.gone_ns is None else t.gone_ns for t in things], np.int64) if gone else None,
     }
-
-
-def _of_refined(request: messages.Request) -> bool:
-    return isinstance(request, messages.LabelsRequest) and request.refined
 
 
 def _takes_long(snapshot: MapSnapshot, request: messages.Request) -> bool:

@@ -86,7 +86,7 @@ class QueryService:
         correction: Takes corrected poses; without it they are refused.
         weights: Takes other weights; without it requests about them are refused.
         keys: See ``QueryServer``.
-        refined, moving, whereabouts: See ``Answers``.
+        moving, whereabouts: See ``Answers``.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
@@ -99,14 +99,13 @@ class QueryService:
         correction: LiveCorrection | None = None,
         keys: Keys | None = None,
         weights: LiveWeights | None = None,
-        refined: MapMirror | None = None,
         moving: MovingSpace | None = None,
         whereabouts: Whereabouts | None = None,
     ) -> None:
         self._map = voxel_map
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        self._answers = Answers(self._mirror, correction, weights, refined, moving, whereabouts)
+        self._answers = Answers(self._mirror, correction, weights, moving, whereabouts)
         self._copied_version = 0
         self._copy_again_at = 0.0
         self.asked = False  # whether anybody has ever asked about the map

@@ -23,7 +23,6 @@ _EARLIER, _UNSOUND, _WORLDS = "earlier", "unsound", "worlds"  # notes
 _NO_FILE = "none"
 _RESULTS = (
     "map.npz",
-    "refined.npz",
     "map.ply",
     "overview.png",
     "report.html",

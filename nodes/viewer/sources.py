@@ -48,14 +48,12 @@ class Live:
         nodes: Endpoints of cameras and mappers, whatever else is among them; none shows the map alone.
         identity: Of a mapper that has keys.
         streams: How many of the nodes are cameras; it is over when all of their streams have ended.
-        refined: The map as its mapper refined it last is shown.
     """
 
     query: str
     nodes: tuple[str, ...] = ()
     identity: ServerIdentity | None = None
     streams: int = 1
-    refined: bool = False
 
 
 class MapShow:
@@ -119,7 +117,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
     Raises:
         TransportError: an invalid endpoint.
     """
-    with MapClient(live.query, identity=live.identity, attempts=1, refined=live.refined) as client:
+    with MapClient(live.query, identity=live.identity, attempts=1) as client:
         stream = begin()
         snapshot = _first_snapshot(client, stop, tell)
         if snapshot is None:
@@ -149,7 +147,7 @@ def _first_snapshot(client: MapClient, stop: StopRequest, tell: Callable[[str], 
     while not stop:
         try:
             return client.mirror().snapshot()
-        except (TransportError, MapError) as error:  # MapError: it has not been refined yet
+        except (TransportError, MapError) as error:
             if not logged:
                 tell(f"waiting for the mapper: {error}")
             logged = True

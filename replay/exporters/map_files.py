@@ -13,12 +13,17 @@ from semantic_mapper.config import read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.export import ColorBy, colored, sure_faces, sure_points
-from semantic_mapper.mapping.files.formats.glb import write_glb
-from semantic_mapper.mapping.files.formats.map_server import write_map_server
-from semantic_mapper.mapping.files.formats.npz import write_npz
-from semantic_mapper.mapping.files.formats.obj import write_obj
-from semantic_mapper.mapping.files.formats.ply import write_ply, write_ply_mesh
+from semantic_mapper.mapping.files.formats import (
+    ColorBy,
+    colored,
+    sure_faces,
+    sure_points,
+    write_glb,
+    write_map_server,
+    write_npz,
+    write_obj,
+    write_ply,
+)
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_scale import require_metres
@@ -171,7 +176,7 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     color = request.color or "rgb"
     mesh, files, found = colored(mesh, labels, color), (path,), ()
     if request.format == "ply-mesh":
-        write_ply_mesh(path, mesh, labels, scale_known=voxel_map.scale_known)
+        write_ply(path, mesh, labels, scale_known=voxel_map.scale_known)
     elif request.format == "obj":
         scale_known = voxel_map.scale_known
         files = write_obj(path, mesh, labels, class_materials=color == "class", scale_known=scale_known)

@@ -1,7 +1,7 @@
 """How far a depth may be off: spreads in planes of the sweep, fitted to procedural rooms.
 
-Both are the exponential of a sum of terms whose factors `benchmarks.depth_spread` fits, so that 68 % of the errors are
-within one spread: rooms of training seeds, every second with poses that are off by 0.06 degrees and 1.5 mm.
+Both are the exponential of a sum of terms whose factors `research.experiments.depth_spread` fits, so that 68 % of the
+errors are within one spread: rooms of training seeds, every second with poses that are off by 0.06 degrees and 1.5 mm.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ from semantic_mapper.fields.carried_labels import CarriedLabels
 from semantic_mapper.fields.grid.field import GridField, RaySamples
 from semantic_mapper.fields.grid.march import gather
 from semantic_mapper.fields.nerf_math import relu_layers
-from semantic_mapper.fields.peers.unet_field import own_view
 from semantic_mapper.fields.source_maps import check_views, encoded_views
+from semantic_mapper.fields.unet_field import own_view
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import RayBatch, SourceViews
 

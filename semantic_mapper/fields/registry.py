@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import cache
 from importlib import import_module
-from typing import Any
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -11,11 +13,8 @@ from semantic_mapper.config import (
     Config,
     GridFieldConfig,
     IRTConfig,
-    MVSNeRFConfig,
-    NeuRayConfig,
     PanopticConfig,
     SamplingConfig,
-    SemanticNeRFConfig,
     SRayConfig,
     UNetFieldConfig,
     convert_config,
@@ -24,17 +23,30 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.labels import LabelSet
 
-# kind -> its config, and the module and class of the field. A peer's module is imported when the kind is built.
-KINDS: dict[str, tuple[type[Config], str, str]] = {
-    "sray": (SRayConfig, "semantic_mapper.fields.sray", "SRay"),
-    "unet": (UNetFieldConfig, "semantic_mapper.fields.peers.unet_field", "UNetField"),
-    "neuray": (NeuRayConfig, "semantic_mapper.fields.peers.neuray", "NeuRay"),
-    "mvsnerf": (MVSNeRFConfig, "semantic_mapper.fields.peers.mvsnerf", "MVSNeRF"),
-    "semantic_nerf": (SemanticNeRFConfig, "semantic_mapper.fields.peers.semantic_nerf", "SemanticNeRF"),
-    "grid": (GridFieldConfig, "semantic_mapper.fields.grid.field", "GridField"),
-    "irt": (IRTConfig, "semantic_mapper.fields.irt", "IRT"),
-    "panoptic": (PanopticConfig, "semantic_mapper.fields.panoptic", "Panoptic"),
+
+class FieldKind(NamedTuple):
+    """A kind of field: its settings, and the module and class that make it, imported when one is built."""
+
+    config: type[Config]
+    module: str
+    class_name: str
+
+
+KINDS: dict[str, FieldKind] = {
+    "sray": FieldKind(SRayConfig, "semantic_mapper.fields.sray", "SRay"),
+    "unet": FieldKind(UNetFieldConfig, "semantic_mapper.fields.unet_field", "UNetField"),
+    "grid": FieldKind(GridFieldConfig, "semantic_mapper.fields.grid.field", "GridField"),
+    "irt": FieldKind(IRTConfig, "semantic_mapper.fields.irt", "IRT"),
+    "panoptic": FieldKind(PanopticConfig, "semantic_mapper.fields.panoptic", "Panoptic"),
 }
+GROUP = "semantic_mapper.fields"  # entry points of other packages, each a ``FieldKind``
+
+
+@cache
+def field_kinds() -> dict[str, FieldKind]:
+    """The kinds of this package, and those that installed packages add by entry points."""
+    return KINDS | {entry.name: entry.load() for entry in entry_points(group=GROUP)}
+
 
 # A name for some switches of a kind. The field built is of that kind, and so is its checkpoint: the switches are part
 # of the config that is saved, so nothing but a choice of names depends on this table.
@@ -51,7 +63,7 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
 
 def field_names() -> tuple[str, ...]:
     """Every name that ``build_field`` takes: kinds, then presets."""
-    return (*KINDS, *PRESETS)
+    return (*field_kinds(), *PRESETS)
 
 
 def field_config(name: str, config: dict[str, Any] | Config) -> Config:
@@ -65,9 +77,9 @@ def field_config(name: str, config: dict[str, Any] | Config) -> Config:
         ConfigError: no such name, or a config that does not fit it.
     """
     kind, switches = PRESETS.get(name, (name, {}))
-    if kind not in KINDS:
+    if kind not in field_kinds():
         raise ConfigError(f"no field of kind '{name}'; there are {', '.join(sorted(field_names()))}")
-    config_type, _, _ = KINDS[kind]
+    config_type = field_kinds()[kind].config
     if isinstance(config, dict):
         config = convert_config(config, config_type, f"config of field '{name}'")
     if not isinstance(config, config_type):
@@ -81,13 +93,13 @@ def build_field(
     """A field with random weights.
 
     Args:
-        name: A key of ``KINDS`` or ``PRESETS``; the ``kind`` of the field is that of the preset's base.
+        name: A kind or a key of ``PRESETS``; the ``kind`` of the field is that of the preset's base.
         config: Of that kind, or plain data for it.
 
     Raises:
         ConfigError: no such name, or a config that does not fit it.
     """
     full = field_config(name, config)
-    _, module, class_name = KINDS[PRESETS[name][0] if name in PRESETS else name]
-    field_type: type[LearnedField] = getattr(import_module(module), class_name)
+    kind = field_kinds()[PRESETS[name][0] if name in PRESETS else name]
+    field_type: type[LearnedField] = getattr(import_module(kind.module), kind.class_name)
     return field_type(full, label_set, sampling)

@@ -32,8 +32,9 @@ _Pack = Callable[[Any, _Words], None]
 class Kernel(Generic[P, R]):
     """A function of the compiled library; see `kernel`. Any number of threads may call it at once, without the GIL."""
 
-    def __init__(self, declaration: Callable[P, R], skip: int = 0) -> None:
+    def __init__(self, declaration: Callable[P, R], skip: int = 0, folder: Path = LIBRARY_FOLDER) -> None:
         functools.update_wrapper(self, declaration)
+        self._folder = folder
         self.name = declaration.__name__.lstrip("_")
         self._declaration = declaration
         self._skip = skip
@@ -46,7 +47,7 @@ class Kernel(Generic[P, R]):
     @functools.cached_property
     def function(self) -> Callable[[int, int, bytes], int]:
         """The C function: start and stop of its loop, and the packed arguments."""
-        library = load_library()
+        library = load_library(self._folder)
         try:
             function = getattr(library, self.name)
         except AttributeError:
@@ -110,21 +111,21 @@ def kernel(declaration: Callable[P, R]) -> Kernel[P, R]:
 
 
 @functools.cache
-def load_library() -> ctypes.CDLL:
-    """The kernels, compiled for the best of the processors that they are there for and this one is.
+def load_library(folder: Path = LIBRARY_FOLDER) -> ctypes.CDLL:
+    """The kernels of a folder, compiled for the best of the processors that they are there for and this one is.
 
     Raises:
         DependencyError: they are not there, or not for this machine.
     """
     for name in _variants():
-        path = LIBRARY_FOLDER / f"{name}.so"
+        path = folder / f"{name}.so"
         if path.exists():
             try:
                 return ctypes.CDLL(str(path))
             except OSError as error:
                 raise DependencyError(f"cannot load the compiled kernels {path}: {error}") from error
     raise DependencyError(
-        f"no compiled kernels for {platform.machine()} in {LIBRARY_FOLDER}; in a checkout run `make setup`, otherwise "
+        f"no compiled kernels for {platform.machine()} in {folder}; in a checkout run `make setup`, otherwise "
         "install the package with pip, which compiles them"
     )
 

@@ -56,9 +56,9 @@ _SAME_M, _SAME_RAD = 0.3, np.deg2rad(10.0)  # poses further apart are two
 class Limits:
     """What a pose must show to be believed.
 
-    Set by views of 26 rooms (``benchmarks.relocalization``): in the mirrored room a symmetric shelf or bed has up to
-    167 features for it; then 0.94 of the depth agrees at most, with a likeness of 0.6. In the room itself likeness is
-    0.79 or more in all but one of 500.
+    Set by views of 26 rooms (``research.experiments.relocalization``): in the mirrored room a symmetric shelf or
+    bed has up to 167 features for it; then 0.94 of the depth agrees at most, with a likeness of 0.6. In the room
+    itself likeness is 0.79 or more in all but one of 500.
 
     Args:
         min_inliers: Features that agree on the pose.

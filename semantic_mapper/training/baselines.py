@@ -14,7 +14,7 @@ from torch.nn import functional
 from semantic_mapper.config import Config, UNetFieldConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.device import choose_device, to_device
-from semantic_mapper.fields.peers.unet_field import UNetField
+from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.geometry import NEAREST_Z_M, invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import LabelSet

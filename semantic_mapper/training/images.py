@@ -18,12 +18,9 @@ from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.appearance import vary_appearance
 from semantic_mapper.training.losses import Loss, guess_loss, image_loss
-from semantic_mapper.training.rooms import RoomViews
 from semantic_mapper.training.views import (
     LabelledView,
-    cropped_view,
     jitter_colours,
-    mirrored_view,
     stack_sources,
     withhold_depth,
 )
@@ -66,33 +63,6 @@ class ImageBatch:
     views: SourceViews
     channel: torch.Tensor
     depth_m: torch.Tensor
-
-
-def draw_images(
-    rooms: Sequence[RoomViews],
-    config: ImageStepConfig,
-    generator: torch.Generator,
-    device: torch.device,
-    *,
-    colours_only: bool = False,
-) -> ImageBatch:
-    """Draw labelled views of each room; all draws are made on the CPU, so they are the same whatever the device.
-
-    Args:
-        colours_only: None of them with depth.
-    """
-    views = []
-    for room in rooms:
-        order = torch.randperm(len(room.labelled), generator=generator).tolist()[: config.images]
-        for place in order:
-            view = room.resident[room.labelled[place]]
-            mirror = float(torch.rand(1, generator=generator)) < config.mirrored
-            view = mirrored_view(view) if mirror else view
-            if config.cropped > 0:
-                crop, size, down, across = torch.rand(4, generator=generator).tolist()
-                view = cropped_view(view, 0.5 + 0.5 * size, down, across) if crop < config.cropped else view
-            views.append(view)
-    return image_batch(views, config, generator, device, colours_only=colours_only)
 
 
 def image_batch(
@@ -147,8 +117,8 @@ def encoder_for_images(model: LearnedField) -> ImageEncoder:
     if encoder is None or not classifies_images(model):
         raise ConfigError(
             f"a field of kind '{model.kind}' does not classify single images, so it can only learn from rays: set "
-            "fraction = 0 under [images] in the file that --config names (recipes/cpu-rays.toml does), and take over "
-            "a trained image encoder with --encoder"
+            "fraction = 0 under [images] in the file that --config names, as recipes/cpu-rays.toml does, and take "
+            "over a trained image encoder with --encoder"
         )
     return encoder
 

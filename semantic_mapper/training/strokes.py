@@ -18,7 +18,7 @@ from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, work
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
-# Chosen on strokes of two scenes, `python -m benchmarks.label_strokes`.
+# Chosen on strokes of two scenes, `python -m research.experiments.label_strokes`.
 WIDTH = 160  # of the image that is looked at: how far a stroke reaches counts in its pixels
 REACH, EDGE = 3000.0, 3.0  # of the filter: its lambda, and the difference of guides that is an edge
 REACHED = 1e-4  # of a stroke's weight

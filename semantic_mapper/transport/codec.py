@@ -96,7 +96,6 @@ _NOT_SENT_AS_0 = (  # what most messages do not need
     "computed",
     "pseudo_label",
     "depth_sigma",
-    "refined",
     "gone",
     "moving",
     "world",

@@ -91,12 +91,6 @@ class Request(Wire, frozen=True, kw_only=True):
     waits_s: Annotated[float, Meta(ge=0, le=MAX_WAIT_S)] = MAX_WAIT_S
 
 
-class LabelsRequest(Request, frozen=True, kw_only=True):
-    """Of every question whose answer tells of classes; ``refined``: of those that refining found (sent only then)."""
-
-    refined: bool = False
-
-
 class Answer(Wire, frozen=True, kw_only=True):
     """Of every answer: which state of which map it is about.
 
@@ -111,7 +105,7 @@ class Answer(Wire, frozen=True, kw_only=True):
     scale_unknown: bool = False
 
 
-class InfoRequest(LabelsRequest, frozen=True, kw_only=True):
+class InfoRequest(Request, frozen=True, kw_only=True):
     """What the map is."""
 
 
@@ -124,7 +118,7 @@ class InfoAnswer(Answer, frozen=True, kw_only=True):
     label_set: LabelSetForm
 
 
-class AtRequest(LabelsRequest, frozen=True, kw_only=True):
+class AtRequest(Request, frozen=True, kw_only=True):
     """What is at points."""
 
     points: Points
@@ -141,7 +135,7 @@ class AtAnswer(Answer, frozen=True, kw_only=True):
     computed: Computed = None
 
 
-class NearestRequest(LabelsRequest, frozen=True, kw_only=True):
+class NearestRequest(Request, frozen=True, kw_only=True):
     """Where the nearest surface of a class is."""
 
     class_name: Word
@@ -159,7 +153,7 @@ class NearestAnswer(Answer, frozen=True, kw_only=True):
     computed: bool = False  # no sensor measured it; sent only then
 
 
-class RaysRequest(LabelsRequest, frozen=True, kw_only=True):
+class RaysRequest(Request, frozen=True, kw_only=True):
     """What rays meet."""
 
     max_m: Finite
@@ -177,7 +171,7 @@ class RaysAnswer(Answer, frozen=True, kw_only=True):
     computed: Computed = None
 
 
-class BoxRequest(LabelsRequest, frozen=True, kw_only=True):
+class BoxRequest(Request, frozen=True, kw_only=True):
     """Surface points in a box."""
 
     lower: Point
@@ -194,7 +188,7 @@ class BoxAnswer(Answer, frozen=True, kw_only=True):
     computed: Computed = None
 
 
-class InstancesRequest(LabelsRequest, frozen=True, kw_only=True):
+class InstancesRequest(Request, frozen=True, kw_only=True):
     """Countable things; ``gone``: also those that have gone lately (sent only then)."""
 
     up: Point
@@ -245,7 +239,7 @@ class DistanceAnswer(Answer, frozen=True, kw_only=True):
     state: Annotated[UInt8, ArrayForm("u1", free=3)]
 
 
-class ChangesRequest(LabelsRequest, frozen=True, kw_only=True):
+class ChangesRequest(Request, frozen=True, kw_only=True):
     """Blocks changed since a version of the map ``map_id``; of another map, all blocks are sent."""
 
     since: Count

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
+from research.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 INTRINSICS = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)

@@ -31,7 +31,6 @@ import semantic_mapper.drivers.poses.config
 import semantic_mapper.drivers.realsense.config
 import semantic_mapper.drivers.stereo.config
 import semantic_mapper.drivers.v4l2.config
-from semantic_mapper.benchmark.config import SuiteConfig
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig, SRayConfig, convert_config, load_config
 from semantic_mapper.drivers.calibration import CalibrationFile, load_calibration, load_mount
@@ -54,17 +53,14 @@ from semantic_mapper.nodes.options import (
     MapperOptions,
     RecorderOptions,
 )
-from semantic_mapper.replay.compare.tolerances import Tolerances
+from semantic_mapper.replay.compare import Tolerances
 from semantic_mapper.replay.corrected_poses import read_corrections
 from semantic_mapper.replay.importers.base import RenameConfig
 from semantic_mapper.replay.log.format import LogReader, LogWriter
-from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig, room_frames
 from semantic_mapper.testing import LogReplays
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
-from semantic_mapper.training.nesf import NesfTrainConfig
 from semantic_mapper.training.online import OnlineConfig
-from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.transport import codec, pose_message, query_messages
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.keys import load_keys
@@ -85,7 +81,6 @@ __all__ = [
     "COMMAND",
     "ROOMS",
     "TOPICS",
-    "VALIDATION_SEEDS",
     "CameraIntrinsics",
     "Checkpoint",
     "CodecOptions",
@@ -102,8 +97,6 @@ __all__ = [
     "LogWriter",
     "MapUpdate",
     "MapperConfig",
-    "NesfTrainConfig",
-    "NoiseConfig",
     "OnlineConfig",
     "PosedFrame",
     "SRay",
@@ -111,9 +104,7 @@ __all__ = [
     "SemanticMapperError",
     "Status",
     "StreamInfo",
-    "SuiteConfig",
     "Tolerances",
-    "TrainConfig",
     "VoxelMap",
     "WeightsInUse",
     "WeightsUpdate",
@@ -128,12 +119,12 @@ __all__ = [
     "load_launch",
     "load_mount",
     "read_corrections",
-    "room_frames",
     "save_checkpoint",
 ]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-LAUNCH, RECIPES = REPOSITORY / "launch", REPOSITORY / "recipes"
+LAUNCH = REPOSITORY / "launch"
+CLASS_FILES = REPOSITORY / "replay" / "importers" / "classes"
 COMMAND = Path(sys.executable).parent / "semantic-mapper"
 TIMEOUT_S = 300.0  # kernels may have to be compiled, on a busy machine
 
@@ -277,8 +268,6 @@ SETTINGS: dict[str, tuple[type[msgspec.Struct], dict[str, Any]]] = {
     "mapper": (MapperConfig, {}),
     "online": (OnlineConfig, {}),
     "finetune": (FinetuneConfig, {}),
-    "train": (TrainConfig, {}),
-    "suite": (SuiteConfig, {}),
     "tolerances": (Tolerances, {}),
     "calibrate": (CalibrationSettings, {}),
     "rename": (RenameConfig, {"classes": {"couch": "sofa"}}),

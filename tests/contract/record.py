@@ -1,8 +1,7 @@
 """Write the golden data of the contract tests from the code as it is.
 
-    OMP_NUM_THREADS=1 python -m tests.contract.record             # all but the inputs
+    OMP_NUM_THREADS=1 python -m tests.contract.record             # all
     OMP_NUM_THREADS=1 python -m tests.contract.record map cli     # some groups
-    OMP_NUM_THREADS=1 python -m tests.contract.record inputs      # the log and the weights, which take minutes to train
 
 Golden data says what users have. Record again only what was meant to change, look at `git diff` of the JSON files, and
 say in the commit why users can live with it. Old bytes of the wire are never replaced: where a message is packed
@@ -14,7 +13,6 @@ are kept.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import shutil
 import tempfile
@@ -24,40 +22,11 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
-import torch
-
 from tests.contract import entry_points as api
 from tests.contract import golden, runs, samples
-from tests.contract.golden import FOLDER, FRAMES, LOG, MAP, MAP_INT16, POINTS, REFUSED_SEQ, STORED, WEIGHTS
+from tests.contract.golden import FOLDER, LOG, MAP, MAP_INT16, POINTS, STORED, WEIGHTS
 
-CAMERA = api.CameraIntrinsics(66.0, 66.0, 47.5, 35.5, 96, 72)
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
-
-
-def record_inputs(folder: Path) -> None:
-    """A furnished room filmed by a noisy sensor; every other frame is the log, the others taught the weights."""
-    frames = list(api.room_frames(api.VALIDATION_SEEDS[0], 24, CAMERA, noise=api.NoiseConfig()))
-    kept = frames[: 2 * (FRAMES - 1) : 2]
-    skewed = kept[0].T_world_camera.copy()
-    skewed[:3, :3] *= 1.5
-    black = np.zeros_like(kept[0].rgb)
-    stamp = (kept[REFUSED_SEQ - 1].stamp_ns + kept[REFUSED_SEQ].stamp_ns) // 2
-    wrong = dataclasses.replace(kept[0], stamp_ns=stamp, rgb=black, depth_m=None, label=None, T_world_camera=skewed)
-    kept.insert(REFUSED_SEQ, wrong)
-    info = api.StreamInfo("a golden room", {"rooms": CAMERA}, api.ROOMS, FRAMES, 7.5, {"made_by": "tests.contract"})
-    with api.LogWriter(LOG, info, overwrite=True) as log:
-        for seq, frame in enumerate(kept):
-            log.write_frame(dataclasses.replace(frame, seq=seq))
-    torch.manual_seed(0)
-    shape = api.convert_config(
-        {"feature_dim": 16, "heads": 2, "encoder": {"channels": [8, 16], "blocks": [1, 1], "depth": True}},
-        api.SRayConfig,
-        "golden weights",
-    )
-    settings = api.FinetuneConfig(seconds=0, steps=300, width=96)
-    fitted = api.finetune(frames[1::2], api.ROOMS, api.SRay(shape, api.ROOMS), settings)
-    api.save_checkpoint(dataclasses.replace(fitted, anchors=fitted.anchors[:1]), WEIGHTS)
 
 
 def record_wire(folder: Path) -> None:
@@ -208,7 +177,6 @@ def record_python(folder: Path) -> None:
 
 
 GROUPS: dict[str, Callable[[Path], None]] = {
-    "inputs": record_inputs,
     "wire": record_wire,
     "map": record_map,
     "kitchen": record_kitchen,
@@ -226,8 +194,8 @@ GROUPS: dict[str, Callable[[Path], None]] = {
 def main() -> None:
     """Record."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("group", nargs="*", choices=[*GROUPS, []], help="by default all but inputs")
-    wanted = parser.parse_args().group or [name for name in GROUPS if name != "inputs"]
+    parser.add_argument("group", nargs="*", choices=[*GROUPS, []], help="by default all")
+    wanted = parser.parse_args().group or list(GROUPS)
     STORED.mkdir(parents=True, exist_ok=True)
     for name in wanted:
         with tempfile.TemporaryDirectory(prefix="contract-") as folder, patch.dict(os.environ):

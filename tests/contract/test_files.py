@@ -311,7 +311,7 @@ def test_what_a_killed_mapper_leaves_can_be_asked(tmp_path: Path) -> None:
     for arguments in (("info", tmp_path), ("query", tmp_path, "nearest", "wall", "0", "0", "1")):
         ran = api.run_here(*arguments)
         assert ran.code == 0, ran.stderr
-    ran = api.run_here("compare", tmp_path, STORED, "--picture", tmp_path / "a.png")
+    ran = api.run_here("compare", tmp_path, STORED)
     assert ran.code == 0, ran.stdout
 
 
@@ -333,8 +333,8 @@ def test_a_stored_run_of_then_is_what_the_plugin_gets(tmp_path: Path) -> None:
     replays = api.LogReplays(FOLDER, lambda name: tmp_path / name)
     made = replays("room.mcap", weights="small.safetensors", config=STORED_SETTINGS, max_frames=STORED_FRAMES)
     # Rays at depth borders are sampled elsewhere since priors follow the image's edges (docs/decisions/0020).
-    made.assert_like("stored", labels=0.02, confidence=0.03, class_iou=0.03)
+    made.assert_like("stored", labels=0.02, score=0.03)
     assert made.mapped == STORED_FRAMES and made.refused == []
     fewer = replays("room.mcap", weights="small.safetensors", config=STORED_SETTINGS, max_frames=STORED_FRAMES - 1)
     with pytest.raises(AssertionError, match="is not as"):
-        fewer.assert_like("stored", labels=0.02, confidence=0.03, class_iou=0.03)
+        fewer.assert_like("stored", labels=0.02, score=0.03)

@@ -26,8 +26,7 @@ EXAMPLES: dict[str, Any] = {
 def observe() -> dict[str, Any]:
     """Defaults of all settings, by table and dotted name; nodes of shipped launch files."""
     files = {path.name: api.launch_nodes(path) for path in sorted(api.LAUNCH.glob("*.toml"))}
-    recipes = sorted(path.name for path in api.RECIPES.rglob("*.toml"))
-    return {"defaults": {name: defaults(name) for name in api.SETTINGS}, "launch": files, "recipes": recipes}
+    return {"defaults": {name: defaults(name) for name in api.SETTINGS}, "launch": files}
 
 
 def defaults(name: str) -> dict[str, Any]:
@@ -125,7 +124,7 @@ def _refuses_name(name: str, key: str) -> list[str]:
 
 
 def _toml_files() -> list[Path]:
-    return [*sorted(api.LAUNCH.rglob("*.toml")), *sorted(api.RECIPES.rglob("*.toml"))]
+    return [*sorted(api.LAUNCH.rglob("*.toml")), *sorted(api.CLASS_FILES.glob("*.toml"))]
 
 
 @pytest.mark.parametrize("path", _toml_files(), ids=lambda p: p.name)
@@ -134,15 +133,9 @@ def test_shipped_files_are_read(path: Path, tmp_path: Path) -> None:
         given = {"camera": ["camera.kind=oak"], "replay": ["camera.log=a.mcap"]}.get(path.stem, [])
         assert api.load_launch(path, given, tmp_path).nodes
     else:
-        kind = api.SETTINGS["rename" if path.parent.name == "classes" else "train"][0]
-        kind = api.NesfTrainConfig if path.name.startswith("nesf") else kind
-        assert api.load_config(path, kind)
+        assert api.load_config(path, api.SETTINGS["rename"][0])
 
 
 @pytest.mark.parametrize("name", _FILE["launch"])
 def test_a_shipped_launch_file_has_the_same_nodes(name: str) -> None:
     assert _FILE["launch"][name] == api.launch_nodes(api.LAUNCH / name)
-
-
-def test_shipped_recipes_of_then_are_there() -> None:
-    assert set(_FILE["recipes"]) <= {path.name for path in api.RECIPES.rglob("*.toml")}

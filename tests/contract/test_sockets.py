@@ -34,7 +34,7 @@ log = ""
 mode = "realtime"
 rate = 0.01
 """
-REFUSED = {"weights", "nearest@refined"}  # nothing learns or refines here, so that an error answers these
+REFUSED = {"weights"}  # nothing learns here, so that an error answers
 _WIRE: dict[str, Any] = read("wire")
 
 

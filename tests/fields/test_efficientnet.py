@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from research.train import start
 from semantic_mapper.config import EncoderConfig, UNetFieldConfig
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.efficientnet import STAGES, WIDTHS, EfficientNetLite0, imagenet_state
@@ -14,7 +15,6 @@ from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training import start
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from tests.fields.scene import pose_at, wall_sources
 

@@ -1,10 +1,11 @@
 import pytest
 import torch
 
-from semantic_mapper.config import EncoderConfig, NeuRayConfig, SRayConfig
+from research.peers.config import NeuRayConfig
+from semantic_mapper.config import EncoderConfig, SRayConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.registry import KINDS, PRESETS, build_field, field_config, field_names
+from semantic_mapper.fields.registry import PRESETS, build_field, field_config, field_kinds, field_names
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.training.losses import LossConfig
 from semantic_mapper.training.step import StepConfig, training_loss
@@ -21,7 +22,7 @@ TRAINED = [name for name in field_names() if name not in ("grid", "panoptic") an
 
 
 def test_every_name_is_tested_here():
-    assert set(TINY) == set(field_names()) == set(KINDS) | set(PRESETS)
+    assert set(TINY) == set(field_names()) == set(field_kinds()) | set(PRESETS)
 
 
 @pytest.mark.parametrize("name", field_names())

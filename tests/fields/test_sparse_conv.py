@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from research.peers.unet3d import LEVELS, UNet3d
 from semantic_mapper.fields.sparse_conv import SubmanifoldConv, cell_levels
-from semantic_mapper.fields.unet3d import LEVELS, UNet3d
 
 SIZE = (8, 4, 12)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from research.scenes import TRAIN_SEEDS, NoiseConfig, room_views
 from semantic_mapper.fields.surface import surface_maps, surface_normals, up_direction
 from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.scenes import TRAIN_SEEDS, NoiseConfig, room_views
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)

@@ -6,17 +6,15 @@ from dataclasses import replace
 
 import torch
 
+from research.peers.config import MVSNeRFConfig, NeuRayConfig, SemanticNeRFConfig
 from semantic_mapper.config import (
     Config,
     EncoderConfig,
     GridConfig,
     GridFieldConfig,
     IRTConfig,
-    MVSNeRFConfig,
-    NeuRayConfig,
     PanopticConfig,
     SamplingConfig,
-    SemanticNeRFConfig,
     SRayConfig,
     UNetFieldConfig,
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,26 +105,17 @@ def test_a_type_that_c_does_not_know_is_refused() -> None:
         kernel(count_visits)("visits")
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Where the library is looked for."""
-    monkeypatch.setattr(binding, "LIBRARY_FOLDER", tmp_path)
-    binding.load_library.cache_clear()
-    yield tmp_path
-    binding.load_library.cache_clear()
+def test_a_missing_library_is_named_and_how_to_get_it(tmp_path: Path) -> None:
+    with pytest.raises(DependencyError, match=f"no compiled kernels for .* in {tmp_path}.*make setup"):
+        binding.load_library(tmp_path)
 
 
-def test_a_missing_library_is_named_and_how_to_get_it(folder: Path) -> None:
-    with pytest.raises(DependencyError, match=f"no compiled kernels for {platform.machine()} in {folder}.*make setup"):
-        binding.load_library()
-
-
-def test_a_library_of_another_machine_is_named(folder: Path) -> None:
-    library = folder / f"kernels-{platform.machine()}.so"
+def test_a_library_of_another_machine_is_named(tmp_path: Path) -> None:
+    library = tmp_path / f"kernels-{platform.machine()}.so"
     header = b"\x7fELF\x02\x01\x01" + bytes(9) + struct.pack("<HH", 3, 8)  # a 64-bit shared object for MIPS
     library.write_bytes(header.ljust(64, b"\0"))
     with pytest.raises(DependencyError, match=f"cannot load the compiled kernels {library}"):
-        binding.load_library()
+        binding.load_library(tmp_path)
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="other machines have one library")

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 
+from research.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.localization.features import (
     Features,
@@ -13,7 +14,6 @@ from semantic_mapper.localization.features import (
     pose_from_points,
 )
 from semantic_mapper.localization.places import PlaceIndex
-from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 INTRINSICS = CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120)

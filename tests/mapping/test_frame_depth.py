@@ -12,6 +12,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import DepthConfig, DepthFromMotionConfig, PoseRefinerConfig
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.errors import ConfigError
@@ -22,7 +23,6 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.frame_depth import MOST_SPREAD, SURE_SPREAD, FrameDepth, computed_trust
 from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, MEASURED
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 from tests.small import SMALL_ENCODER, SMALL_MODEL, tiny_config, tiny_field
 

@@ -10,7 +10,7 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import look_at, transform, turn_onto
-from semantic_mapper.mapping.files.formats.map_server import write_map_server
+from semantic_mapper.mapping.files.formats import write_map_server
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, floor_height, occupancy_grid
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64

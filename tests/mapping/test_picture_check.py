@@ -7,13 +7,13 @@ from functools import cache
 
 import pytest
 
-from benchmarks.picture_faults import BEGIN, FAULTS, named, room_walk, spoil, zoom
+from research.experiments.picture_faults import BEGIN, FAULTS, named, room_walk, spoil, zoom
+from research.scenes import TRAIN_SEEDS
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.picture_check import REFUSED, SENTENCES, PictureCheck
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.scenes import TRAIN_SEEDS
 from semantic_mapper.types import PosedFrame
 from tests.small import tiny_config, tiny_field
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as with_settings
 
+from research.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import invert_pose, rotation_vector
@@ -17,7 +18,6 @@ from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.mapping.worlds import HELD, MapWorlds
 from semantic_mapper.replay.session import MapSession, Refusal
-from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 
 INTRINSICS = CameraIntrinsics(140.0, 140.0, 79.5, 59.5, 160, 120)

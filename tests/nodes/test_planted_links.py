@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from research.train.folder_lock import LOCK_FILE, sole_use_of
 from semantic_mapper.nodes.cli.outputs import hold_folder
 from semantic_mapper.replay.log.atomic_file import AtomicFile
-from semantic_mapper.training.folder_lock import LOCK_FILE, sole_use_of
 from tests.nodes.support import run_here
 
-RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html", "compare.png")
+RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html")
 
 
 def test_no_result_is_written_through_a_link(

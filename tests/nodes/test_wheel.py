@@ -13,7 +13,7 @@ import pytest
 from tests.nodes.support import error_line
 
 TOP = Path(__file__).resolve().parents[2]
-SOURCES = ("semantic_mapper", "drivers", "nodes", "replay", "launch", "recipes")
+SOURCES = ("semantic_mapper", "drivers", "nodes", "replay", "launch")
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +36,12 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "installed"
 
 
-def test_the_wheel_holds_launch_files_recipes_and_the_unit(installed: Path) -> None:
-    for inside, outside in (("launch_files", "launch"), ("recipes", "recipes")):
-        wanted = {p.relative_to(TOP / outside): p.read_bytes() for p in (TOP / outside).rglob("*") if p.is_file()}
-        packaged = installed / "semantic_mapper" / inside
-        assert {p.relative_to(packaged): p.read_bytes() for p in packaged.rglob("*") if p.is_file()} == wanted
+def test_the_wheel_holds_launch_files_the_unit_and_no_research(installed: Path) -> None:
+    wanted = {p.relative_to(TOP / "launch"): p.read_bytes() for p in (TOP / "launch").rglob("*") if p.is_file()}
+    packaged = installed / "semantic_mapper" / "launch_files"
+    assert {p.relative_to(packaged): p.read_bytes() for p in packaged.rglob("*") if p.is_file()} == wanted
+    assert not (installed / "research").exists()
+    assert (installed / "semantic_mapper" / "demo.mcap").exists()
     assert not (installed / "launch").exists()  # a package of that name would fight ROS 2's
 
 

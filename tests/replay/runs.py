@@ -12,7 +12,7 @@ from semantic_mapper.config import MapperConfig
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.run_folder import Run
+from semantic_mapper.replay.compare import Run
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import PosedFrame
 from tests.mapping import rendered_views as views

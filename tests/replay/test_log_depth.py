@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import DepthConfig, DepthFromMotionConfig
 from semantic_mapper.replay.log_depth import compute_depths
-from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)

@@ -11,7 +11,7 @@ import pytest
 import structlog
 import torch
 
-from benchmarks.grid_scenes import BOX_M, object_frames, objects_scene
+from research.experiments.grid_scenes import BOX_M, object_frames, objects_scene
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.registry import build_field

@@ -9,8 +9,8 @@ import torch
 
 from semantic_mapper.config import EncoderConfig, SRayConfig, UNetFieldConfig
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.peers.unet_field import UNetField
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.losses import guess_loss, semantic_loss
 from semantic_mapper.training.step import StepConfig, pick_views_on_path

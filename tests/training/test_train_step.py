@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from research.train.train_config import TrainStepConfig
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.device import choose_device, compute_in_bfloat16
@@ -15,7 +16,6 @@ from semantic_mapper.training.step import (
     draw_batch,
     pick_views_on_path,
 )
-from semantic_mapper.training.train_config import TrainStepConfig
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_field, tiny_frames
 

@@ -10,9 +10,9 @@ import pytest
 @pytest.fixture(scope="session")
 def room_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A furnished room, filmed by a hand-held depth camera: 12 labelled frames of 160x120."""
+    from research.scenes import VALIDATION_SEEDS, room_frames
     from semantic_mapper.labels import ROOMS
     from semantic_mapper.replay.log.format import LogWriter
-    from semantic_mapper.scenes import VALIDATION_SEEDS, room_frames
     from semantic_mapper.transport.messages import StreamInfo
     from semantic_mapper.types import CameraIntrinsics
 

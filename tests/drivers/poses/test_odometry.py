@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from research.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses.alignment import Target, align, fit
 from semantic_mapper.drivers.poses.config import OdometryPoses
@@ -17,7 +18,6 @@ from semantic_mapper.errors import CameraError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import invert_pose, rotation_vector, unproject
 from semantic_mapper.localization.features import find_features, pose_from_features
-from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 from . import images

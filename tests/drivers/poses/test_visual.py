@@ -8,6 +8,9 @@ from typing import Any, Self
 import numpy as np
 import pytest
 
+from research.scenes import TEST_SEEDS, CameraPathConfig, room_frames
+from research.scenes.config import PoseNoiseConfig
+from research.scenes.pose_noise import drifting_poses
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.mounts import Mount
@@ -17,9 +20,6 @@ from semantic_mapper.drivers.poses.visual import VisualPoseSource
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error
 from semantic_mapper.nodes.camera.live import with_poses
-from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
-from semantic_mapper.scenes.config import PoseNoiseConfig
-from semantic_mapper.scenes.pose_noise import drifting_poses
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float64, PosedFrame
 from tests.bundle.rooms import INTRINSICS, truth, walk, way_m

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from research.scenes import render_view
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo import list_devices
 from semantic_mapper.drivers.stereo.calibration import load_stereo, save_stereo
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
-from semantic_mapper.scenes import render_view
 from semantic_mapper.types import Float64
 from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine, write_calibration
 from tests.drivers.stereo import pairs

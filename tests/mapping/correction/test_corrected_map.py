@@ -12,6 +12,7 @@ import structlog
 import torch
 from scipy.spatial import cKDTree
 
+from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.errors import MapError, PoseError
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
@@ -19,7 +20,6 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction.pose_correction import ALWAYS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import BLOCKS_A_VERSION, VoxelMap
-from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.mapping.correction.test_history import damage
 from tests.small import tiny_config, tiny_field, tiny_frames

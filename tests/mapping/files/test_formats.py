@@ -12,12 +12,16 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
-from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.files.export import colored, sure_faces, sure_points
-from semantic_mapper.mapping.files.formats.glb import write_glb
-from semantic_mapper.mapping.files.formats.npz import write_npz
-from semantic_mapper.mapping.files.formats.obj import write_obj
-from semantic_mapper.mapping.files.formats.ply import write_ply, write_ply_mesh
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.files.formats import (
+    colored,
+    sure_faces,
+    sure_points,
+    write_glb,
+    write_npz,
+    write_obj,
+    write_ply,
+)
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
@@ -89,22 +93,13 @@ def test_glb_holds_every_value_and_what_labels_mean(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "map.glb"]
 
 
-@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (0, 1, 0), (1, 0, 0), (0.6, 0, -0.8)])
-def test_glb_turns_up_to_y_without_a_mirror(tmp_path: Path, up: tuple[float, float, float]) -> None:
-    write_glb(tmp_path / "map.glb", MESH, LABELS, np.array(up, np.float64))
-    T = np.array(read_glb(tmp_path / "map.glb")[0]["nodes"][0]["matrix"]).reshape(4, 4).T
-    np.testing.assert_allclose(T[:3, :3] @ up, (0, 1, 0), atol=1e-12)
-    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(T[:3, :3]) > 0 and (T[3] == (0, 0, 0, 1)).all() and (T[:3, 3] == 0).all()
-
-
 def test_open3d_reads_the_glb_with_y_up(tmp_path: Path) -> None:
     write_glb(tmp_path / "map.glb", MESH, LABELS, UP_Z)
     model = load_open3d().io.read_triangle_model(str(tmp_path / "map.glb"))
     mesh = model.meshes[0].mesh
     x, y, z = MESH.vertices[MESH.faces].reshape(-1, 3).T
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(-1, 3)
-    np.testing.assert_allclose(corners, np.stack((x, z, -y), axis=1), atol=1e-6)
+    np.testing.assert_allclose(corners, np.stack((x, z, -y), axis=1), atol=1e-6)  # no mirror
 
 
 def test_an_empty_mesh_is_no_glb(tmp_path: Path) -> None:
@@ -139,7 +134,7 @@ def test_obj_groups_faces_by_class_with_a_material_each(tmp_path: Path, class_ma
 
 def test_open3d_reads_obj_and_ply_mesh_alike(tmp_path: Path) -> None:
     write_obj(tmp_path / "map.obj", MESH, LABELS, class_materials=True)
-    write_ply_mesh(tmp_path / "map.ply", MESH, LABELS)
+    write_ply(tmp_path / "map.ply", MESH, LABELS)
     o3d = load_open3d()
     for name in ("map.obj", "map.ply"):
         mesh = o3d.io.read_triangle_mesh(str(tmp_path / name))
@@ -175,35 +170,35 @@ def test_npz_needs_no_pickle_and_is_the_same_each_time(tmp_path: Path) -> None:
         assert (int(read["ignore_id"]), str(read["label_set"])) == (0, "three")
 
 
-SOME_COMPUTED = np.array([True, False, False, True])
-
-
-@pytest.mark.parametrize("measured", [None, np.ones(4, np.bool_)])
-def test_points_and_meshes_say_nothing_of_measuring_where_nothing_was_computed(
-    tmp_path: Path, measured: np.ndarray | None
-) -> None:
-    write_npz(tmp_path / "map.npz", replace(POINTS, measured=measured), LABELS)
-    with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
-        assert "measured" not in read.files
-    write_ply(tmp_path / "map.ply", replace(POINTS, measured=measured), LABELS)
-    write_ply(tmp_path / "plain.ply", POINTS, LABELS)
-    assert (tmp_path / "map.ply").read_bytes() == (tmp_path / "plain.ply").read_bytes()
-    write_ply_mesh(tmp_path / "mesh.ply", replace(MESH, measured=measured), LABELS)
-    assert b"measured" not in (tmp_path / "mesh.ply").read_bytes()
-
-
 def test_points_and_meshes_say_what_was_measured_where_something_was_computed(tmp_path: Path) -> None:
-    write_npz(tmp_path / "map.npz", replace(POINTS, measured=SOME_COMPUTED), LABELS)
-    with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
-        assert read["measured"].dtype == np.bool_ and (read["measured"] == SOME_COMPUTED).all()
-    write_ply(tmp_path / "points.ply", replace(POINTS, measured=SOME_COMPUTED), LABELS)
-    write_ply_mesh(tmp_path / "mesh.ply", replace(MESH, measured=SOME_COMPUTED), LABELS)
-    for name in ("points.ply", "mesh.ply"):
-        point = load_open3d().t.io.read_point_cloud(str(tmp_path / name)).point
-        assert point["measured"].numpy().ravel().tolist() == [1, 0, 0, 1]
-        assert (point.positions.numpy() == POINTS.xyz).all() and (point["label"].numpy().ravel() == POINTS.label).all()
-    kept = sure_points(replace(POINTS, measured=SOME_COMPUTED), 0.75)
-    assert kept.measured is not None and kept.measured.tolist() == [True, False]
+    some, all_ = np.array([True, False, False, True]), np.ones(4, np.bool_)
+    for measured, said in ((some, True), (all_, False)):
+        write_npz(tmp_path / "map.npz", replace(POINTS, measured=measured), LABELS)
+        with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
+            assert ("measured" in read.files) == said and (not said or (read["measured"] == some).all())
+        for surface in (POINTS, MESH):
+            write_ply(tmp_path / "map.ply", replace(surface, measured=measured), LABELS)
+            point = load_open3d().t.io.read_point_cloud(str(tmp_path / "map.ply")).point
+            assert ("measured" in point) == said and (not said or (point["measured"].numpy().ravel() == some).all())
+
+
+@pytest.mark.parametrize("name", ["Tür", "a\nend_header", "a\r\x00\x1b[31m", "back\\slash", "椅" * 128])
+def test_any_class_name_is_one_readable_comment_of_a_ply(tmp_path: Path, name: str) -> None:
+    """Open3D ends the process at lines of more than 1,000 characters."""
+    write_ply(tmp_path / "map.ply", POINTS, LabelSet("odd", (7, 9), (name, "table"), ((1, 2, 3), (4, 5, 6))))
+    header = (tmp_path / "map.ply").read_bytes().split(b"\nend_header\n")[0].decode("ascii").split("\n")
+    assert all(line.isprintable() for line in header)
+    number, text = header[2].removeprefix("comment label ").split(" ", 1)
+    assert number == "7" and header[3] == "comment label 9 table"
+    shown = text.encode().decode("unicode_escape")
+    assert name.startswith(shown) and (shown == name or 190 < len(text) <= 200)
+    cloud = load_open3d().t.io.read_point_cloud(str(tmp_path / "map.ply"))
+    assert (cloud.point["label"].numpy().ravel() == POINTS.label).all()
+
+
+def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="nowhere"):
+        write_ply(tmp_path / "nowhere" / "map.ply", POINTS, LABELS)
 
 
 def test_colours_and_confidence_choose_what_is_seen() -> None:
@@ -246,12 +241,3 @@ def test_no_up_is_better_than_a_wrong_one() -> None:
     mixed = np.random.default_rng(4).permutation(room.label)
     with pytest.raises(MapError, match="in no plane"):
         find_up(MapPoints(room.xyz, room.rgb, mixed, room.confidence), ROOMS)
-
-
-def test_the_least_turn_is_a_rotation_even_for_opposite_directions() -> None:
-    for a in (*np.eye(3), *-np.eye(3), np.array((0.36, 0.48, 0.8))):
-        for b in (*np.eye(3), -np.array((0.36, 0.48, 0.8))):
-            R = turn_onto(a, b)
-            np.testing.assert_allclose(R @ a, b, atol=1e-9)
-            np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
-            assert np.linalg.det(R) > 0

@@ -13,10 +13,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.config import SemanticNeRFConfig
+from research.bench.render import log_scenes
+from research.peers.config import SemanticNeRFConfig
+from research.peers.semantic_nerf import SemanticNeRF
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.peers.semantic_nerf import SemanticNeRF
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
@@ -28,7 +29,6 @@ from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_con
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel import RENDERED_SPREAD, AutolabelReport, AutolabelRequest, autolabel
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.bench.render import log_scenes
 from semantic_mapper.replay.exporters import LogExportRequest, export_log
 from semantic_mapper.replay.importers import import_recording
 from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter

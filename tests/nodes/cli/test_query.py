@@ -226,8 +226,6 @@ def test_query_and_export_see_that_a_folder_holds_tiles(tiles: Path, tmp_path: P
     assert code == 1 and "it holds a map in tiles, which `query` and `export` read" in said
     code, said = run_here("query", "memory://nothing-there", "info")
     assert code == 1 and "tiles.json: is missing" in said
-    code, said = run_here("query", tiles, "info", "--refined")
-    assert code == 2
 
 
 def test_a_damaged_tile_is_reported_with_its_name(tiles: Path, tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from research.train.map_grids import made_of_room, training_map
 from semantic_mapper.fields.checkpoint import find_checkpoint
 from semantic_mapper.fields.nesf import SHIPPED, load_nesf, save_nesf
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.map_grids import made_of_room, training_map
 from tests.mapping.test_refine import UP, make_map, random_weights
 from tests.nodes.support import error_line, run, write_weights
 from tests.small import tiny_frames

@@ -29,7 +29,7 @@ from urllib.parse import unquote, urlsplit
 import fsspec
 import pytest
 
-from benchmarks.ray_nodes import free_port
+from research.experiments.ray_nodes import free_port
 
 ACCESS_KEY, SECRET_KEY = "fleet-test", "fleet-test-secret"
 _START_TIMEOUT_S = 30.0

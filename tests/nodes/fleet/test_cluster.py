@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks.ray_nodes import RayNodes, free_port, ray_nodes
+from research.experiments.ray_nodes import RayNodes, free_port, ray_nodes
 from semantic_mapper.errors import DependencyError, FleetError
 from semantic_mapper.nodes.fleet import cluster
 from semantic_mapper.nodes.fleet.cluster import connected

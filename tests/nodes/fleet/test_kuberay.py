@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from benchmarks.ray_nodes import free_port, ray_nodes
+from research.experiments.ray_nodes import free_port, ray_nodes
 from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.launcher.launch_file import LAUNCH_FOLDER
 

@@ -22,8 +22,7 @@ import pytest
 
 from semantic_mapper.errors import ConfigError, FleetError, MapError, StoreError
 from semantic_mapper.geometry import invert_pose
-from semantic_mapper.localization.features import find_place_features
-from semantic_mapper.localization.places import Place, make_place
+from semantic_mapper.localization.places import Place
 from semantic_mapper.mapping.files.tiles import TILES_NAME, parse_tiles
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.console import frame_progress
@@ -344,32 +343,6 @@ def test_poses_that_are_none_are_refused(tmp_path: Path, text: str, says: str) -
 def test_maps_are_named_by_their_file_or_folder() -> None:
     assert map_names(["runs/east/map.npz", "runs/west", "s3://maps/attic.npz"]) == ["east", "west", "attic"]
     assert map_names(["1/east.npz", "2/east.npz"]) == ["1/east.npz", "2/east.npz"]
-
-
-@pytest.fixture(scope="module")
-def seen_maps(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], list[Float64]]:
-    """Three robots in one room, which find each other by what they have seen."""
-    from benchmarks.fleet_merge import CAMERA, frames_of, robot_world
-    from semantic_mapper.config import VoxelMapConfig
-    from semantic_mapper.labels import ROOMS
-    from semantic_mapper.scenes.storey import make_storey
-
-    folder = tmp_path_factory.mktemp("seen")
-    storey = make_storey(200001, 20.0)
-    paths: list[str] = []
-    for robot in range(3):
-        voxel_map = VoxelMap(VoxelMapConfig(voxel_size_m=0.03), ROOMS)
-        for frame in frames_of(storey, 200001, robot):
-            assert frame.depth_m is not None
-            voxel_map.integrate(frame, frame.depth_m, None)
-            if voxel_map.places.wants(frame.T_world_camera):
-                features = find_place_features(frame.rgb, frame.depth_m, 400)
-                voxel_map.places.add(
-                    make_place(frame.camera_id, frame.stamp_ns, frame.T_world_camera, features, CAMERA)
-                )
-        paths.append(str(folder / f"robot-{robot}.npz"))
-        voxel_map.save(Path(paths[-1]))
-    return paths, [robot_world(200001, robot) for robot in range(3)]
 
 
 @pytest.mark.slow

@@ -15,8 +15,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks.ray_nodes import RayNodes, ray_nodes
-from tests.conftest import REPOSITORY
+from conftest import REPOSITORY
+from research.experiments.ray_nodes import RayNodes, ray_nodes
 from tests.nodes.fleet.test_cluster import join
 
 pytest.importorskip("ray")

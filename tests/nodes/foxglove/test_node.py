@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
-from benchmarks.foxglove_client import FoxgloveClient, Received
+from research.experiments.foxglove_client import FoxgloveClient, Received
 from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.nodes.foxglove.node import run_foxglove
 from semantic_mapper.nodes.foxglove.server import BACKLOG, FoxgloveServer

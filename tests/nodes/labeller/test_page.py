@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.browser import PROGRAM, Browser
+from research.experiments.browser import PROGRAM, Browser
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.labeller.server import LabelServer
 from semantic_mapper.nodes.labeller.session import LabelSession

@@ -60,5 +60,5 @@ def test_what_the_command_says_of_a_saved_map_without_metres(replayed: Path, tmp
     assert code == 1 and "scale is unknown" in " ".join(said.split()) and not (tmp_path / "plan.yaml").exists()
     code, said = run_here("merge", saved, replayed, "--out", tmp_path / "both.npz")
     assert code == 1 and "scale of the other is unknown" in " ".join(said.split())
-    code, said = run_here("compare", saved, replayed, "--picture", tmp_path / "a.png")
+    code, said = run_here("compare", saved, replayed)
     assert code == 2 and "scale of the other is unknown" in " ".join(said.split())

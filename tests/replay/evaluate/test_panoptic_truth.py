@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from research.scenes import TRAIN_SEEDS
+from research.scenes.sequence import room_views
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.evaluate.panoptic_truth import InstanceFolder, PanopticTruth
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.scenes import TRAIN_SEEDS
-from semantic_mapper.scenes.sequence import room_views
 from tests.nodes.support import write_log
 from tests.small import INTRINSICS, tiny_config
 

@@ -17,7 +17,7 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from benchmarks.fuzz_targets import TARGETS, flip
+from research.experiments.fuzz_targets import TARGETS, flip
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.replay.log import reader
 from semantic_mapper.replay.log.format import LogReader
@@ -187,7 +187,7 @@ def test_chunks_that_another_tool_compressed_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_mutated_inputs_raise_nothing_but_our_errors(name: str) -> None:
-    """A second of what ``benchmarks/fuzz.py`` does, without its guidance."""
+    """A second of what ``research/experiments/fuzz.py`` does, without its guidance."""
     target, rng = TARGETS[name], random.Random(7)
     seeds = target.seeds()
     for seed in seeds[: 1 if name == "log" else None]:

@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from research.scenes.camera import camera_path
+from research.scenes.config import CameraPathConfig, NoiseConfig
+from research.scenes.render import render_view
+from research.scenes.room import make_room
+from research.scenes.shots import sequence_shots
 from semantic_mapper.geometry import interpolate_pose
-from semantic_mapper.scenes.camera import camera_path
-from semantic_mapper.scenes.config import CameraPathConfig, NoiseConfig
-from semantic_mapper.scenes.render import render_view
-from semantic_mapper.scenes.room import make_room
-from semantic_mapper.scenes.shots import sequence_shots
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 W, H, HZ = 320, 240, 15.0

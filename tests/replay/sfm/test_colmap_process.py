@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from research.scenes.daylight import pose_of
 from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import transform
 from semantic_mapper.replay.sfm import colmap_process as colmap
 from semantic_mapper.replay.sfm.colmap_model import read_model
-from semantic_mapper.scenes.daylight import pose_of
 from semantic_mapper.types import Float64
 
 W, H, FOCAL, FRAMES = 640, 360, 400.0, 10

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.drone_pictures import DIAGONAL_35MM, rows_over, save_picture
-from benchmarks.forward_film import compare, pinhole, street_drive, take
-from benchmarks.video import write_film
+from research.experiments.drone_pictures import DIAGONAL_35MM, rows_over, save_picture
+from research.experiments.forward_film import compare, pinhole, street_drive, take
+from research.experiments.video import write_film
+from research.scenes.aerial.views import aerial_camera, cached_town, render_town
+from research.scenes.streets.views import cached_street
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.evaluation.trajectory import align_similar
@@ -21,8 +23,6 @@ from semantic_mapper.replay.sfm.film_note import read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
 from semantic_mapper.replay.sfm.refusals import FilmError
 from semantic_mapper.replay.sfm.scale import Mark, MarkedDistance, ScaleHint
-from semantic_mapper.scenes.aerial.views import aerial_camera, cached_town, render_town
-from semantic_mapper.scenes.streets.views import cached_street
 from semantic_mapper.types import Float64
 from tests.nodes.support import run
 
@@ -143,8 +143,8 @@ def test_a_calibrated_film_gets_its_scale_from_two_marked_points_or_a_height(
     # Two features that the scene has at a known distance: corners of the first picture with their true depth.
     import cv2
 
-    from semantic_mapper.scenes.render import render_view
-    from semantic_mapper.scenes.room import make_room
+    from research.scenes.render import render_view
+    from research.scenes.room import make_room
 
     n = COUNT // 2
     view = render_view(make_room(films.SEED), films.CAMERA, poses[n])
@@ -187,7 +187,7 @@ def test_a_hand_held_walk_with_rolling_shutter_is_reconstructed(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_a_camera_that_turns_on_the_spot_is_refused(tmp_path: Path) -> None:
-    from semantic_mapper.scenes.camera import pose_of
+    from research.scenes.camera import pose_of
 
     start = films.walk(1)[0][:3, 3]
     poses = np.stack([pose_of(start, yaw, -0.1) for yaw in np.linspace(0.0, 1.6, 40)])
@@ -199,7 +199,7 @@ def test_a_camera_that_turns_on_the_spot_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_camera_that_stands_and_looks_around_is_refused(tmp_path: Path) -> None:
-    from semantic_mapper.scenes.camera import pose_of
+    from research.scenes.camera import pose_of
 
     scene = cached_street(200_000).scene
     poses = [pose_of(np.array([10, -1.5, 1.55]), 0.35 * np.sin(n / 6), 0.03 * np.sin(n / 3)) for n in range(70)]

@@ -1,0 +1,191 @@
+"""Measure mapping on this machine: fusion against Open3D's own, and whole steps of the pipeline, in one process."""
+
+from __future__ import annotations
+
+# Open3D comes without types.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semantic_mapper.config import MapperConfig, VoxelMapConfig
+from semantic_mapper.errors import LogError
+from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.geometry import invert_pose
+from semantic_mapper.imaging import resize_depth
+from semantic_mapper.labels import LabelSet, make_label_set
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
+
+WIDTH, HEIGHT = 640, 480  # of the frames that are measured
+COARSE = (120, 160)  # size of the rendered view that is upsampled, as the pipeline has it
+CLASSES = (20, 40)
+WARM_UP = 3  # frames that do not count: first growth of buffers
+
+
+def bench_fusion(log: Path, frames: int = 20, voxel_size_m: float = 0.02) -> dict[str, Any]:
+    """Time our fusion with 20 and 40 classes against Open3D's ``integrate`` without any, frame by frame in turns.
+
+    Both find their own blocks. Open3D fuses TSDF and colour; ours class evidence, too, of a quarter-size rendered view.
+
+    Returns:
+        Plain data: milliseconds a frame (medians); ``ratio_20`` and ``ratio_40`` are ours over Open3D's.
+    """
+    posed, _ = _frames(log, frames + WARM_UP)
+    config = VoxelMapConfig(voxel_size_m=voxel_size_m)
+    reference = _Open3DFusion(config)
+    maps = {n: VoxelMap(config, make_label_set("bench", [f"class {c}" for c in range(n)])) for n in CLASSES}
+    votes = {count: _some_probabilities(count) for count in CLASSES}
+    open3d_ms: list[float] = []
+    ours_ms: dict[int, list[float]] = {count: [] for count in CLASSES}
+    height, width = COARSE  # each pixel takes the coarse one that it lies in
+    rows = np.arange(HEIGHT)[:, None] * height // HEIGHT * width + np.arange(WIDTH) * width // WIDTH
+    rows = rows.astype(np.int32)
+    for frame in posed:
+        depth = np.ascontiguousarray(frame.depth_m, np.float32)
+        open3d_ms.append(_milliseconds(lambda f=frame, d=depth: reference.integrate(f, d)))
+        for count, voxel_map in maps.items():
+            p = votes[count]
+            ours_ms[count].append(
+                _milliseconds(lambda f=frame, d=depth, m=voxel_map, p=p: m.integrate(f, d, p, rows=rows))
+            )
+    theirs = float(np.median(open3d_ms[WARM_UP:]))
+    ours = {count: float(np.median(values[WARM_UP:])) for count, values in ours_ms.items()}
+    return {
+        "frames": len(posed) - WARM_UP,
+        "voxel_size_m": voxel_size_m,
+        "threads": torch.get_num_threads(),
+        "blocks": maps[20].block_count,
+        "open3d_blocks": reference.block_count,
+        "open3d_ms": round(theirs, 1),
+        **{f"ms_{count}": round(ms, 1) for count, ms in ours.items()},
+        **{f"ratio_{count}": round(ms / theirs, 2) for count, ms in ours.items()},
+    }
+
+
+def bench_pipeline(log: Path, weights: Path | None, config: MapperConfig, frames: int = 20) -> dict[str, Any]:
+    """Time whole steps: 640x480 frames of a log in, the semantic map out.
+
+    The frames have a sensor's depth; none with ``depth.source`` "computed": a step computes it as a live mapper does.
+
+    Returns:
+        Plain data: ``hz`` (1 / mean of a step), ``p50_ms`` and ``p95_ms`` of ``step``, medians of its stages, and the
+        mIoU of the rendered labels (None for a log without labels).
+    """
+    pipeline = Mapper.load(weights, config).pipeline
+    posed, label_set = _frames(log, frames + WARM_UP)
+    if config.depth.source == "computed":
+        posed = [dataclasses.replace(frame, depth_m=None) for frame in posed]
+    steps: list[float] = []
+    confusion = ConfusionMatrix(pipeline.label_set)
+    in_map = None if label_set is None else pipeline.label_set.channel_map_from(label_set)
+    stages: dict[str, list[float]] = {}
+    for number, frame in enumerate(posed):
+        began = time.perf_counter()
+        update = pipeline.step(frame)
+        if number < WARM_UP:
+            continue
+        steps.append((time.perf_counter() - began) * 1e3)
+        if frame.label is not None and in_map is not None:
+            confusion.update(pipeline.label_set.to_ids(in_map[frame.label]), update.label, f"frame {number}")
+        rest = steps[-1] - sum(update.stage_ms.values())  # poses and depth, where these are computed
+        for name, value in {**update.stage_ms, "before": rest}.items():
+            stages.setdefault(name, []).append(value)
+    score = confusion.metrics().miou
+    return {
+        "frames": len(steps),
+        "size": f"{WIDTH}x{HEIGHT}",
+        "voxel_size_m": config.voxel_map.voxel_size_m,
+        "threads": torch.get_num_threads(),
+        "hz": round(1e3 / float(np.mean(steps)), 2),
+        "p50_ms": round(float(np.percentile(steps, 50)), 1),
+        "p95_ms": round(float(np.percentile(steps, 95)), 1),
+        "stages_ms": {name: round(float(np.median(values)), 1) for name, values in stages.items()},
+        "blocks": pipeline.voxel_map.block_count,
+        "miou": None if score is None else round(score, 4),
+        "quality": config.quality,
+        "depth": "computed" if config.depth.source == "computed" else "sensor",
+    }
+
+
+def _frames(log: Path, count: int) -> tuple[list[PosedFrame], LabelSet | None]:
+    """The first frames of a log with depth, at 640x480, and the label set of their labels."""
+    with LogReader(log) as reader:
+        frames = [_resized(f) for f in itertools.islice((f for f in reader if f.depth_m is not None), count)]
+        label_set = reader.info.label_set
+    if len(frames) <= WARM_UP:
+        raise LogError(f"{log}: {len(frames)} frames with depth; this needs more than {WARM_UP}")
+    return frames, label_set
+
+
+def _resized(frame: PosedFrame) -> PosedFrame:
+    if frame.rgb.shape[:2] == (HEIGHT, WIDTH):
+        return frame
+    x, y = WIDTH / frame.rgb.shape[1], HEIGHT / frame.rgb.shape[0]
+    k, label = frame.intrinsics, frame.label
+    intrinsics = CameraIntrinsics(k.fx * x, k.fy * y, (k.cx + 0.5) * x - 0.5, (k.cy + 0.5) * y - 0.5, WIDTH, HEIGHT)
+    rgb = np.asarray(cv2.resize(frame.rgb, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR), np.uint8)
+    if label is not None:
+        label = np.asarray(cv2.resize(label, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST_EXACT), label.dtype)
+    depth_m = resize_depth(frame, intrinsics)
+    return dataclasses.replace(frame, rgb=rgb, depth_m=depth_m, label=label, intrinsics=intrinsics)
+
+
+class _Open3DFusion:
+    """Open3D's own fusion of TSDF and colour, with its own choice of blocks."""
+
+    def __init__(self, config: VoxelMapConfig) -> None:
+        self._o3d = load_open3d()
+        self._config = config
+        core = self._o3d.core
+        dtypes, shapes, cpu = (core.float32,) * 3, ((1,), (1,), (3,)), core.Device("CPU:0")
+        self._grid = self._o3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight", "color"),
+            dtypes,
+            shapes,
+            config.voxel_size_m,
+            8,
+            config.initial_blocks,
+            core.Device("CPU:0"),
+        )
+
+    @property
+    def block_count(self) -> int:
+        return int(self._grid.hashmap().size())
+
+    def integrate(self, frame: PosedFrame, depth_m: Float32) -> None:
+        core, config, k = self._o3d.core, self._config, frame.intrinsics
+        # Open3D puts pixel centres at halves.
+        K = core.Tensor(np.array([[k.fx, 0, k.cx + 0.5], [0, k.fy, k.cy + 0.5], [0, 0, 1]]))
+        T_camera_world = core.Tensor(invert_pose(frame.T_world_camera))
+        image = self._o3d.t.geometry.Image
+        depth = image(core.Tensor.from_numpy(depth_m))
+        color = image(core.Tensor.from_numpy(frame.rgb.astype(np.float32)))
+        limits = (1.0, config.depth_max_m, config.truncation_voxels)
+        blocks = self._grid.compute_unique_block_coordinates(depth, K, T_camera_world, *limits)
+        self._grid.integrate(blocks, depth, color, K, K, T_camera_world, *limits)
+
+
+def _milliseconds(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return (time.perf_counter() - began) * 1e3
+
+
+def _some_probabilities(classes: int) -> Float32:
+    """(h * w, L): patches of 10 x 10 pixels of one class each, as sure as a field is."""
+    rng = np.random.default_rng(0)
+    patch: NDArray[np.int64] = rng.integers(0, classes, (COARSE[0] // 10, COARSE[1] // 10))
+    sure = np.eye(classes, dtype=np.float32)[np.repeat(np.repeat(patch, 10, 0), 10, 1)]
+    return np.ascontiguousarray(0.9 * sure + np.float32(0.1 / classes)).reshape(-1, classes)

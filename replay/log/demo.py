@@ -1,0 +1,12 @@
+"""The log that comes with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import semantic_mapper
+
+
+def demo_log() -> Path:
+    """40 frames (320x240, depth, classes) of a furnished room, rendered with the noise of a depth camera."""
+    return Path(semantic_mapper.__file__).parent / "demo.mcap"

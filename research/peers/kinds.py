@@ -1,0 +1,8 @@
+"""The peers as kinds of fields, which the entry points of this package name."""
+
+from research.peers.config import MVSNeRFConfig, NeuRayConfig, SemanticNeRFConfig
+from semantic_mapper.fields.registry import FieldKind
+
+NEURAY = FieldKind(NeuRayConfig, "research.peers.neuray", "NeuRay")
+MVSNERF = FieldKind(MVSNeRFConfig, "research.peers.mvsnerf", "MVSNeRF")
+SEMANTIC_NERF = FieldKind(SemanticNeRFConfig, "research.peers.semantic_nerf", "SemanticNeRF")

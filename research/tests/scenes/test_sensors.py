@@ -1,0 +1,269 @@
+"""Sensors: depth cameras by name, the colour camera, drift along a sequence, odometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from research.scenes import (
+    CameraPathConfig,
+    NoiseConfig,
+    PoseNoiseConfig,
+    RoomConfig,
+    camera_path,
+    make_room,
+    render_view,
+)
+from research.scenes.pose_noise import drifting_poses
+from research.scenes.primitives import rotation_x, rotation_z
+from research.scenes.sensor_color import blur_motion, develop, expose
+from research.scenes.sensor_depth import STEREO_SENSORS, depth_edges, hidden_from_other_eye, measure_depth
+from research.scenes.shots import Shot, sequence_shots
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.geometry import check_pose, invert_pose
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+
+CAMERA = CameraIntrinsics(fx=220.6, fy=220.6, cx=159.5, cy=119.5, width=320, height=240)
+SIZE = (240, 320)
+FAST = RoomConfig(shadow_resolution=16)
+
+
+def textured() -> UInt8:
+    return np.random.default_rng(0).integers(0, 255, (*SIZE, 3)).astype(np.uint8)
+
+
+def flat(z: float) -> Float32:
+    return np.full(SIZE, z, np.float32)
+
+
+def errors_at(sensor: str, z: float) -> np.ndarray:
+    measured = measure_depth(flat(z), textured(), CAMERA, sensor, np.random.default_rng(1))  # type: ignore[arg-type]
+    return measured[measured > 0] - z
+
+
+@pytest.mark.parametrize("sensor", sorted(STEREO_SENSORS))
+def test_stereo_noise_grows_with_the_square_of_range(sensor: str) -> None:
+    model = STEREO_SENSORS[sensor]
+    for z in (1.5, 3.0, 6.0):
+        errors = errors_at(sensor, z)
+        step = model.step_px / np.sqrt(12)  # what quantisation adds
+        sigma_z = z * z / (882.4 * model.baseline_m) * float(np.hypot(model.sigma_px, step))
+        assert errors.std() == pytest.approx(sigma_z, rel=0.25)
+        assert abs(errors.mean()) < 0.5 * sigma_z
+
+
+@pytest.mark.parametrize("sensor", sorted(STEREO_SENSORS))
+def test_disparities_are_multiples_of_the_sensors_step(sensor: str) -> None:
+    model = STEREO_SENSORS[sensor]
+    measured = measure_depth(flat(2.0), textured(), CAMERA, sensor, np.random.default_rng(1))  # type: ignore[arg-type]
+    steps = 882.4 * model.baseline_m / measured[measured > 0] / model.step_px
+    np.testing.assert_allclose(steps, np.round(steps), atol=2e-2)
+
+
+def test_noise_of_neighbouring_pixels_is_correlated() -> None:
+    error = measure_depth(flat(3.0), textured(), CAMERA, "oak_d", np.random.default_rng(2)) - 3.0
+    near = np.corrcoef(error[:, :-2].ravel(), error[:, 2:].ravel())[0, 1]
+    far = np.corrcoef(error[:, :-40].ravel(), error[:, 40:].ravel())[0, 1]
+    assert near > 0.25
+    assert abs(far) < 0.1
+
+
+def test_nothing_is_measured_nearer_than_the_ceiling_of_the_disparity() -> None:
+    assert (measure_depth(flat(0.6), textured(), CAMERA, "oak_d", np.random.default_rng(0)) == 0).all()
+    assert (measure_depth(flat(0.8), textured(), CAMERA, "oak_d", np.random.default_rng(0)) > 0).mean() > 0.9
+
+
+def test_the_passive_sensor_fails_on_blank_surfaces_and_the_active_one_does_not() -> None:
+    blank = np.full((*SIZE, 3), 128, np.uint8)
+    rng = np.random.default_rng
+    assert (measure_depth(flat(2.0), blank, CAMERA, "oak_d", rng(0)) == 0).mean() > 0.9
+    assert (measure_depth(flat(2.0), blank, CAMERA, "d435", rng(0)) == 0).mean() < 0.01
+
+
+def test_a_band_beside_a_near_thing_is_hidden_from_the_other_eye() -> None:
+    disparity = np.full((1, 40), 2.0, np.float32)
+    disparity[0, 20:30] = 8.0
+    hidden = hidden_from_other_eye(disparity)
+    # The background at columns 14 to 19 lands behind the near thing in the right image: 8 - 2 = 6 pixels.
+    np.testing.assert_array_equal(np.flatnonzero(hidden[0]), np.arange(14, 20))
+
+
+def test_near_things_grow_at_their_edges() -> None:
+    exact = flat(4.0)
+    exact[:, 160:] = 2.0
+    measured = measure_depth(exact, textured(), CAMERA, "d435", np.random.default_rng(0))
+    beside = measured[:, 159]
+    assert (np.abs(beside[beside > 0] - 2.0) < 0.3).mean() > 0.4
+
+
+def test_exact_and_no_depth_sensor() -> None:
+    exact = flat(2.5)
+    rng = np.random.default_rng(0)
+    np.testing.assert_array_equal(measure_depth(exact, textured(), CAMERA, "exact", rng), exact)
+    assert not measure_depth(exact, textured(), CAMERA, "none", rng).any()
+
+
+@pytest.mark.parametrize(("sensor", "least", "most"), [("oak_d", 0.08, 0.5), ("d435", 0.01, 0.2)])
+def test_depth_of_rooms_has_a_realistic_share_of_holes_and_stays_near_the_truth(
+    sensor: str, least: float, most: float
+) -> None:
+    holes, far_off = [], []
+    for seed in range(5):
+        scene = make_room(seed, FAST)
+        for k, pose in enumerate(camera_path(scene, 2, 0, CameraPathConfig(step_m=0.5))):
+            config = NoiseConfig(depth=sensor)  # type: ignore[arg-type]
+            view = render_view(scene, CAMERA, pose, noise=k, noise_config=config)
+            seen = (view.depth_m > 0) & ~depth_edges(view.exact_depth_m, 0.03)
+            holes.append((view.depth_m == 0).mean())
+            error = np.abs(view.depth_m - view.exact_depth_m)[seen]
+            far_off.append((error > 0.03 + 0.02 * view.exact_depth_m[seen] ** 2).mean())
+    assert least < np.mean(holes) < most
+    assert np.mean(far_off) < 0.02
+
+
+def shot(**changes: object) -> Shot:
+    neutral = Shot(np.ones(3), 1.0, 1.0, 1.0, 0.0, 0.0, np.eye(4))
+    return replace(neutral, **changes)  # type: ignore[arg-type]
+
+
+QUIET = NoiseConfig(auto_exposure=0.0, shot_noise=0.0, read_noise=0.0)
+
+
+def taken(linear: Float32, how: Shot, config: NoiseConfig = QUIET, z: float = 2.0) -> UInt8:
+    return expose(linear, flat(z), CAMERA, how, config, np.random.default_rng(0))
+
+
+def test_a_quiet_neutral_camera_is_a_perfect_one() -> None:
+    linear = np.random.default_rng(0).uniform(0, 2, (*SIZE, 3)).astype(np.float32)
+    assert np.abs(taken(linear, shot()).astype(int) - develop(linear).astype(int)).max() <= 1
+
+
+def test_noise_in_the_dark_stands_out_and_grows_with_iso() -> None:
+    grey = np.full((*SIZE, 3), 0.05, np.float32)
+    config = NoiseConfig(auto_exposure=0.0)
+    low, high = (taken(grey, shot(iso=iso), config).astype(float).std() for iso in (0.5, 2.0))
+    assert 1.0 < low < high < 30.0
+
+
+def test_corners_are_darker_with_vignetting() -> None:
+    picture = taken(np.full((*SIZE, 3), 0.4, np.float32), shot(vignetting=0.35)).astype(int)
+    assert picture[0, 0, 0] < picture[120, 160, 0] - 10
+
+
+def test_auto_exposure_brings_dark_and_bright_rooms_closer() -> None:
+    config = NoiseConfig(shot_noise=0.0, read_noise=0.0)
+    dark, bright = (np.full((*SIZE, 3), light, np.float32) for light in (0.1, 1.2))
+    before = develop(bright).mean() - develop(dark).mean()
+    assert taken(bright, shot(), config).mean() - taken(dark, shot(), config).mean() < 0.6 * before
+
+
+def test_motion_blur_follows_the_motion_and_spares_what_is_far() -> None:
+    linear = np.zeros((*SIZE, 3), np.float32)
+    linear[:, 160] = 1.0
+    T = np.eye(4)
+    T[0, 3] = 0.05  # 5 cm to the right while the shutter is open: 5.5 pixels at 2 m, none at 50 m
+    near, far = (blur_motion(linear, flat(z), CAMERA, shot(T_open_close=T)) for z in (2.0, 50.0))
+    assert (near[120, :, 0] > 0).sum() >= 5
+    np.testing.assert_array_equal(far, linear)
+    T[:2, 3] = 0.0, 0.05
+    up = blur_motion(linear, flat(2.0), CAMERA, shot(T_open_close=T))
+    np.testing.assert_allclose(up[20:-20], linear[20:-20], atol=1e-6)  # along the line itself nothing changes
+
+
+def plain_blur(linear: Float32, depth_m: Float32, T_close_open: Float64) -> Float32:
+    """``blur_motion`` in numpy, for 7 samples."""
+    height, width = depth_m.shape
+    v, u = np.indices(depth_m.shape)
+    z = depth_m.astype(np.float64)
+    point = np.stack(((u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z), -1)
+    then = point @ T_close_open[:3, :3].T + T_close_open[:3, 3]
+    safe = np.where((z > 0) & (then[..., 2] > 0.02), then[..., 2], np.nan)
+    du, dv = (then[..., 0] / safe * CAMERA.fx + CAMERA.cx - u, then[..., 1] / safe * CAMERA.fy + CAMERA.cy - v)
+    moved = du**2 + dv**2 >= 0.25
+    du, dv = np.where(moved, du, 0), np.where(moved, dv, 0)
+    total = np.zeros(linear.shape)
+    for moment in np.arange(7) / 6 - 0.5:
+        column = np.clip(np.floor(u + moment * du + 0.5), 0, width - 1).astype(int)
+        row = np.clip(np.floor(v + moment * dv + 0.5), 0, height - 1).astype(int)
+        total += linear[row, column]
+    return np.where(moved[..., None], total / 7, linear).astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_motion_blur_is_as_in_numpy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    linear = rng.random((*SIZE, 3), np.float32)
+    depth_m = rng.uniform(-0.2, 5.0, SIZE).astype(np.float32)  # without a measurement, and behind the camera later on
+    T = np.eye(4)
+    T[:3, :3] = rotation_z(float(rng.normal(0, 0.02))) @ rotation_x(float(rng.normal(0, 0.02)))
+    T[:3, 3] = rng.normal(0, 0.05, 3)
+    blurred = blur_motion(linear, depth_m, CAMERA, shot(T_open_close=T))
+    expected = plain_blur(linear, depth_m, invert_pose(T))
+    off = np.abs(blurred - expected).max(-1) > 1e-6
+    assert off.mean() < 1e-4  # samples on the edge between two pixels may fall either way
+    assert (blurred != linear).any(-1).mean() > 0.5
+
+
+def test_motion_blur_refuses_a_depth_image_of_another_size() -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.05
+    with pytest.raises(ShapeError, match="depth_m"):
+        blur_motion(np.zeros((*SIZE, 3), np.float32), flat(2.0)[1:], CAMERA, shot(T_open_close=T))
+
+
+def plain_expose(linear: Float32, how: Shot, noise: Float32) -> np.ndarray:
+    """Grey levels (H, W, 3), before rounding, of a camera with a neutral tone curve."""
+    y, x = np.meshgrid(np.linspace(-1, 1, SIZE[0]), np.linspace(-1, 1, SIZE[1]), indexing="ij")
+    light = linear * how.gain
+    grey = (light @ [0.299, 0.587, 0.114])[..., None]
+    light = np.maximum(
+        (grey + how.saturation * (light - grey)) * (1 - how.vignetting / 2 * (x**2 + y**2))[..., None], 0
+    )
+    light = light + noise * np.sqrt(0.002 * light + 0.01**2)
+    light = np.clip(light, 0, 4)
+    return np.minimum(light * (1 + light / 9) / (1 + light), 1) ** (1 / 2.2) * 255
+
+
+def test_exposure_is_as_in_numpy() -> None:
+    rng = np.random.default_rng(0)
+    linear = rng.gamma(0.5, 1.0, (*SIZE, 3)).astype(np.float32)
+    config = NoiseConfig(auto_exposure=0.0, shot_noise=0.002, read_noise=0.01)
+    how = shot(gain=np.array([0.8, 1.0, 1.3]), saturation=0.7, vignetting=0.3)
+    expected = plain_expose(linear, how, np.random.default_rng(0).standard_normal(linear.shape, np.float32))
+    # The tone curve is a table of 4096 entries: near black one is up to 3 grey levels wide.
+    assert np.quantile(np.abs(taken(linear, how, config) - expected), 0.99) < 1.0
+
+
+def test_light_that_is_no_number_is_black() -> None:
+    linear = np.full((*SIZE, 3), 0.3, np.float32)
+    linear[0, 0, 1] = np.nan
+    picture = taken(linear, shot())
+    assert (picture[0, 0] == 0).all() and (picture[0, 1:] > 0).all()
+
+
+def test_exposure_and_white_balance_drift_along_a_sequence_without_jumps() -> None:
+    poses = camera_path(make_room(3, FAST), 60, 0)
+    shots = sequence_shots(poses, 5, NoiseConfig())
+    gains = np.log([s.gain for s in shots])
+    assert gains.std(0).min() > 0.01
+    assert np.abs(np.diff(gains, axis=0)).max() < 0.5
+    assert len({(s.contrast, s.saturation, s.iso) for s in shots}) == 1  # one camera
+    assert [s.gain.tolist() for s in sequence_shots(poses[:20], 5, NoiseConfig())] == [
+        s.gain.tolist() for s in shots[:20]
+    ]
+
+
+def test_odometry_drifts_a_little_and_a_loop_closure_takes_part_of_it_back() -> None:
+    poses = camera_path(make_room(3, FAST), 120, 0)
+    config = PoseNoiseConfig(translation_share=0.03, closure_frames=60)
+    drifted = drifting_poses(poses, 9, config)
+    for pose in drifted:
+        check_pose(pose, "test")
+    error = np.linalg.norm(drifted[:, :3, 3] - poses[:, :3, 3], axis=1)
+    np.testing.assert_array_equal(drifted[0], poses[0])
+    assert 0.005 < error.max() < 0.5
+    jumps = np.abs(np.diff(error))
+    assert jumps.max() > 4 * np.median(jumps)
+    np.testing.assert_array_equal(drifting_poses(poses, 9, config), drifted)

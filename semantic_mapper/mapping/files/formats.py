@@ -1,0 +1,326 @@
+"""A map as files of other programs: PLY, OBJ and GLB (surface), NPZ (points), PGM and YAML (floor plan).
+
+Files hold the world frame, in metres unless they say "scale: unknown". Of PLY, ``comment label 3 chair`` says what the
+id 3 of the property ``label`` means; names are ASCII with Python's escapes, which
+``name.encode().decode("unicode_escape")`` reads. Where depth was computed somewhere, PLY and NPZ have ``measured``: 0
+there, 1 where a sensor measured the surface.
+
+GLB (glTF 2.0) is right-handed with y up. Vertices keep the coordinates of the world; the mesh's node holds the rotation
+that takes the world's up to +y, so that viewers show the map upright and programs find world coordinates. Vertex
+attributes: POSITION; COLOR_0 (linear light, as glTF asks, 16 bits so that sRGB's 8 survive); _LABEL (uint8 class id,
+each padded to four bytes as glTF asks); _CONFIDENCE (float). ``extras.label_set`` of the mesh says what the ids mean.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import struct
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.files import atomic_write
+from semantic_mapper.geometry import turn_onto
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints
+from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, OccupancyGrid
+from semantic_mapper.types import Float32, Float64, UInt8
+
+ColorBy = Literal["rgb", "class", "confidence"]
+SurfaceT = TypeVar("SurfaceT", MapPoints, MapMesh)
+
+
+def sure_points(points: MapPoints, min_confidence: float) -> MapPoints:
+    """The points whose label is at least so sure; all of them for 0."""
+    keep = points.confidence >= min_confidence
+    measured = None if points.measured is None else points.measured[keep]
+    return MapPoints(points.xyz[keep], points.rgb[keep], points.label[keep], points.confidence[keep], measured)
+
+
+def sure_faces(mesh: MapMesh, min_confidence: float) -> MapMesh:
+    """The faces all of whose corners are at least so sure, and their vertices; the whole mesh for 0."""
+    if min_confidence <= 0:
+        return mesh
+    faces = mesh.faces[(mesh.confidence >= min_confidence)[mesh.faces].all(axis=1)]
+    used, corners = np.unique(faces, return_inverse=True)
+    faces = corners.reshape(-1, 3).astype(np.int32)
+    measured = None if mesh.measured is None else mesh.measured[used]
+    return MapMesh(mesh.vertices[used], faces, mesh.rgb[used], mesh.label[used], mesh.confidence[used], measured)
+
+
+def colored(surface: SurfaceT, label_set: LabelSet, by: ColorBy) -> SurfaceT:
+    """The surface with other colours: the camera's, those of the classes, or dark (0) to bright (1) for confidence."""
+    if by == "rgb":
+        return surface
+    rgb = label_set.colorize(surface.label) if by == "class" else _confidence_colors(surface.confidence)
+    return dataclasses.replace(surface, rgb=rgb)
+
+
+def _confidence_colors(confidence: Float32) -> UInt8:
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+    return np.asarray(table, np.uint8)[np.rint(confidence * 255).astype(np.uint8)]
+
+
+MAX_NAME = 200  # characters of a class name in a comment
+_PLY_NAMES = {"<f4": "float", "|u1": "uchar"}
+_PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
+
+
+def write_ply(path: Path, surface: MapPoints | MapMesh, label_set: LabelSet, *, scale_known: bool = True) -> None:
+    """Write points or a mesh as binary little-endian PLY: x y z red green blue label confidence, lists of vertices.
+
+    Raises:
+        MapError: the file cannot be written.
+    """
+    mesh = surface if isinstance(surface, MapMesh) else None
+    xyz = surface.xyz if isinstance(surface, MapPoints) else surface.vertices
+    columns = dict(zip(("x", "y", "z"), xyz.astype("<f4").T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), surface.rgb.T, strict=True))
+    columns |= {"label": surface.label, "confidence": surface.confidence.astype("<f4")}
+    if surface.measured is not None and not surface.measured.all():
+        columns["measured"] = surface.measured.astype(np.uint8)
+    vertices = np.empty(len(xyz), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        vertices[name] = values
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [] if scale_known else ["comment scale: unknown"]
+    lines += [f"comment label {i} {_escaped(n)}" for i, n in zip(label_set.ids, label_set.names, strict=True)]
+    lines += [f"comment label {label_set.ignore_id} unknown", f"element vertex {len(vertices)}"]
+    lines += [f"property {_PLY_NAMES[values.dtype.str]} {name}" for name, values in columns.items()]
+    faces = np.empty(0 if mesh is None else len(mesh.faces), _PLY_FACE)
+    if mesh is not None:
+        faces["count"], faces["corners"] = 3, mesh.faces
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    with atomic_write(path, raises=MapError) as file:
+        file.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+        file.write(vertices.tobytes())
+        file.write(faces.tobytes())
+
+
+def _escaped(name: str) -> str:
+    """One line of printable ASCII; Open3D's reader writes past its buffer at lines above 1,000 characters."""
+    while len(escaped := name.encode("unicode_escape").decode("ascii")) > MAX_NAME:
+        name = name[:-1]  # a whole letter, however long its escape is
+    return escaped
+
+
+def write_obj(
+    path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials: bool, scale_known: bool = True
+) -> tuple[Path, Path]:
+    """Write ``path`` and, beside it, the material library of the same stem (.mtl).
+
+    OBJ knows neither units nor an up axis: vertices are in the world frame, metres, to the micrometre. Each has its
+    colour behind its position (``v x y z r g b``), as most programs read it. A face is of the class that most of its
+    corners are of (the first one's where all differ); material ``ID_NAME`` stands for a class, ``ID_unknown`` for none.
+
+    Args:
+        class_materials: Whether materials have the colours of their classes; else they are white, so that programs
+            which multiply both show the colours of the vertices.
+        scale_known: Whether lengths are metres; a comment says where not.
+
+    Returns:
+        The two files.
+
+    Raises:
+        MapError: a file cannot be written.
+    """
+    library = path.with_suffix(".mtl")
+    names = {i: _material(i, name) for i, name in zip(label_set.ids, label_set.names, strict=True)}
+    names[label_set.ignore_id] = _material(label_set.ignore_id, "unknown")
+    label = _face_labels(mesh)
+    used = np.unique(label)
+    with atomic_write(library, raises=MapError) as file:
+        for class_id in used.tolist():
+            color = label_set.colorize(np.array(class_id, np.uint8)) / 255 if class_materials else np.ones(3)
+            values = " ".join(f"{c:.6f}" for c in color)
+            file.write(f"newmtl {names[class_id]}\nKd {values}\nKa 0 0 0\nKs 0 0 0\nillum 1\n\n".encode())
+    rows = np.concatenate((mesh.vertices.astype(np.float64), mesh.rgb / 255), axis=1).tolist()
+    with atomic_write(path, raises=MapError) as file:
+        file.write(b"" if scale_known else b"# scale: unknown\n")
+        file.write(f"mtllib {library.name}\n".encode())
+        file.writelines(b"v %.6f %.6f %.6f %.4f %.4f %.4f\n" % tuple(row) for row in rows)
+        for class_id in used.tolist():
+            file.write(f"g {names[class_id]}\nusemtl {names[class_id]}\n".encode())
+            corners = (mesh.faces[label == class_id].astype(np.int64) + 1).tolist()  # OBJ counts from 1
+            file.writelines(b"f %d %d %d\n" % tuple(face) for face in corners)
+    return path, library
+
+
+def _face_labels(mesh: MapMesh) -> UInt8:
+    """Class id of each face, (F,) uint8: that of most corners, of the first one where all three differ."""
+    a, b, c = mesh.label[mesh.faces].T
+    return np.where(b == c, b, a).astype(np.uint8)
+
+
+def _material(class_id: int, name: str) -> str:
+    """Names of materials end at white space, and programs differ in which letters they know."""
+    return f"{class_id}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}"
+
+
+_UINT8, _UINT16, _UINT32, _FLOAT = 5121, 5123, 5125, 5126
+_VERTICES, _INDICES = {"target": 34962}, {"target": 34963}  # what a part of the numbers is for
+
+
+def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, scale_known: bool = True) -> None:
+    """Write a mesh as GLB: a header, one chunk of JSON, one chunk of numbers.
+
+    Args:
+        path: Of the file.
+        mesh: With at least one face: glTF has no empty meshes.
+        label_set: For ``extras``.
+        up: (3,) unit vector, up in the world.
+        scale_known: Whether lengths are metres; ``extras`` say where not.
+
+    Raises:
+        MapError: no faces, more than 4 GiB, or the file cannot be written.
+    """
+    if not len(mesh.faces):
+        raise MapError(f"{path}: glTF cannot hold a mesh without faces")
+    labels = np.zeros((len(mesh.label), 4), np.uint8)
+    labels[:, 0] = mesh.label
+    ends = {"min": mesh.vertices.min(axis=0).tolist(), "max": mesh.vertices.max(axis=0).tolist()}
+    scalar = {"type": "SCALAR"}
+    parts: list[tuple[NDArray[Any], dict[str, Any], dict[str, Any]]] = [
+        (mesh.vertices.astype("<f4"), _VERTICES, {"componentType": _FLOAT, "type": "VEC3", **ends}),
+        (_linear_color(mesh.rgb), _VERTICES, {"componentType": _UINT16, "type": "VEC4", "normalized": True}),
+        (labels, {**_VERTICES, "byteStride": 4}, {"componentType": _UINT8, **scalar}),
+        (mesh.confidence.astype("<f4"), _VERTICES, {"componentType": _FLOAT, **scalar}),
+        (mesh.faces.astype("<u4").reshape(-1), _INDICES, {"componentType": _UINT32, **scalar}),
+    ]
+    starts = np.cumsum([0, *(array.nbytes for array, _, _ in parts)]).tolist()  # multiples of four bytes, as glTF asks
+    turn = np.eye(4)
+    turn[:3, :3] = turn_onto(up, np.array((0.0, 1.0, 0.0)))
+    attributes = {"POSITION": 0, "COLOR_0": 1, "_LABEL": 2, "_CONFIDENCE": 3}
+    kept = ("name", "ids", "names", "colors", "ignore_id")
+    extras = {"label_set": {name: getattr(label_set, name) for name in kept}}
+    document = {
+        "asset": {"version": "2.0", "generator": "semantic-mapper"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "world", "mesh": 0, "matrix": turn.T.reshape(-1).tolist()}],  # column by column
+        "meshes": [
+            {
+                "name": "map",
+                "primitives": [{"attributes": attributes, "indices": 4, "material": 0, "mode": 4}],
+                "extras": extras if scale_known else {**extras, "scale": "unknown"},
+            }
+        ],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
+        "accessors": [{"bufferView": n, "count": len(array), **a} for n, (array, _, a) in enumerate(parts)],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, **view}
+            for start, (array, view, _) in zip(starts[:-1], parts, strict=True)
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + starts[-1]
+    if total > 2**32 - 1:
+        raise MapError(
+            f"{path}: {total / 2**30:.1f} GiB are more than a GLB can hold; choose ply-mesh or larger voxels"
+        )
+    with atomic_write(path, raises=MapError) as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, total))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        for array, _, _ in parts:
+            file.write(array.tobytes())
+
+
+def _linear_color(rgb: UInt8) -> NDArray[np.uint16]:
+    """(V, 3) sRGB bytes -> (V, 4) linear light, opaque."""
+    s = np.arange(256) / 255
+    table = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    color = np.full((len(rgb), 4), 65535, "<u2")
+    color[:, :3] = np.rint(table * 65535).astype(np.uint16)[rgb]
+    return color
+
+
+def write_npz(path: Path, points: MapPoints, label_set: LabelSet, *, scale_known: bool = True) -> None:
+    """Write xyz (N, 3) float32 metres in the world, rgb (N, 3) uint8, label (N,) uint8, confidence (N,) float32.
+
+    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale, "unknown".
+
+    And of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id, label_set
+    (its name).
+
+    Raises:
+        MapError: the file cannot be written.
+    """
+    measured = {} if points.measured is None or points.measured.all() else {"measured": points.measured}
+    with atomic_write(path, raises=MapError) as file:
+        np.savez_compressed(
+            file,
+            xyz=points.xyz,
+            rgb=points.rgb,
+            label=points.label,
+            confidence=points.confidence,
+            label_ids=np.array(label_set.ids, np.uint8),
+            label_names=np.array(label_set.names, np.str_),
+            label_colors=np.array(label_set.colors, np.uint8).reshape(-1, 3),
+            ignore_id=np.uint8(label_set.ignore_id),
+            label_set=np.str_(label_set.name),
+            allow_pickle=False,
+            **measured,
+            **({} if scale_known else {"scale": np.str_("unknown")}),
+        )
+
+
+_FREE_GREY, _OCCUPIED_GREY, _UNKNOWN_GREY = 254, 0, 205
+_OCCUPIED_ABOVE, _FREE_BELOW = 0.65, 0.196  # of (255 - grey) / 255; nav2's own 0.25 would read unknown as free
+_UNKNOWN_RAW = 255  # mode raw: grey levels 0 to 100 are the costs themselves, and what is above is unknown
+
+
+def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
+    """Write the YAML and, beside it, the PGM of the same stem; of a grid with costs, these as ``STEM_costs``, too.
+
+    The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
+    pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.
+
+    Args:
+        path: One of the two files.
+        grid: The plan.
+
+    Returns:
+        The YAML and the PGM; then those of the costs.
+
+    Raises:
+        MapError: a file cannot be written.
+    """
+    grey = np.full(grid.cells.shape, _UNKNOWN_GREY, np.uint8)
+    grey[grid.cells == FREE] = _FREE_GREY
+    grey[grid.cells == OCCUPIED] = _OCCUPIED_GREY
+    files = _write_grid(path, grid, grey, "trinary")
+    if grid.costs is None:
+        return files
+    grey = np.where(grid.costs < 0, _UNKNOWN_RAW, grid.costs).astype(np.uint8)
+    return files + _write_grid(path.with_stem(f"{path.stem}_costs"), grid, grey, "raw")
+
+
+def _write_grid(path: Path, grid: OccupancyGrid, grey: UInt8, mode: str) -> tuple[Path, Path]:
+    picture, description = path.with_suffix(".pgm"), path.with_suffix(".yaml")
+    rows, columns = grey.shape
+    with atomic_write(picture, raises=MapError) as file:
+        file.write(f"P5\n{columns} {rows}\n255\n".encode())
+        file.write(np.ascontiguousarray(grey[::-1]).tobytes())
+    x, y = grid.origin_m
+    lines = (
+        f"image: {json.dumps(picture.name)}",
+        f"mode: {mode}",
+        f"resolution: {grid.resolution_m!r}",
+        f"origin: [{x:.6f}, {y:.6f}, 0.0]",
+        "negate: 0",
+        f"occupied_thresh: {_OCCUPIED_ABOVE}",
+        f"free_thresh: {_FREE_BELOW}",
+        f"T_grid_world: {np.round(grid.T_grid_world, 9).tolist()}",
+    )
+    with atomic_write(description, raises=MapError) as file:
+        file.write(("\n".join(lines) + "\n").encode())
+    return description, picture

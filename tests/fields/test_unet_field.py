@@ -1,0 +1,93 @@
+import pytest
+import torch
+
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.fields.unet_field import UNetField, own_view
+from semantic_mapper.types import SourceViews
+from tests.fields.scene import pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import AWAY, POSES, assert_gradients_are_right, assert_unknown, tiny
+
+
+def unet() -> UNetField:
+    field = tiny("unet")
+    assert isinstance(field, UNetField)
+    return field
+
+
+def test_rays_of_a_source_camera_render_to_what_its_image_is_classified_as():
+    field = unet()
+    views = wall_sources(POSES)
+    rays = wall_rays(POSES[1])
+    with torch.no_grad():
+        render = field.render(rays, field.encode(views))
+        expected = field.predict_image(views)[1].flatten(1).T
+    assert render.known.all()
+    torch.testing.assert_close(render.logits, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_only_the_query_image_matters():
+    field = unet()
+    views = wall_sources(POSES)
+    others = views.rgb.clone()
+    others[[0, 2, 3]] = torch.rand_like(others[[0, 2, 3]])
+    rays = wall_rays(POSES[1], step=7)
+    with torch.no_grad():
+        a = field.render(rays, field.encode(views))
+        b = field.render(rays, field.encode(SourceViews(others, views.depth_m, views.K, views.T_world_camera)))
+        alone = field.render(rays, field.encode(views).select(torch.tensor([1])))
+    torch.testing.assert_close(a.logits, b.logits)
+    torch.testing.assert_close(a.logits, alone.logits, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("query", [pose_at(0.05), pose_at(0.1, 0.2), AWAY])
+def test_a_query_whose_own_image_is_not_there_is_unknown(query):
+    """Also where a camera stood at the same place but looked elsewhere: (0.1, 0) turned by 0.2 is no source."""
+    field = unet()
+    with torch.no_grad():
+        render = field.render(wall_rays(query, step=10), field.encode(wall_sources(POSES)))
+    assert render.known.float().mean() <= 0.05  # a turned camera shares the pixels of its turning axis
+    if query is not AWAY:
+        return
+    assert_unknown(render)
+
+
+def test_a_camera_that_turned_on_the_spot_is_told_from_the_query_camera():
+    poses = [pose_at(0.1, 0.05), pose_at(0.1), pose_at(0.1, -0.05)]
+    index, same = own_view(wall_rays(pose_at(0.1), step=3), unet().encode(wall_sources(poses)))
+    assert same.all() and (index == 1).float().mean() > 0.95
+
+
+@pytest.mark.parametrize("views", [1, 2, 7, 16])
+def test_any_number_of_views_from_1_to_16_renders(views: int):
+    field = unet()
+    encoded = field.encode(wall_sources([pose_at(0.02 * i) for i in range(views)]))
+    render = field.render(wall_rays(pose_at(0.0), step=101), encoded)
+    assert render.known.all() and torch.isfinite(render.logits).all()
+
+
+def test_depth_makes_no_difference():
+    field = unet()
+    rays = wall_rays(POSES[0], step=31)
+    with torch.no_grad():
+        a = field.render(rays, field.encode(wall_sources(POSES)))
+        b = field.render(wall_rays(POSES[0], step=31, prior=0.0), field.encode(wall_sources(POSES, with_depth=False)))
+    torch.testing.assert_close(a.logits, b.logits)
+    assert a.opacity.max() == 0 and a.depth_m.max() == 0
+
+
+def test_a_novel_view_still_gives_a_loss_to_train_on():
+    field = unet().train()
+    encoded = field.encode(wall_sources(POSES))
+    render, _ = field.render_samples(wall_rays(AWAY, step=31), torch.ones(50, 2), encoded)
+    assert render.logits.requires_grad
+    assert field.source_logits(encoded).shape == (4, 3, 16, 24)
+
+
+def test_mismatched_sources_give_a_shape_error():
+    views = wall_sources(POSES)
+    with pytest.raises(ShapeError, match="source depth_m"):
+        unet().encode(SourceViews(views.rgb, views.depth_m[:2], views.K, views.T_world_camera))
+
+
+def test_the_whole_field_passes_gradcheck():
+    assert_gradients_are_right(unet())
