@@ -19,7 +19,7 @@ PYTEST := OMP_NUM_THREADS=1 $(TESTS)
 # Without bytecode, each process that a test starts would compile its packages again: seconds of CPU.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-loaded test-slow test-research nightly test-v4l2 test-web check bench wheels docs format lock clean
+.PHONY: help setup demo test test-loaded test-gate test-slow test-research nightly test-v4l2 test-web check bench wheels docs format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -40,6 +40,9 @@ test-loaded: $(READY)  ## run the quick tests beside two busy processes, then on
 	env -u OMP_NUM_THREADS .venv/bin/python -m tools.beside_load 2 $(TESTS) -m "not slow"
 	$(PYTEST) -m "not slow" --cpu-limit 6
 
+test-gate: $(READY)  ## run the three slow tests of the gate: lockstep, a crash, a finetuning
+	$(PYTEST) -m gate
+
 test-slow: $(READY)  ## run the slow tests: crash rounds, launches, learning, training
 	$(PYTEST) -m slow
 
@@ -54,8 +57,7 @@ nightly: $(READY)  ## run all tests, those of research, and everything on a bare
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
 	.venv/bin/python -m research.experiments.v4l2_machine
 
-test-web: $(READY)  ## look at the viewer and the labelling page in a headless browser
-	.venv/bin/python -m research.experiments.web_viewer_check
+test-web: $(READY)  ## try the labelling page in a headless browser
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests/nodes/labeller/test_page.py
 
 check: $(READY)  ## formatting, lint, types, import contracts

@@ -1,20 +1,22 @@
-"""What a session leaves behind: summary.json, map.ply, map.npz, overview.png."""
+"""What a session leaves behind: map.npz, map.ply, summary.json, overview.png, report.html."""
 
 from __future__ import annotations
 
+import json
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from semantic_mapper import __version__
 from semantic_mapper.config import to_plain
+from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.evaluation.metrics import confusion_of
-from semantic_mapper.evaluation.overview import ViewStrip, draw_overview
+from semantic_mapper.evaluation.overview import ViewStrip, draw_overview, draw_strip
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
@@ -23,13 +25,22 @@ from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
+from semantic_mapper.queries.graph import SceneGraph, find_graph
+from semantic_mapper.replay.page import (
+    Section,
+    class_sections,
+    picture,
+    picture_files,
+    point_view,
+    stage_sections,
+    table_of,
+    write_page,
+)
+from semantic_mapper.replay.run_folder import MAP_NAME
+from semantic_mapper.replay.session import MAX_LISTED, MapSession, Refusal
+from semantic_mapper.replay.stats import LatencyHistogram
+from semantic_mapper.replay.summary import SUMMARY_FILE, dig, notes, summary_table
 from semantic_mapper.types import Float64
-
-if TYPE_CHECKING:  # session imports this module
-    from semantic_mapper.queries.graph import SceneGraph
-    from semantic_mapper.replay.exporters.rerun_log import RerunLog
-    from semantic_mapper.replay.session import MapSession, Refusal
-    from semantic_mapper.replay.stats import LatencyHistogram
 
 _log = get_logger(__name__)
 
@@ -38,27 +49,29 @@ OVERVIEW_FRAMES = 2
 # Surface points that a map has at least for each of its blocks, else it is nearly empty. With sensor depth they are 25
 # to 33 in the demo, 64 where a flat surface goes through each; with rendered depth that does not agree 0 to 1.
 MIN_POINTS_A_BLOCK = 2
-MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are reported in the summary
+OVERVIEW_NAME, REPORT_NAME = "overview.png", "report.html"
+STRIPS = 4  # frames that the report shows
 PACKAGES = ("torch", "open3d", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
 
-def write_artifacts(
+def finish_session(
     session: MapSession,
     out: Path,
-    rerun: RerunLog | None,
-    more: Mapping[str, Any],
+    stopped_by: str = "",
+    restarted: str = "",
     progress: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
-    """Write everything to ``out`` (made if missing): first the map, then the summary, pictures last.
+    """Map what still waits, and write everything to ``out`` (made if missing): the map first, then the summary,
+    pictures and the report last.
 
     Each file is there whole or not at all, whenever the process is killed; what an earlier run left is removed first,
-    but for its map. A summary that is there means that the map beside it is whole, and the one that it is of.
+    but for its map. A summary that is there means that the map next to it is whole, and the one that it is of.
 
     Args:
-        session: To be written.
+        session: To be finished; it counts what came since this process began.
         out: The folder.
-        rerun: Gets the map, too.
-        more: What else the summary says.
+        stopped_by: What ended it early; empty = nothing.
+        restarted: What became of the map of a process before this one; empty = there was none.
         progress: Called after each step.
 
     Returns:
@@ -66,29 +79,36 @@ def write_artifacts(
 
     Raises:
         MapError: the map cannot be written.
+        ConfigError: the report cannot be written.
     """
-    from semantic_mapper.queries.graph import find_graph  # needs SciPy, which machines that train lack
-
+    try:
+        session.process_rest()
+    except SemanticMapperError as error:  # the map is full, for one: what is in it is worth keeping
+        _log.error("last_frames_not_mapped", reason=str(error))
+    progress()
     out.mkdir(parents=True, exist_ok=True)
     clear_results(out)
     voxel_map = session.pipeline.voxel_map
-    voxel_map.save(out / "map.npz", progress)
+    voxel_map.save(out / MAP_NAME, progress)
     points = voxel_map.points()
     progress()
     write_ply(out / "map.ply", points, session.pipeline.label_set, scale_known=voxel_map.scale_known)
     progress()
-    summary = {**build_summary(session, points), **more}
+    summary = {**build_summary(session, points), **session.more_summary()}
+    summary |= {"stopped_by": stopped_by or None, "restarted": restarted or None}
     if summary["map"]["nearly_empty"]:
         _log.warning("map_nearly_empty", reason=summary["map"]["nearly_empty"])
-    write_json(out / "summary.json", summary)
+    write_json(out / SUMMARY_FILE, summary)
     progress()
     graph = find_graph(voxel_map)
     progress()
-    _draw_overview(session, points, graph, out / "overview.png")
+    _draw_overview(session, points, graph, out / OVERVIEW_NAME)
     progress()
-    if rerun is not None:
-        rerun.finish(points, graph)
+    if session.rerun is not None:
+        session.rerun.finish(points, graph)
         progress()
+    _write_report(session, points, summary, out)
+    progress()
     return summary
 
 
@@ -337,3 +357,49 @@ def versions() -> dict[str, str]:
     """Versions of this project, Python and the packages that decide a result."""
     found = {"semantic_mapper": __version__, "python": platform.python_version()}
     return found | {name: metadata.version(name) for name in PACKAGES}
+
+
+def _write_report(session: MapSession, points: MapPoints, summary: Mapping[str, Any], out: Path) -> None:
+    """Write ``report.html`` to the folder of a replay, with what is there already.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    label_set = session.pipeline.label_set
+    overview = out / OVERVIEW_NAME, "Frames, what was rendered for them, and the map from above and aside"
+    strips = [
+        picture(
+            draw_strip(s, label_set, picture_unit(session)),
+            f"{s.name}: camera, and what was rendered for it",
+            photo=True,
+        )
+        for s in view_strips(session, STRIPS)
+    ]
+    counts = [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()]
+    sections = [
+        Section(notes=notes(summary)),
+        *([Section("The map", view=point_view(points, label_set, map_up(session)))] if len(points.xyz) else []),
+        Section("Overview", pictures=list(picture_files(overview))),
+        Section("Figures", tables=[summary_table({out.resolve().name: summary})]),
+        *([Section("Frames", pictures=strips)] if strips else []),
+        *stage_sections({"this replay": summary}),
+        *class_sections({"this replay": dig(summary, "metrics.per_class") or {}}),
+        Section(
+            "Frames that came, and what became of them",
+            notes=[f"Damaged: {stretch}" for stretch in summary["damaged_stretches"]],
+            tables=[table_of(("frames", ""), counts)],
+        ),
+        *_refused(summary["refusals"]),
+        Section(
+            "Configuration",
+            tables=[table_of(("package", "version"), list(summary["versions"].items()))],
+            folded={"Settings that were in force": json.dumps(summary["config"], indent=1)},
+        ),
+    ]
+    write_page(out / REPORT_NAME, f"Replay of {summary['source'] or 'a session'}", sections)
+
+
+def _refused(refusals: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
+    rows = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in refusals]
+    if rows:
+        yield Section(f"Refused, the first {MAX_LISTED}", tables=[table_of(("seq", "stamp, ns", "reason"), rows)])

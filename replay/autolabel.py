@@ -28,6 +28,7 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, AutolabelNote
 from semantic_mapper.replay.instance_images import InstanceImages
+from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.reader import LogReader
@@ -97,24 +98,13 @@ class AutolabelReport:
     damage: tuple[str, ...]
 
 
-def autolabel(
-    request: AutolabelRequest,
-    stopped: Callable[[], object],
-    on_start: Callable[[int], None],
-    on_frame: Callable[[int], None],
-) -> AutolabelReport:
+def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) -> AutolabelReport:
     """Write a new log with labels that weights have rendered; it is there once it is whole.
 
     Source views of a frame are those that ``replay`` and ``eval`` choose: the frame itself and earlier keyframes, the
     frames that the weights were finetuned on among them. A label that is there stays, unless it is a pseudo label or
     ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Weights that know no classes leave
     all labels as they are, and give depth.
-
-    Args:
-        request: What to do.
-        stopped: Looked at before every frame.
-        on_start: Called with how many frames there are.
-        on_frame: Called with how many were read.
 
     Raises:
         ConfigError: the new log would be the old one.
@@ -124,6 +114,7 @@ def autolabel(
         WeightsError: there are no such weights, or they tell no classes apart.
         KeyboardInterrupt: it was stopped; nothing is left of the new log, nor of images of things.
     """
+    monitor = monitor or JobMonitor()
     with open_log(request.logs) as log, ExitStack() as stack:
         readers = log.logs if isinstance(log, LogSequence) else [log]
         _check_place(request, readers)
@@ -138,7 +129,7 @@ def autolabel(
         if labeller.instances is not None:
             stack.callback(labeller.instances.close)
         digest = hashlib.sha256(bundle.weights_path.read_bytes()).hexdigest()
-        on_start(min(len(log), request.max_frames or len(log)))
+        monitor.start(min(len(log), request.max_frames or len(log)))
         writers: list[LogWriter] = []
         for number, reader in enumerate(readers):
             if request.max_frames and labeller.frames >= request.max_frames:
@@ -147,12 +138,12 @@ def autolabel(
             writers.append(stack.enter_context(_writer(reader, part_path(request.out, number), label_set, name)))
             for envelope, parts in _messages(reader, label_set):
                 if envelope.topic == "frame":
-                    if stopped():
+                    if monitor.stopped_by:
                         raise KeyboardInterrupt
                     if request.max_frames and labeller.frames >= request.max_frames:
                         break
                 labeller.push(_Message(writers[-1], envelope, parts))
-                on_frame(labeller.frames)
+                monitor.set(labeller.frames)
         labeller.finish()
         note = labeller.note(digest)
         if not labeller.rendered:

@@ -157,7 +157,7 @@ class _Open3DFusion:
             config.voxel_size_m,
             8,
             config.initial_blocks,
-            core.Device("CPU:0"),
+            cpu,
         )
 
     @property

@@ -7,14 +7,14 @@ a log, so that both write the same map and the same summary.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from semantic_mapper.errors import FrameError, LabelError, PoseError, SemanticMapperError
+from semantic_mapper.errors import FrameError, LabelError, PoseError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
 from semantic_mapper.evaluation.segments import Segments
 from semantic_mapper.fields.checkpoint import Checkpoint
@@ -22,7 +22,6 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.worlds import MapWorlds, Taken
-from semantic_mapper.replay.artifacts import MAX_LISTED, write_artifacts
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.stats import BoundedLog, LatencyHistogram
 from semantic_mapper.types import MapUpdate, PosedFrame
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
 _log = get_logger(__name__)
 
 MOSTLY = 0.5  # of a frame that weights of its scene know; of the frames that they do not, for a warning
+MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are reported in the summary
 SNAPSHOTS = 8  # frames kept for the overview picture
 
 
@@ -113,7 +113,7 @@ class MapSession:
         self.surface_truth = SurfaceTruth(self.pipeline.label_set)
         self.snapshots: list[tuple[PosedFrame, MapUpdate]] = []
         self._snapshot_stride = 1
-        self._rerun = rerun
+        self.rerun = rerun
         if rerun is not None:
             rerun.note_scale(scale_known)
 
@@ -166,8 +166,8 @@ class MapSession:
         self._note_scene(update)
         frame = self.pipeline.corrector.place(frame)  # where the map has it
         self._keep_snapshot(self._score(frame, update), update)
-        if self._rerun is not None:
-            self._rerun.log_step(frame, update)
+        if self.rerun is not None:
+            self.rerun.log_step(frame, update)
         return replace(update, world=frame.world, T_map_world=self.worlds.where(frame.world))
 
     def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
@@ -241,29 +241,9 @@ class MapSession:
         self.published += count
         self.dropped += count
 
-    def finish(
-        self, out: Path, more: Mapping[str, Any] | None = None, progress: Callable[[], object] = lambda: None
-    ) -> dict[str, Any]:
-        """Map what still waits, and write ``map.npz``, ``map.ply``, ``summary.json``, ``overview.png``, in this order.
-
-        Args:
-            out: The folder; made if missing.
-            more: What else the summary says.
-            progress: Called after each step.
-
-        Returns:
-            The summary.
-
-        Raises:
-            MapError: the map cannot be written.
-        """
-        try:
-            self.process_rest()
-        except SemanticMapperError as error:  # the map is full, for one: what is in it is worth keeping
-            _log.error("last_frames_not_mapped", reason=str(error))
-        progress()
-        more = {**self._scene_summary(), **self._world_summary(), **(more or {})}
-        return write_artifacts(self, out, self._rerun, more, progress)
+    def more_summary(self) -> dict[str, Any]:
+        """What the summary says of some sessions only: of weights of one scene, of worlds found in the map."""
+        return {**self._scene_summary(), **self._world_summary()}
 
     def _world_summary(self) -> dict[str, Any]:
         """Of worlds that had to be found in the map."""

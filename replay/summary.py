@@ -1,14 +1,18 @@
-"""Reading the summary of a run."""
+"""The summary of a run: read, and as a table for people; several side by side."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import read_regular
+from semantic_mapper.mapping.map_scale import MEND, voxel_size_text
+from semantic_mapper.plain_text import counted
 
 SUMMARY_FILE = "summary.json"
 MAX_SUMMARY_BYTES = 1 << 24
@@ -44,3 +48,165 @@ def dig(summary: Mapping[str, Any], path: str) -> Any:
     for key in path.split("."):
         value = value.get(key) if isinstance(value, Mapping) else None
     return value
+
+
+def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
+    """One column a summary, by name; classes that any of them has scored come last."""
+    table = Table(title="replay", title_justify="left")
+    table.add_column("")
+    for name in summaries:
+        table.add_column(name, justify="right")
+    columns = list(summaries.values())
+    for name, path, show in _ROWS:
+        values = [dig(s, path) if path else s for s in columns]
+        if any(v is not None for v in values):
+            table.add_row(name, *(show(v) if v is not None else "-" for v in values))
+    classes = [dig(s, "metrics.per_class") or {} for s in columns]
+    names = list(dict.fromkeys(n for c in classes for n in c))
+    if names:
+        table.add_section()
+    for name in names:
+        table.add_row(f"IoU {name}", *(percent(c[name]) if c.get(name) is not None else "-" for c in classes))
+    return table
+
+
+def result_lines(out: Path) -> list[str]:
+    """Where the results are."""
+    what = {
+        "overview.png": "picture",
+        "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
+        "map.npz": "the map itself",
+        "report.html": "report on one page, for a browser",
+        "summary.json": "all figures",
+    }
+    return [f"  {out / name}  ({text})" for name, text in what.items() if (out / name).exists()]
+
+
+def notes(summary: Mapping[str, Any]) -> list[str]:
+    """What a reader of the figures has to know."""
+    frames, lines = summary["frames"], []
+    if dig(summary, "map.nearly_empty"):
+        lines.append(f"warning: {summary['map']['nearly_empty']}")
+    if dig(summary, "pose_check.warning"):
+        lines.append(f"warning: {summary['pose_check']['warning']}")
+    lines.extend(f"warning: {note}" for note in dig(summary, "pictures.notes") or ())
+    if fraction := dig(summary, "depth.computed_fraction"):
+        lines.append(
+            f"depth: computed from the pictures for {percent(fraction)} of the frames, which have no sensor depth; "
+            "expect a surface less exact than a sensor's, and holes in plain walls"
+        )
+    if fraction := dig(summary, "depth.rendered_fraction"):
+        lines.append(
+            f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
+            "is less exact than with a depth sensor"
+        )
+    if fraction := dig(summary, "map.computed"):
+        lines.append(
+            f"surface: {percent(fraction)} of its points were computed, not measured by a sensor; "
+            "`export --min-weight 1` leaves them out"
+        )
+    unused = sum(
+        frames.get(k, 0) * sign for k, sign in (("published", 1), ("dropped", -1), ("refused", -1), ("fused", -1))
+    )
+    if unused and dig(summary, "depth.computed_fraction"):
+        lines.append(
+            f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure, as at "
+            "the beginning of a walk"
+        )
+    if summary.get("scale") == "unknown":
+        lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {MEND}")
+    if frames.get("left_out"):
+        lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
+    if frames.get("excluded_from_scores"):
+        lines.append(
+            f"{counted(frames['excluded_from_scores'], 'frame')} left out of the scores: weights were finetuned on them"
+        )
+    if frames.get("pseudo_labels"):
+        lines.append(
+            f"{counted(frames['pseudo_labels'], 'frame')} not scored: their labels are pseudo labels, which weights "
+            "have rendered (`autolabel`)"
+        )
+    if frames.get("refused"):
+        first = summary["refusals"][0]["reason"] if summary.get("refusals") else ""
+        lines.append(f"{counted(frames['refused'], 'frame')} refused; the first: {first}")
+    if frames.get("labels_refused"):
+        lines.append(f"{counted(frames['labels_refused'], 'frame')} mapped, but not scored: labels that cannot be used")
+    if summary.get("damaged_stretches"):
+        damaged = counted(len(summary["damaged_stretches"]), "damaged stretch", "damaged stretches")
+        lines.append(f"{damaged} of the log passed over")
+    if summary.get("map", {}).get("unfinished_correction"):
+        lines.append(summary["map"]["unfinished_correction"])
+    if summary.get("stopped_by"):
+        lines.append(f"stopped by {summary['stopped_by']}: the results are those of the frames so far")
+    if summary.get("restarted"):
+        lines.append(f"{summary['restarted']}; frames are counted since then")
+    return lines
+
+
+def percent(value: float) -> str:
+    """0.1234 -> 12.3 %."""
+    return f"{value * 100:.1f} %"
+
+
+def _ms(value: float) -> str:
+    return f"{value:.0f} ms"
+
+
+def _voxel_size(summary: Mapping[str, Any]) -> str:
+    size = dig(summary, "map.voxel_size_m")
+    return "-" if size is None else voxel_size_text(size, summary.get("scale") != "unknown")
+
+
+def _scene_known(scene: Mapping[str, Any]) -> str:
+    """Pixels that weights of one scene know; those of another scene know few."""
+    known, outside = percent(scene["known"]), scene["frames_outside"]
+    return f"{known} of the pixels; {counted(outside, 'frame')} mostly unknown" if outside else f"{known} of the pixels"
+
+
+def _pose_figure(check: Mapping[str, Any], key: str) -> str:
+    """A figure of the pose check, or that too few keyframes overlap for it."""
+    value = check.get(key)
+    return "not checked" if value is None else percent(value)
+
+
+def _depth_source(depth: Mapping[str, Any]) -> str:
+    if depth["source"] != "mixed":
+        return _DEPTH_SOURCES[depth["source"]]
+    fractions = {"computed from the pictures": "computed_fraction", "rendered by the field": "rendered_fraction"}
+    parts = [f"{how} for {percent(depth[key])}" for how, key in fractions.items() if depth.get(key)]
+    return f"{', '.join(parts)} of the frames"
+
+
+_DEPTH_SOURCES = {
+    "sensor": "sensor",
+    "rendered": "rendered by the field (no depth sensor)",
+    "computed": "computed from the pictures (no depth sensor)",
+}
+_ROWS: Sequence[tuple[str, str, Any]] = (
+    ("log", "source", str),
+    ("weights", "weights.file", str),
+    ("frames published", "frames.published", str),
+    ("frames fused", "frames.fused", str),
+    ("frames dropped", "frames.dropped", str),
+    ("frames refused", "frames.refused", str),
+    ("frames left out of the log", "frames", lambda f: str(f.get("left_out") or "-")),
+    ("scale", "scale", str),
+    ("frames scored", "frames.scored", str),
+    ("depth", "depth", _depth_source),
+    ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),
+    ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
+    ("latency p50", "latency_ms.p50", _ms),
+    ("latency p95", "latency_ms.p95", _ms),
+    ("voxel size", "", _voxel_size),
+    ("blocks", "map.blocks", str),
+    ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
+    ("known to the weights", "scene", _scene_known),
+    ("unknown surface", "map.unknown", percent),
+    ("computed surface", "map.computed", percent),
+    ("map memory", "map.memory_mb", lambda v: f"{v} MB"),
+    ("mIoU", "metrics.miou", percent),
+    ("total accuracy", "metrics.total_accuracy", percent),
+    ("average accuracy", "metrics.average_accuracy", percent),
+    ("mIoU a frame", "metrics_per_image.miou", percent),
+    ("mIoU of the map", "metrics.map_miou", percent),
+)

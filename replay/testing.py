@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml
 from semantic_mapper.errors import LogError
-from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
@@ -22,10 +21,8 @@ from semantic_mapper.queries.nearest import NearestSurface, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.replay.compare import MAP_FILE, Comparison, Run, Tolerances, compare_runs, read_run
-from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.replay.session import MapSession
+from semantic_mapper.replay.jobs import ReplayRequest, replay_log
 from semantic_mapper.replay.summary import SUMMARY_FILE
-from semantic_mapper.types import PosedFrame
 
 UPDATE_OPTION = "--update-runs"
 
@@ -226,24 +223,6 @@ class LogReplays:
         return mapper
 
     def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
-        with open_log(path) as log:
-            bundle = Mapper.load(weights, config)
-            session = MapSession(
-                bundle,
-                stream_labels=log.info.label_set,
-                source=log.info.source,
-                scale_known=log.info.scale_known,
-            )
-            for error in log.errors:
-                session.note_damage(str(error))
-            for number, item in enumerate(log.frames_or_errors(min(len(log), max_frames or len(log)))):
-                if isinstance(item, PosedFrame):
-                    session.process(item)
-                else:
-                    session.refuse(number, 0, str(item))
-        if not session.fused:
-            reason = session.refusals.first[0].reason if session.refusals else "no frame finds a source view"
-            raise LogError(f"{path}: none of its frames could be mapped; the first: {reason}")
         folder = self._make_folder(path.stem)
-        summary = session.finish(folder)
-        return ReplayedMap(folder, session.pipeline.voxel_map, summary, self._root, self._update)
+        result = replay_log(ReplayRequest(path, folder, weights, config, max_frames))
+        return ReplayedMap(folder, result.session.pipeline.voxel_map, result.summary, self._root, self._update)

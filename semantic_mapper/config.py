@@ -9,7 +9,7 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
@@ -414,6 +414,72 @@ def load_config(path: Path, kind: type[ConfigT]) -> ConfigT:
         ConfigError: file missing, not TOML, unknown key (with the nearest valid one), or a value of the wrong type.
     """
     return convert_config(read_toml(path), kind, str(path))
+
+
+def load_mapper_config(
+    path: Path | None, settings: Mapping[str, Any] | None = None, defaults: Mapping[str, Any] | None = None
+) -> MapperConfig:
+    """The mapper's config: a TOML file, what goes before it, and what stands in where it says nothing.
+
+    Args:
+        path: The file; None = the defaults of ``MapperConfig``.
+        settings: By dotted name ("voxel_map.voxel_size_m"); they replace what the file says. None = not given.
+        defaults: By dotted name; for what neither the file nor ``settings`` say.
+
+    Raises:
+        ConfigError: see ``load_config`` and ``check_quality``.
+    """
+    data = read_toml(path) if path else {}
+    where = str(path) if path else "settings of the mapper"
+    in_file = convert_config(data, MapperConfig, where)
+    given = {name: value for name, value in (settings or {}).items() if value is not None}
+    check_quality(data, given.get("quality", in_file.quality), where)
+    for name, value in (defaults or {}).items():
+        assign(data, name, value, where, replace=False)
+    for name, value in given.items():
+        assign(data, name, value, where)
+    return convert_config(data, MapperConfig, where)
+
+
+def parse_assignments(texts: Iterable[str]) -> dict[str, Any]:
+    """What ``--set NAME=VALUE`` says, by name; values as in TOML, bare words are text.
+
+    Raises:
+        ConfigError: not of this form.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise ConfigError(f"--set {text}: write NAME=VALUE, such as seed=1")
+        try:
+            found[name] = tomllib.loads(f"value = {value}")["value"]
+        except (ValueError, RecursionError):
+            found[name] = value
+    return found
+
+
+def assign(data: dict[str, Any], name: str, value: Any, where: str, *, replace: bool = True) -> None:
+    """Set a value of plain data by its dotted name, making the tables on the way.
+
+    Args:
+        data: Nested tables; changed.
+        name: Such as "voxel_map.voxel_size_m".
+        value: Plain.
+        where: Its file, for messages.
+        replace: Whether a value that is there gives way.
+
+    Raises:
+        ConfigError: a part of the name is a value already, not a table.
+    """
+    *tables, last = name.split(".")
+    for key in tables:
+        inner = data.setdefault(key, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{where}: {name}: `{key}` is a value, not a table")
+        data = inner
+    if replace or last not in data:
+        data[last] = value
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -17,12 +17,12 @@ from semantic_mapper.config import (
     VoxelMapConfig,
     convert_config,
     load_config,
+    load_mapper_config,
     read_json,
     read_toml,
     to_plain,
 )
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.run_replay import mapper_config
 
 
 def write(folder: Path, text: str) -> Path:
@@ -81,11 +81,11 @@ def test_what_a_quality_would_override_is_refused(
     own.write_text(f'quality = "{quality}"\n{text}', encoding="utf-8")
     for path, asked in ((plain, quality), (own, None)):
         if clash is None:
-            assert mapper_config(path, None, quality=asked).quality == quality
+            assert load_mapper_config(path, {"quality": asked}).quality == quality
         else:
             with pytest.raises(ConfigError, match=rf"{path.name}: .*{clash}"):
-                mapper_config(path, None, quality=asked)
-    assert mapper_config(own, None, quality="custom").quality == "custom"
+                load_mapper_config(path, {"quality": asked})
+    assert load_mapper_config(own, {"quality": "custom"}).quality == "custom"
 
 
 def test_an_unknown_key_like_no_other_is_answered_with_the_valid_ones(tmp_path: Path) -> None:

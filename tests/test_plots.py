@@ -128,7 +128,7 @@ def test_drawing_leaves_the_settings_of_the_process_as_they_are() -> None:
 def test_matplotlib_is_imported_when_something_is_drawn() -> None:
     """The command line starts without it, and machines that only train lack it."""
     code = (
-        "import sys; import semantic_mapper.nodes.cli.main, semantic_mapper.nodes.cli.report, semantic_mapper.plots; "
+        "import sys; import semantic_mapper.nodes.cli.main, semantic_mapper.replay.page, semantic_mapper.plots; "
         "import research.train.train_log, research.suites.run; "
         "print({'matplotlib', 'PIL'} & set(sys.modules)); "
         "semantic_mapper.plots.draw_panels('', [semantic_mapper.plots.Panel('', '', '', [])]); "

@@ -22,7 +22,7 @@ import zenoh
 from semantic_mapper import MapClient
 from semantic_mapper.errors import MapError, TransportError
 from semantic_mapper.nodes.bridge.packing import describe_map, pack_points, thinned
-from semantic_mapper.nodes.cli.map_answers import answer_graph
+from semantic_mapper.nodes.map_answers import answer_graph
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 

@@ -13,7 +13,7 @@ from semantic_mapper.drivers.calibrating.views import ViewGatherer, simultaneous
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import CameraError, SemanticMapperError
 from semantic_mapper.nodes.calibration.sources import Source
-from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.process import StopRequest
 
 TELL_S = 2.0

@@ -12,7 +12,7 @@ import structlog
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
-from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import CameraOptions, NodeJob
 

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.replay import MaxFramesOption
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.process import StopRequest
 
 LISTED = 10  # frames without a label, and damages, that are shown one by one
@@ -60,19 +60,18 @@ def autolabel(
     must_be_there(*log)
     output = Output.guarded()
     output.quiet = json
+    from semantic_mapper.config import load_mapper_config
     from semantic_mapper.nodes.cli.log_info import autolabel_rows
-    from semantic_mapper.nodes.cli.outputs import prepare_file
-    from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
-    from semantic_mapper.replay.autolabel import AutolabelRequest
-    from semantic_mapper.replay.autolabel import autolabel as autolabel_log
+    from semantic_mapper.replay.jobs import OFFLINE, AutolabelRequest, autolabel_log
+    from semantic_mapper.replay.run_folder import prepare_file
 
     prepare_file(out)
-    config = mapper_config(None, None, delay_frames=REPLAY_DELAY_FRAMES)
+    config = load_mapper_config(None, defaults=OFFLINE)
     request = AutolabelRequest(
         tuple(log), out, weights, config, depth, min_confidence, overwrite_labels, max_frames, instances
     )
-    with StopRequest() as stop, frame_progress("autolabel", None) as bar:
-        report = autolabel_log(request, lambda: stop, bar.start, bar.set)
+    with StopRequest() as stop, frame_progress("autolabel", None, stop=stop) as bar:
+        report = autolabel_log(request, bar)
     found: dict[str, Any] = {
         "files": [str(file) for file in report.files],
         **report.note.plain(),

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.replay import ConfigOption, QualityOption, VoxelSizeOption, WeightsOption
 from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
+from semantic_mapper.nodes.console import Output
 
 
 @verb
@@ -37,7 +37,7 @@ def bench(
     """
     must_be_there(*(path for path in (log, config) if path is not None))
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.run_replay import mapper_config
+    from semantic_mapper.config import load_mapper_config
     from semantic_mapper.replay.artifacts import versions
     from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
     from semantic_mapper.replay.log.demo import demo_log
@@ -53,7 +53,12 @@ def bench(
             f"with 40 ({found['ratio_40']} times)"
         )
     else:
-        settings = mapper_config(config, voxel_size, None, quality, None if depth == "sensor" else depth, live=True)
+        given = {
+            "voxel_map.voxel_size_m": voxel_size,
+            "quality": quality,
+            "depth.source": None if depth == "sensor" else depth,
+        }
+        settings = load_mapper_config(config, given)
         found = bench_pipeline(log, weights, settings, frames)
         stages = ", ".join(f"{name} {value}" for name, value in found["stages_ms"].items())
         score = "" if found["miou"] is None else f"mIoU {found['miou'] * 100:.1f} %; "

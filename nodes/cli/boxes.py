@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.console import Output
-from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.run_folder import prepare_file
 
 if TYPE_CHECKING:
     from rich.table import Table

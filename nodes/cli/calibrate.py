@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def calibrate(
     """
     output = Output.guarded()
     from semantic_mapper.nodes.calibration.sources import check_places
-    from semantic_mapper.nodes.cli.outputs import folder_for_results
+    from semantic_mapper.replay.run_folder import folder_for_results
 
     check_places(sources or ())
     from semantic_mapper.nodes.calibration.report import report, report_json, write_files, write_stereo
@@ -119,7 +119,7 @@ def board_settings(path: Path | None, square_mm: float) -> Any:
 def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
     from semantic_mapper.drivers.calibrating.sheet import sheet_png
     from semantic_mapper.nodes.calibration.report import write_whole
-    from semantic_mapper.nodes.cli.outputs import prepare_file
+    from semantic_mapper.replay.run_folder import prepare_file
 
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: the board is written as a PNG picture; give a name that ends with .png")

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import show_error, verb
+from semantic_mapper.nodes.console import Output
 
 EXIT_DIFFERS = 1
 EXIT_TROUBLE = 2
@@ -42,8 +42,8 @@ def compare(
     Example: semantic-mapper compare runs/before runs/after --labels 0.05
     Example: semantic-mapper compare a/map.npz b/map.npz --exact --json
     """
-    from semantic_mapper.nodes.cli.saved_maps import is_log
     from semantic_mapper.replay.compare import Difference, Tolerances, compare_runs, map_file, read_run
+    from semantic_mapper.replay.run_folder import is_log
 
     output = Output.guarded()
     given = {"score": score, "surface_m": surface_m, "labels": labels}

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.replay import VoxelSizeOption, WeightsOption
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 
 
@@ -27,17 +27,20 @@ def demo(
     Example: semantic-mapper demo --out runs/demo
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.outputs import prepare_folder
-    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
-    from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
+    from semantic_mapper.config import load_mapper_config
+    from semantic_mapper.replay.jobs import ReplayRequest, replay_log
     from semantic_mapper.replay.log.demo import demo_log
+    from semantic_mapper.replay.run_folder import prepare_folder
+    from semantic_mapper.replay.summary import notes, result_lines, summary_table
 
     began = time.monotonic()
     prepare_folder(out)
     with StopRequest() as stop:
-        request = ReplayRequest(demo_log(), out, weights, mapper_config(None, voxel_size))
-        with frame_progress("map", None) as bar:
-            summary = replay_log(request, stop, bar.start, bar.set)
+        request = ReplayRequest(
+            demo_log(), out, weights, load_mapper_config(None, {"voxel_map.voxel_size_m": voxel_size})
+        )
+        with frame_progress("map", None, stop=stop) as bar:
+            summary = replay_log(request, bar).summary
         output.print(summary_table({"demo": summary}))
         for line in (*notes(summary), *result_lines(out), f"  {demo_log()}  (the log it was made from)"):
             output.print(line)

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.nodes.console import Output
 
 _STYLES = {"ok": "green", "note": "yellow", "bad": "bold red"}
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
-from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import write_json
 from semantic_mapper.nodes.cli.replay import ConfigOption, MaxFramesOption
 from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, results_file, verb
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from semantic_mapper.config import MapperConfig
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.replay.run_folder import MAP_SUFFIX, is_log, prepare_file
+from semantic_mapper.replay.summary import notes, read_summary, result_lines, summary_table
 
 BASELINE_SECONDS = 300.0
 
@@ -77,38 +78,14 @@ def evaluate(
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
     Example: semantic-mapper eval kitchen.mcap --instances kitchen/instance
     """
-    out, print_json = results_file(out), json
+    out = results_file(out)
     if baselines and seconds == 0:
         raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
     must_be_there(*targets or ())
-    baseline_s = BASELINE_SECONDS if seconds is None else seconds
-    from semantic_mapper.nodes.cli.run_replay import mapper_config
-
-    mapper = mapper_config(config, None, seed or 0)
-    options = weights, baselines, baseline_s, max_frames, mapper, seed or 0, instances
-    return _evaluate_targets(targets or [], options, mesh, out, print_json=print_json)
-
-
-def _evaluate_targets(
-    targets: list[Path],
-    options: tuple[Path | None, bool, float, int, MapperConfig, int, Path | None],
-    mesh: Path | None,
-    json_file: Path | None,
-    *,
-    print_json: bool,
-) -> int:
-    """Figures of folders and logs; ``options`` are those of ``scoring.ScoreRequest`` after the log."""
     if not targets:
         raise typer.BadParameter("give folders or logs", param_hint="DIR_OR_LOG")
     output = Output.guarded()
-    output.quiet = print_json
-    from semantic_mapper.errors import ConfigError
-    from semantic_mapper.files import write_json
-    from semantic_mapper.nodes.cli.outputs import prepare_file, say_replaced
-    from semantic_mapper.nodes.cli.report import write_eval_report
-    from semantic_mapper.nodes.cli.results import print_results
-    from semantic_mapper.nodes.cli.saved_maps import MAP_SUFFIX, is_log
-
+    output.quiet = json
     for target in targets:
         if target.suffix == MAP_SUFFIX:
             raise ConfigError(f"{target}: is a map alone; give the folder with its summary.json, or a log")
@@ -116,26 +93,33 @@ def _evaluate_targets(
     folders = [t for t in targets if t not in logs]
     if mesh is not None and not folders:
         raise typer.BadParameter("goes with a DIR that `replay` has written", param_hint="--mesh")
-    if options[-1] is not None and not logs:
+    if instances is not None and not logs:
         raise typer.BadParameter("goes with a LOG", param_hint="--instances")
-    path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
-    if json_file is not None or targets[0].exists():  # no folders for a log that is not there
+    path = out or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
+    if out is not None or targets[0].exists():  # no folders for a log that is not there
         prepare_file(path)
-    say_replaced(path)
-    found: dict[str, Any] = {"replays": {}, "logs": {}}
-    tables: dict[str, Table] = {}
-    if folders:
-        found["replays"] = print_results(output, folders)
+    if path.exists():
+        note = f"{path}: of an earlier run; will be replaced (--out names another file)"
+        stderr_console().print(note, soft_wrap=True)
+    found: dict[str, Any] = {"replays": print_results(output, folders), "logs": {}}
     if mesh is not None:
         from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
 
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
-            output.print(f"{name}: {surface_line(figures)}")
-    for log in logs:
-        from semantic_mapper.nodes.cli.scoring import ScoreRequest, score_log, score_table
+            output.print(f"{name}: {_surface_line(figures)}")
+    from semantic_mapper.config import load_mapper_config
+    from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
+    from semantic_mapper.replay.jobs import EvaluateRequest, evaluate_log
 
-        found["logs"][str(log)] = scores = score_log(ScoreRequest(log, *options))
+    mapper = load_mapper_config(config, {"seed": seed})
+    baseline_s = (BASELINE_SECONDS if seconds is None else seconds) if baselines else 0.0
+    tables: dict[str, Table] = {}
+    for log in logs:
+        request = EvaluateRequest(log, weights, mapper, max_frames, baseline_s, instances)
+        with frame_progress("score", None) as bar:
+            scores = evaluate_log(request, bar).scores
+        found["logs"][str(log)] = scores
         tables[str(log)] = score_table(log.name, scores)
         output.print(tables[str(log)])
         for note in scores["notes"]:
@@ -143,12 +127,29 @@ def _evaluate_targets(
     write_json(path, found)
     write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)
     output.print(f"written to {path} and, for a browser, {page}")
-    if print_json:
+    if json:
         output.json(found)
     return 0
 
 
-def surface_line(figures: dict[str, Any]) -> str:
+def print_results(output: Output, folders: Sequence[Path]) -> dict[str, dict[str, Any]]:
+    """Show the tables of result folders side by side, and where the files are.
+
+    Raises:
+        ConfigError: see ``read_summary``.
+    """
+    short = [f.resolve().name for f in folders]
+    names = [s if short.count(s) == 1 else str(f) for s, f in zip(short, folders, strict=True)]
+    summaries = dict(zip(names, map(read_summary, folders), strict=True))
+    if summaries:
+        output.print(summary_table(summaries))
+    for (name, summary), folder in zip(summaries.items(), folders, strict=True):
+        for line in (*(f"{name}: {n}" for n in notes(summary)), *result_lines(folder)):
+            output.print(line)
+    return summaries
+
+
+def _surface_line(figures: dict[str, Any]) -> str:
     """One sentence about a map and a mesh."""
     labels = "" if figures["mesh_miou"] is None else f", mIoU at its vertices {figures['mesh_miou'] * 100:.1f} %"
     return (

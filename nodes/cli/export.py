@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def export(
     """
     output = Output.guarded()
     from semantic_mapper.nodes.cli.export_log import export_recording
-    from semantic_mapper.nodes.cli.saved_maps import is_log
+    from semantic_mapper.replay.run_folder import is_log
 
     if is_log(source):
         given = {"--color": color, "--height": height, "--resolution": resolution, "--floor": floor}
@@ -91,10 +91,9 @@ def export(
 
 def _export_map(output: Output, folder_or_map: Path, out: Path, request: ExportRequest) -> None:
     from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.nodes.cli.outputs import prepare_file
-    from semantic_mapper.nodes.cli.saved_maps import holds_tiles, map_path, refuse_overwriting
     from semantic_mapper.queries.tiles import TiledMap
     from semantic_mapper.replay.exporters.map_files import export_map
+    from semantic_mapper.replay.run_folder import holds_tiles, map_path, prepare_file, refuse_overwriting
 
     if holds_tiles(str(folder_or_map)):
         prepare_file(out)
@@ -135,8 +134,8 @@ def merge(
     from semantic_mapper.mapping.files.merge import count_empty
     from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
     from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.nodes.cli.outputs import prepare_file
-    from semantic_mapper.nodes.cli.saved_maps import map_path, parse_transform, refuse_overwriting
+    from semantic_mapper.replay.exporters.map_files import parse_transform
+    from semantic_mapper.replay.run_folder import map_path, prepare_file, refuse_overwriting
 
     T_a_b = None if transform == "find" else parse_transform(transform)
     sources = map_path(a), map_path(b)

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.console import Output, frame_progress
-from semantic_mapper.nodes.cli.outputs import prepare_folder
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.run_folder import prepare_folder
 
 LISTED = 10  # frames left out that are shown one by one
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress
+from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
 from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def write_film_report(report: FilmReport, path: Path) -> None:
     Raises:
         ConfigError: it cannot be written.
     """
-    from semantic_mapper.nodes.cli.report import Section, picture, table_of, write_page
+    from semantic_mapper.replay.page import Section, picture, table_of, write_page
 
     spans = [(f"{p.start_s:.2f}", f"{p.end_s:.2f}", str(p.frames), p.reason) for p in report.left_out[:LISTED]]
     counts = [(reason, str(count)) for reason, count in report.left_out_counts.items()]

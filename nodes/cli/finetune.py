@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.label import frame_numbers
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.summary import percent
+
+if TYPE_CHECKING:
+    from semantic_mapper.replay.jobs import FinetuneRequest, FinetuneResult
 
 FinetuneDepthOption = Annotated[
     Literal["auto", "sensor", "computed", "off"] | None,
@@ -120,9 +125,8 @@ def finetune(
     output = Output.guarded()
     import msgspec
 
-    from semantic_mapper.config import load_config
-    from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_lines, finetune_log
-    from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
+    from semantic_mapper.config import load_config, load_mapper_config
+    from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
     from semantic_mapper.training.finetune import FinetuneConfig
     from semantic_mapper.training.fitters import FITTERS
 
@@ -138,27 +142,27 @@ def finetune(
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
-    depths = mapper_config(None, None, depth=depth or "sensor", delay_frames=REPLAY_DELAY_FRAMES).depth
+    depths = load_mapper_config(None, {"depth.source": depth or "sensor"}, OFFLINE).depth
     request = FinetuneRequest(
         log,
-        keyframes or 0,
         out,
-        settings,
-        weights,
-        from_scratch,
-        depths,
-        kind,
-        labels,
-        frame_numbers(frames),
-        unlabelled,
-        boxes,
-        pseudo,
-        uncovered or "stuff",
-        strokes,
+        keyframes=keyframes or 0,
+        config=settings,
+        weights=weights,
+        from_scratch=from_scratch,
+        depth=depths,
+        kind=kind,
+        labels=labels,
+        frames=frame_numbers(frames),
+        unlabelled=unlabelled,
+        boxes=boxes,
+        pseudo=pseudo,
+        uncovered=uncovered or "stuff",
+        strokes=strokes,
     )
-    with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
-        checkpoint, chosen = finetune_log(request, stop, bar)
-    for line in finetune_lines(checkpoint, chosen, request):
+    with StopRequest() as stop, frame_progress("finetune", None, unit="%", stop=stop) as bar:
+        result = finetune_log(request, bar)
+    for line in finetune_lines(result, request):
         output.print(line)
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
@@ -205,3 +209,70 @@ def _refuse_mixed(
         raise typer.BadParameter("goes with --kind, or --weights of such a kind", param_hint="--unlabelled")
     if variant is not None and kind != "irt" and (kind is not None or weights is None):
         raise typer.BadParameter("goes with --kind irt, or --weights of it", param_hint="--variant")
+
+
+def finetune_lines(result: FinetuneResult, request: FinetuneRequest) -> list[str]:
+    """What was learned, for a reader."""
+    from semantic_mapper.fields.primitive_rays import MAX_INTERVALS
+
+    checkpoint, chosen = result.checkpoint, result.chosen
+    recipe, out, log = checkpoint.recipe, request.out, request.log.name
+    lines = [f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log}"] if chosen else []
+    if "psnr" in recipe:
+        psnr = "no held-out views rendered" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"
+        steps = recipe.get("grid_steps", recipe["steps"])
+        lines.append(f"{out}: grid of {log}, {steps} steps in {recipe['seconds']} s, {psnr}")
+    if "held_out_loss" in recipe:
+        lines.append(
+            f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
+            f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
+        )
+    if pseudo := recipe.get("pseudo_labels"):
+        by = f" that {pseudo['of']} has rendered" if pseudo["of"] else ""
+        lines.append(
+            f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
+            "well these are learned, not how right they are"
+        )
+    if grown := recipe.get("strokes"):
+        lines.append(
+            f"  strokes of {percent(grown['painted'])} of the keyframes' pixels have grown to {percent(grown['grown'])}"
+        )
+    if own := recipe.get("own_view"):
+        lines.append(
+            f"  a frame's own image counts {own['factor']:g} times among the views, "
+            f"{own['factor_without_depth']:g} times where there is no depth"
+        )
+    if boxed := recipe.get("panoptic"):
+        lines.append(
+            f"  {boxed['seen']} of {boxed['boxes']} boxes seen; pixels that meet one {percent(boxed['covered'])}, "
+            f"with a surface in boxes of several classes {percent(boxed['ambiguous'])}; pseudo labels "
+            f"({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
+            f"{percent(boxed['matched'])}"
+        )
+        if checkpoint.model.config.classes == "fixed":
+            lines.append(
+                "  stopped before classes were learned: they are those of the boxes alone; what is in none of them "
+                "(wall or floor) is not told apart"
+            )
+        if boxed["crowded"]:
+            lines.append(
+                f"  {percent(boxed['crowded'])} of the pixels meet more than {MAX_INTERVALS} boxes: of these the "
+                "nearest count"
+            )
+        if boxed["moving"]:
+            lines.append(f"  {boxed['moving']} boxes that move, with grids of their own")
+        if left_out := [text for count, text in _left_out(boxed) if count]:
+            lines.append(f"  boxes left out: {'; '.join(left_out)}")
+    if checkpoint.model.holds_scene:
+        lines.append(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
+    return lines
+
+
+def _left_out(boxed: Mapping[str, Any]) -> list[tuple[int, str]]:
+    """How many boxes were left out, for which reason."""
+    reasons = {
+        "unseen": "that no frame sees",
+        "lost": "that move, which no frame shows at their times",
+        "left_out": "of no class, or of one that the labels lack",
+    }
+    return [(boxed[name], f"{boxed[name]} {reason}") for name, reason in reasons.items()]

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.fleet_run import RayOption, TrustedOption
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 
 
@@ -49,11 +49,11 @@ def merge(
     """
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.nodes.cli.saved_maps import map_path
     from semantic_mapper.nodes.fleet.cluster import connected
     from semantic_mapper.nodes.fleet.merge import check_names, merge_maps, read_poses, run_on_ray
     from semantic_mapper.nodes.fleet.store import Store
     from semantic_mapper.nodes.fleet.urls import is_url
+    from semantic_mapper.replay.run_folder import map_path
 
     if len(maps) < 2:
         raise typer.BadParameter("give two maps or more", param_hint="MAPS")

@@ -15,8 +15,15 @@ import numpy as np
 from semantic_mapper.errors import ConfigError, FleetError, StoreError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.cli.fleet_results import cell_text
-from semantic_mapper.nodes.cli.report import (
-    REPORT_NAME,
+from semantic_mapper.nodes.fleet.compare import main_method
+from semantic_mapper.nodes.fleet.metrics import Direction, direction_of
+from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.tables import Tables, column_name
+from semantic_mapper.nodes.fleet.variants import Variant, operations, quoted, variants
+from semantic_mapper.plain_text import counted
+from semantic_mapper.plots import Histogram, PercentileBox, draw_boxes, draw_histograms
+from semantic_mapper.replay.artifacts import REPORT_NAME
+from semantic_mapper.replay.page import (
     Card,
     Picture,
     Section,
@@ -26,13 +33,6 @@ from semantic_mapper.nodes.cli.report import (
     table_of,
     write_page,
 )
-from semantic_mapper.nodes.fleet.compare import main_method
-from semantic_mapper.nodes.fleet.metrics import Direction, direction_of
-from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.tables import Tables, column_name
-from semantic_mapper.nodes.fleet.variants import Variant, operations, quoted, variants
-from semantic_mapper.plain_text import counted
-from semantic_mapper.plots import Histogram, PercentileBox, draw_boxes, draw_histograms
 from semantic_mapper.types import Float64
 
 WORST = 12  # logs with their pictures

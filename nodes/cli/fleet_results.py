@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import show_error, verb
+from semantic_mapper.nodes.console import Output
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -248,7 +248,7 @@ def _write_file(path: Path, found: pa.Table, write: Any) -> None:
     import io
 
     from semantic_mapper.files import write_bytes
-    from semantic_mapper.nodes.cli.outputs import prepare_file
+    from semantic_mapper.replay.run_folder import prepare_file
 
     prepare_file(path)
     stream = io.BytesIO()

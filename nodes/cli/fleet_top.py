@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.table import Table
 
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.fleet.runner import REPORT_S, DriverStatus
 from semantic_mapper.nodes.fleet.store import Store
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:

@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output
-from semantic_mapper.nodes.cli.remote import default_folder
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -17,7 +16,14 @@ app = typer.Typer(
     help="Keys by which this machine and others know each other. Needed where a node listens beyond this machine.",
 )
 
-FolderOption = Annotated[Path, typer.Option("--keys", help="Folder of the keys.", default_factory=default_folder)]
+
+def _user_folder() -> Path:
+    from semantic_mapper.transport.keys import user_key_folder
+
+    return user_key_folder()
+
+
+FolderOption = Annotated[Path, typer.Option("--keys", help="Folder of the keys.", default_factory=_user_folder)]
 
 
 @app.command("make")

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 
@@ -208,7 +208,7 @@ def _send(
     endpoint = labels_endpoint(to)
     if "://" not in to:
         _refuse_without_finetuner(Path(endpoint.removeprefix("ipc://")).parent)
-    with StopRequest() as stop, frame_progress("label", None) as bar:
+    with StopRequest() as stop, frame_progress("label", None, stop=stop) as bar:
         found, label_set = choose_keyframes(log, keyframes, numbers, images, stop, bar)
         with sending(endpoint, timeout, stop) as send:
             for frame in found.values():

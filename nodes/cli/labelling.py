@@ -6,16 +6,14 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import LabelError, LogError, TransportError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.cli.console import FrameProgress
-from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, choose_labelled
+from semantic_mapper.nodes.console import FrameProgress
 from semantic_mapper.nodes.launcher.running import running_launches
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.finetune_log import FinetuneRequest, FrameSource
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe
 from semantic_mapper.transport.sockets import Publisher
@@ -53,8 +51,8 @@ def choose_keyframes(
             raise LabelError(f"{path}: has no label images; give --images with a folder that has labels.json")
         numbers = sorted(set(frames)) or ([] if folder is None else folder.numbers())
         if folder is None and not numbers:
-            request = FinetuneRequest(path, count, path, FinetuneConfig(), None, False, DepthConfig(source="sensor"))
-            return choose_labelled(log, label_set, request, {}, stop, bar), label_set
+            request = FinetuneRequest(path, path, keyframes=count)
+            return FrameSource(log, None, request, {}).choose_labelled(label_set, bar), label_set
         bar.start(len(numbers))
         chosen: dict[int, PosedFrame] = {}
         for number in numbers:

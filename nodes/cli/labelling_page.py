@@ -14,7 +14,7 @@ from semantic_mapper.errors import FrameError, LogError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.cli.console import FrameProgress
+from semantic_mapper.nodes.console import FrameProgress
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.importers.folder import read_label_set
 from semantic_mapper.replay.label_folder import (

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 
 app = typer.Typer(
     no_args_is_help=True,

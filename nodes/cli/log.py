@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.film import (
     BoardOption,
     CalibrationOption,
@@ -24,6 +23,7 @@ from semantic_mapper.nodes.cli.film import (
 )
 from semantic_mapper.nodes.cli.imported import print_import
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 
 LISTED = 10  # damages that are shown one by one
@@ -165,7 +165,7 @@ def info(
     Example: semantic-mapper info runs/demo
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.saved_maps import is_map, map_path
+    from semantic_mapper.replay.run_folder import is_map, map_path
 
     if is_map(file[0]):
         if len(file) > 1:

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.film import (
     BoardOption,
     CalibrationOption,
@@ -25,8 +24,10 @@ from semantic_mapper.nodes.cli.replay import (
     VoxelSizeOption,
     WeightsOption,
     map_exit_code,
+    show_replay,
 )
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 
 
@@ -65,16 +66,15 @@ def map_(
     """
     must_be_there(source)
     output = Output.guarded()
+    from semantic_mapper.config import load_mapper_config
     from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
     from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film, recording_scale
     from semantic_mapper.nodes.cli.imported import print_import
-    from semantic_mapper.nodes.cli.outputs import hold_folder
-    from semantic_mapper.nodes.cli.report import REPORT_NAME
-    from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, ReplayRequest, mapper_config, replay_log
-    from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
     from semantic_mapper.replay.importers import ImportOptions, import_recording
+    from semantic_mapper.replay.jobs import OFFLINE, ReplayRequest, replay_log
+    from semantic_mapper.replay.run_folder import hold_folder
 
-    settings = mapper_config(config, voxel_size, None, quality, None, REPLAY_DELAY_FRAMES)
+    settings = load_mapper_config(config, {"voxel_map.voxel_size_m": voxel_size, "quality": quality}, OFFLINE)
     options = film_options(
         calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90
     )
@@ -96,12 +96,11 @@ def map_(
             print_import(output, found, log)
             with_depth = found.with_depth
     with StopRequest() as stop:
-        with frame_progress("replay", None) as bar:
+        with frame_progress("replay", None, stop=stop) as bar:
             chosen = weights or (None if with_depth else COMPUTED_DEPTH)
-            summary = replay_log(ReplayRequest(log, out, chosen, settings), stop, bar.start, bar.set)
-        output.print(summary_table({out.name: summary}))
-        for line in (*notes(summary), *result_lines(out), str(out / REPORT_NAME)):
-            output.print(line)
+            summary = replay_log(ReplayRequest(log, out, chosen, settings), bar).summary
+        show_replay(output, summary, out)
+        output.print(str(out / "report.html"))
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
         return map_exit_code(summary, stop, accept_contradictions)

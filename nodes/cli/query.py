@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.nodes.cli.console import Output
-from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.running import map_endpoint
+from semantic_mapper.replay.run_folder import prepare_file
 
 if TYPE_CHECKING:
     from semantic_mapper.queries.graph import SceneGraph
@@ -103,7 +103,7 @@ def query(
     Example: semantic-mapper query s3://maps/house nearest chair 0 0 1
     """
     class_name, point = _read_arguments(question, arguments or [])
-    from semantic_mapper.nodes.cli.saved_maps import holds_tiles
+    from semantic_mapper.replay.run_folder import holds_tiles
 
     in_tiles = holds_tiles(source)
     endpoint = "" if in_tiles else map_endpoint(source)
@@ -113,7 +113,7 @@ def query(
         raise typer.BadParameter("goes with `graph`", param_hint="--picture")
     output = Output.guarded()
     from semantic_mapper.files import write_json
-    from semantic_mapper.nodes.cli.map_answers import answer_table
+    from semantic_mapper.nodes.map_answers import answer_table
 
     out, output.quiet = results_file(out), json
     for path in (out, picture):
@@ -138,13 +138,13 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     Raises:
         ConfigError, MapError, LabelError: no map there, or a question that cannot be answered.
     """
-    from semantic_mapper.nodes.cli import map_answers
-    from semantic_mapper.nodes.cli.saved_maps import map_path
+    from semantic_mapper.nodes import map_answers
     from semantic_mapper.queries.graph import GraphTracker
     from semantic_mapper.queries.instances import InstanceTracker
     from semantic_mapper.queries.lookup import at
     from semantic_mapper.queries.mirror import MapMirror
     from semantic_mapper.queries.nearest import nearest
+    from semantic_mapper.replay.run_folder import map_path
 
     snapshot = MapMirror.load(map_path(Path(source))).snapshot()
     match asked.question:
@@ -171,7 +171,7 @@ def ask_tiles(source: str, asked: Asked) -> dict[str, Any]:
         StoreError: the store cannot be reached.
     """
     from semantic_mapper.mapping.files.up_axis import find_up
-    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes import map_answers
     from semantic_mapper.nodes.fleet.tile_reading import open_tiles
     from semantic_mapper.queries.graph import GraphTracker
     from semantic_mapper.queries.mirror import MapMirror
@@ -201,7 +201,7 @@ def ask_tiles(source: str, asked: Asked) -> dict[str, Any]:
 
 def _find_up(snapshot: MapSnapshot) -> tuple[float, ...]:
     """Away from the floor, as in the graph; z of the world where no floor shows it, which the answer tells (``up``)."""
-    from semantic_mapper.nodes.cli.map_answers import UP
+    from semantic_mapper.nodes.map_answers import UP
     from semantic_mapper.queries.graph import GraphTracker
 
     try:
@@ -218,7 +218,7 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
         MapError, LabelError: a question that cannot be answered.
     """
     from semantic_mapper.client import MapClient
-    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes import map_answers
 
     with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
         match asked.question:
@@ -242,7 +242,7 @@ def _answer_graph(source: str, graph: SceneGraph, picture: Path | None) -> dict[
     Raises:
         MapError: there is no floor to draw.
     """
-    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes import map_answers
 
     if picture is not None:
         from semantic_mapper.plots import write_picture

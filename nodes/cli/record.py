@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 
@@ -56,9 +56,9 @@ def record(
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.outputs import prepare_file
     from semantic_mapper.nodes.launcher.running import launch_folder
     from semantic_mapper.nodes.recorder.node import record as record_until_end
+    from semantic_mapper.replay.run_folder import prepare_file
 
     prepare_file(log)
     wanted = {

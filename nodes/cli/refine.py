@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.replay.run_folder import map_path, refuse_overwriting
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -58,42 +59,29 @@ def refine(
         raise typer.BadParameter("goes with --weights; without, other classes are smoothed", param_hint="--by-name")
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.nodes.cli.outputs import prepare_file
-    from semantic_mapper.nodes.cli.saved_maps import map_path, refuse_overwriting
-    from semantic_mapper.replay.exporters.map_files import parse_up
-
-    path, direction = map_path(source), parse_up(up)
+    path = map_path(source)
     refuse_overwriting(out, path)
-    prepare_file(out)
-    from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED, SMOOTHING, find_nesf
-    from semantic_mapper.mapping.refine import refine as refine_map
-    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED, SMOOTHING
+    from semantic_mapper.replay.jobs import RefineRequest, refine_map
 
-    voxel_map = VoxelMap.load(path)
-    network = find_nesf(weights, voxel_map.label_set)
     with frame_progress("refine", None, unit="tiles") as bar:
-
-        def on_tile(done: int, total: int) -> None:
-            bar.start(total)
-            bar.set(done)
-
-        report = refine_map(voxel_map, network, fill=fill, up=direction, by_name=by_name, on_tile=on_tile)
-    voxel_map.save(out)
+        result = refine_map(RefineRequest(path, out, weights, fill, up, by_name), bar)
+    report = result.report
     output.print(_table(report))
-    if network.digest != SMOOTHED:
+    if result.weights != SMOOTHED:
         output.print(f"refined by the weights {weights or SHIPPED}")
         if not report.voted:
             output.print("the map had no votes: its classes are guessed from shape and colour")
     elif weights == SMOOTHING:
         output.print("the votes were smoothed, nothing was learned")
     else:
-        output.print(f"no weights ship for label set '{voxel_map.label_set.name}': the votes were smoothed")
+        output.print(f"no weights ship for label set '{result.label_set}': the votes were smoothed")
     relabelled, filled = (100 * count / max(report.surface, 1) for count in (report.relabelled, report.filled))
     output.print(f"{out}: {relabelled:.1f} % of the surface relabelled, {filled:.1f} % filled")
     if report.things is not None:
         output.print(f"{report.things} pieces of things told apart; `query {out} instances` leaves out the smallest")
     if json:
-        output.json(asdict(report) | {"weights": network.digest, "out": str(out)})
+        output.json(asdict(report) | {"weights": result.weights, "out": str(out)})
 
 
 def _table(report: RefineReport) -> Table:

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress
 
 _NAMED = 10  # frames that cannot be read
 
@@ -31,7 +31,7 @@ def relocalize(
     Example: semantic-mapper relocalize runs/yesterday today.mcap
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.saved_maps import map_path
+    from semantic_mapper.replay.run_folder import map_path
 
     map_file = map_path(saved)
     must_be_there(log)

@@ -19,19 +19,14 @@ KeysOption = Annotated[
 ]
 
 
-def default_folder() -> Path:
-    """Where this user's keys lie unless set otherwise."""
-    return Path(typer.get_app_dir("semantic-mapper")) / "keys"
-
-
 def server_identity(server: str, keys: Path | None) -> ServerIdentity | None:
     """Whom to expect at the other end; None where no server is named.
 
     Raises:
         TransportError: no keys.
     """
-    from semantic_mapper.transport.keys import ServerIdentity, load_keys
+    from semantic_mapper.transport.keys import ServerIdentity, load_keys, user_key_folder
 
     if not server:
         return None
-    return ServerIdentity(load_keys(keys or default_folder()), server)
+    return ServerIdentity(load_keys(keys or user_key_folder()), server)

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.verb import EXIT_UNTRUSTED, must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.summary import dig
+from semantic_mapper.replay.summary import dig, notes, result_lines, summary_table
 
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")]
 WeightsOption = Annotated[
@@ -92,22 +92,28 @@ def replay(
     """
     must_be_there(*log)
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, ReplayRequest, mapper_config, replay_log
-    from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
+    from semantic_mapper.config import load_mapper_config
+    from semantic_mapper.replay.jobs import OFFLINE, ReplayRequest, replay_log
 
-    settings = mapper_config(config, voxel_size, seed, quality, depth, REPLAY_DELAY_FRAMES)
+    given = {"voxel_map.voxel_size_m": voxel_size, "seed": seed, "quality": quality, "depth.source": depth}
+    settings = load_mapper_config(config, given, OFFLINE)
     request = ReplayRequest(
         log[0], out, weights, settings, max_frames, eval_exclude, rerun, corrections, tuple(log[1:])
     )
     with StopRequest() as stop:
-        with frame_progress("replay", None) as bar:
-            summary = replay_log(request, stop, bar.start, bar.set)
+        with frame_progress("replay", None, stop=stop) as bar:
+            summary = replay_log(request, bar).summary
         if json:
             output.json(summary)
         else:
-            output.print(summary_table({out.name: summary}))
-            for line in (*notes(summary), *result_lines(out)):
-                output.print(line)
+            show_replay(output, summary, out)
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
         return map_exit_code(summary, stop, accept_contradictions)
+
+
+def show_replay(output: Output, summary: Mapping[str, Any], out: Path) -> None:
+    """Table, notes and files of one replay, for people."""
+    output.print(summary_table({out.name: summary}))
+    for line in (*notes(summary), *result_lines(out)):
+        output.print(line)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
 
 if TYPE_CHECKING:
-    from semantic_mapper.nodes.cli.top_table import LaunchView
+    from semantic_mapper.nodes.launcher.launch_view import LaunchView
     from semantic_mapper.transport.sockets import NewestSubscriber
 
 ANSWER_S = 5.0  # how long the launcher may take to say anything
@@ -51,7 +51,7 @@ def top(
     if json and not once:
         raise typer.BadParameter("--json goes with --once")
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.top_table import LaunchView
+    from semantic_mapper.nodes.launcher.launch_view import LaunchView
     from semantic_mapper.nodes.launcher.running import status_endpoint
     from semantic_mapper.transport.sockets import NewestSubscriber
 

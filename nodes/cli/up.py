@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 
@@ -45,12 +45,12 @@ def up(
     Example: semantic-mapper up camera --set camera.kind=oak
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.outputs import hold_folder
-    from semantic_mapper.nodes.cli.results import print_results
+    from semantic_mapper.nodes.cli.eval import print_results
     from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
     from semantic_mapper.nodes.launcher.launcher import Launcher
     from semantic_mapper.nodes.launcher.systemd import Notifier
     from semantic_mapper.nodes.options import MapperOptions
+    from semantic_mapper.replay.run_folder import hold_folder
 
     checked = load_launch(find_launch(launch), settings or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]

@@ -18,7 +18,7 @@ import typer
 from rich.text import Text
 
 from semantic_mapper.errors import LogError, SemanticMapperError
-from semantic_mapper.nodes.cli.console import stderr_console
+from semantic_mapper.nodes.console import stderr_console
 from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.process import prepare_process
 from semantic_mapper.plain_text import visible

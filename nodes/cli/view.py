@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Self
 import typer
 
 from semantic_mapper.errors import ConfigError, TransportError
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.replay import ConfigOption, MaxFramesOption, WeightsOption
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.process import StopRequest
 
 if TYPE_CHECKING:
@@ -137,14 +137,14 @@ class _Page:
 
 
 def _is_log(source: str) -> bool:
-    from semantic_mapper.nodes.cli.saved_maps import is_log
+    from semantic_mapper.replay.run_folder import is_log
 
     return bool(source) and is_log(Path(source))
 
 
 def _saved_map(path: Path, source: str) -> Path | None:
     """The file of a saved map, where the source is one."""
-    from semantic_mapper.nodes.cli.saved_maps import is_map, map_path
+    from semantic_mapper.replay.run_folder import is_map, map_path
 
     return map_path(path) if source and is_map(path) else None
 
@@ -176,10 +176,10 @@ def _show_log(
     refresh: float,
     stop: StopRequest,
 ) -> None:
-    from semantic_mapper.nodes.cli.run_replay import mapper_config
+    from semantic_mapper.config import load_mapper_config
     from semantic_mapper.nodes.viewer.mapped_log import show_log
 
-    settings = mapper_config(config, None)
+    settings = load_mapper_config(config)
     with frame_progress("map", None) as bar:
         show_log(
             path,

@@ -9,9 +9,9 @@ import typer
 from msgspec import to_builtins
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:

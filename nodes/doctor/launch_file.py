@@ -7,12 +7,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.nodes.cli.remote import default_folder
 from semantic_mapper.nodes.doctor.check import Check, failed
 from semantic_mapper.nodes.doctor.launch_nodes import node_settings
 from semantic_mapper.nodes.doctor.robot import port_is_taken
 from semantic_mapper.nodes.launcher.launch_file import Launch, load_launch
 from semantic_mapper.nodes.options import FoxgloveOptions, MapperOptions
+from semantic_mapper.transport.endpoints import check_bind
+from semantic_mapper.transport.keys import load_keys, user_key_folder
 
 
 def launch_file(path: Path, settings: Sequence[str]) -> Iterator[Check]:
@@ -38,7 +39,7 @@ def launch_file(path: Path, settings: Sequence[str]) -> Iterator[Check]:
 
 def own_keys() -> Iterator[Check]:
     """Those of this user, where there are any."""
-    folder = default_folder()
+    folder = user_key_folder()
     if folder.exists():
         yield keys_in(folder)
     else:
@@ -47,8 +48,6 @@ def own_keys() -> Iterator[Check]:
 
 def keys_in(folder: Path) -> Check:
     """Whether the keys of a folder, and those of all peers, can be used."""
-    from semantic_mapper.transport.keys import load_keys
-
     try:
         peers = load_keys(folder).peers()
     except SemanticMapperError as error:
@@ -72,9 +71,6 @@ def _listening(launch: Launch) -> list[tuple[str, str]]:
 
 
 def _address(endpoint: str, folder: str) -> Check:
-    from semantic_mapper.transport.endpoints import check_bind
-    from semantic_mapper.transport.keys import load_keys
-
     try:
         check_bind(endpoint, load_keys(Path(folder).expanduser()) if folder else None)
     except SemanticMapperError as error:

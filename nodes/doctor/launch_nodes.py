@@ -49,9 +49,10 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
                 check_world(entry.name, live)
             return f"{_connected(live)}; its settings and poses"
         case MapperOptions() as options:
-            from semantic_mapper.nodes.cli.run_replay import mapper_config
+            from semantic_mapper.config import load_mapper_config
 
-            mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
+            path = Path(options.config) if options.config else None
+            load_mapper_config(path, {"voxel_map.voxel_size_m": options.voxel_size_m or None})
             return _weights(options.weights)
         case FinetunerOptions() as options:
             from semantic_mapper.config import load_config

@@ -18,8 +18,8 @@ from semantic_mapper.config import Config, convert_config
 from semantic_mapper.errors import CodecError, ConfigError, SemanticMapperError
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.cli.outputs import free_name
 from semantic_mapper.nodes.options import Count
+from semantic_mapper.replay.run_folder import free_name
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
 from semantic_mapper.transport.codec import decode_as, encode, pack_parts, unpack_parts
 from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, LabelledKeyframe, digest_of

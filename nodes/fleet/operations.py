@@ -17,6 +17,7 @@ from semantic_mapper.config import (
     Fraction,
     MapperConfig,
     NotNegative,
+    assign,
     check_quality,
     convert_config,
     read_toml,
@@ -24,9 +25,7 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.segments import Segments
-from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES
 from semantic_mapper.nodes.fleet.results import ClassRow, EventRow, Findings, SegmentRow
-from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.training.finetune import FinetuneConfig
 
 if TYPE_CHECKING:
@@ -209,14 +208,15 @@ def run_operation(operation: str, job: Job) -> Findings:
 
 
 def _replay(job: Job) -> Findings:
-    from semantic_mapper.nodes.cli.report import REPORT_NAME
-    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, replay_session
+    from semantic_mapper.replay.artifacts import REPORT_NAME
+    from semantic_mapper.replay.jobs import ReplayRequest, replay_log
     from semantic_mapper.replay.summary import dig
 
     settings: ReplaySettings = job.settings
     config = _with_delay(settings.mapper)
     request = ReplayRequest(job.log, job.out, job.weights, config, settings.max_frames)
-    summary, session = replay_session(request, StopRequest(), _unheard, _unheard)
+    result = replay_log(request)
+    summary, session = result.summary, result.session
     metrics = {name: _number(dig(summary, f"metrics.{name}")) for name in _SCORES}
     metrics |= {f"frames_{name}": _number(count) for name, count in summary["frames"].items()}
     for name in ("surface_points", "blocks", "cleared_voxels", "unknown"):
@@ -241,20 +241,12 @@ _SCORES = ("miou", "total_accuracy", "average_accuracy", "coverage", "map_miou")
 
 def _eval(job: Job) -> Findings:
     from semantic_mapper.files import write_json
-    from semantic_mapper.nodes.cli.report import write_eval_report
-    from semantic_mapper.nodes.cli.scoring import ScoreRequest, evaluate_log, score_table
+    from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
+    from semantic_mapper.replay.jobs import EvaluateRequest, evaluate_log
 
     settings: EvalSettings = job.settings
-    request = ScoreRequest(
-        log=job.log,
-        weights=job.weights,
-        baselines=False,
-        seconds=0.0,
-        max_frames=settings.max_frames,
-        config=settings.mapper,
-        seed=settings.mapper.seed,
-    )
-    scores, evaluation = evaluate_log(request)
+    result = evaluate_log(EvaluateRequest(job.log, job.weights, settings.mapper, settings.max_frames))
+    scores, evaluation = result.scores, result.evaluation
     name = job.log.name
     found: dict[str, Any] = {"replays": {}, "logs": {name: scores}}
     write_json(job.out / "eval.json", found)
@@ -275,7 +267,7 @@ def _eval(job: Job) -> Findings:
 
 
 def _autolabel(job: Job) -> Findings:
-    from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel
+    from semantic_mapper.replay.jobs import AutolabelRequest, autolabel_log
 
     settings: AutolabelSettings = job.settings
     request = AutolabelRequest(
@@ -288,7 +280,7 @@ def _autolabel(job: Job) -> Findings:
         settings.overwrite_labels,
         settings.max_frames,
     )
-    report = autolabel(request, lambda: False, _unheard, _unheard)
+    report = autolabel_log(request)
     note = report.note
     names = (
         "frames",
@@ -306,24 +298,19 @@ def _autolabel(job: Job) -> Findings:
 
 
 def _finetune(job: Job) -> Findings:
-    from semantic_mapper.config import DepthConfig
-    from semantic_mapper.nodes.cli.console import frame_progress
-    from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_log
+    from semantic_mapper.replay.jobs import FinetuneRequest, finetune_log
 
     settings: FinetuneSettings = job.settings
     request = FinetuneRequest(
         job.log,
-        0 if settings.kind == "grid" else settings.keyframes,  # a grid learns no classes
         job.out / "weights.safetensors",
-        settings.fit,
-        None if settings.kind else job.weights,
-        from_scratch=False,
-        depth=DepthConfig(source="sensor"),
+        keyframes=0 if settings.kind == "grid" else settings.keyframes,  # a grid learns no classes
+        config=settings.fit,
+        weights=None if settings.kind else job.weights,
         kind=settings.kind or None,
     )
-    with frame_progress("finetune", None) as bar:
-        checkpoint, chosen = finetune_log(request, StopRequest(), bar)
-    recipe = checkpoint.recipe
+    result = finetune_log(request)
+    recipe, chosen = result.checkpoint.recipe, result.chosen
     names = ("steps", "best_step", "held_out_loss", "held_out_accuracy", "psnr")
     metrics = {name: _number(recipe[name]) for name in names if name in recipe}
     events = (EventRow("keyframes", ", ".join(map(str, chosen))),)
@@ -331,16 +318,11 @@ def _finetune(job: Job) -> Findings:
 
 
 def _refine(job: Job) -> Findings:
-    from semantic_mapper.fields.nesf import find_nesf
-    from semantic_mapper.mapping.refine import refine
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.replay.exporters.map_files import parse_up
+    from semantic_mapper.replay.jobs import RefineRequest, refine_map
 
     settings: RefineSettings = job.settings
-    voxel_map = VoxelMap.load(job.log)
-    network = find_nesf(job.weights, voxel_map.label_set)
-    report = refine(voxel_map, network, fill=settings.fill, up=parse_up(settings.up), by_name=settings.by_name)
-    voxel_map.save(job.out / "map.npz")
+    request = RefineRequest(job.log, job.out / "map.npz", job.weights, settings.fill, settings.up, settings.by_name)
+    report = refine_map(request).report
     metrics = {name: _number(getattr(report, name)) for name in ("surface", "relabelled", "filled", "things")}
     return Findings(metrics=metrics)
 
@@ -356,15 +338,19 @@ OPERATIONS: Mapping[str, Operation] = {
 
 def _with_delay(config: MapperConfig) -> MapperConfig:
     """As ``replay`` has it: nobody waits for the map of a log, so that computed depth may wait for later frames."""
+    from semantic_mapper.replay.jobs import OFFLINE
+
     if config.depth.from_motion.delay_frames:
         return config
-    from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=REPLAY_DELAY_FRAMES)
-    return msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, from_motion=from_motion))
+    data: dict[str, Any] = to_plain(config)
+    for name, value in OFFLINE.items():
+        assign(data, name, value, "mapper")
+    return convert_config(data, MapperConfig, "mapper")
 
 
 def _events(summary: Mapping[str, Any]) -> tuple[EventRow, ...]:
     """What a person may want to look at in a replay."""
-    from semantic_mapper.nodes.cli.summary_table import notes
+    from semantic_mapper.replay.summary import notes
 
     events = [EventRow("note", text) for text in notes(summary)]
     events += [EventRow("damaged", text) for text in summary["damaged_stretches"]]
@@ -395,7 +381,3 @@ def _write_thumbnail(session: MapSession, out: Path) -> str:
 
 def _number(value: Any) -> float | None:
     return None if value is None else float(value)
-
-
-def _unheard(count: int) -> None:
-    """Progress inside of a log is not shown: whole logs are counted."""

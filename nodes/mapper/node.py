@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import structlog
 
+from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import give_back_freed_memory
 from semantic_mapper.nodes.frame_gaps import Gaps
@@ -47,22 +48,22 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     from semantic_mapper.fields.checkpoint import load_checkpoint
     from semantic_mapper.mapper import Mapper
     from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.nodes.cli.outputs import prepare_folder
-    from semantic_mapper.nodes.cli.run_replay import mapper_config
-    from semantic_mapper.nodes.cli.saved_maps import MAP_NAME, map_path
     from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
     from semantic_mapper.nodes.mapper.live_weights import taking_weights
     from semantic_mapper.nodes.mapper.resume import go_on, stored_settings, take_up
     from semantic_mapper.nodes.public_publisher import PublicPublisher
+    from semantic_mapper.replay.run_folder import MAP_NAME, map_path, prepare_folder
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 
     prepare_folder(Path(options.out))
-    config = mapper_config(
+    config = load_mapper_config(
         Path(options.config) if options.config else None,
-        options.voxel_size_m or None,
-        depth=options.depth or None,
-        live=options.delivery == "newest",
-        history_frames=options.history_frames,
+        {
+            "voxel_map.voxel_size_m": options.voxel_size_m or None,
+            "depth.source": options.depth or None,
+            "depth.refine_in_background": options.delivery == "newest" or None,
+        },
+        {"history.max_frames": options.history_frames},
     )
     saved = None
     if options.map:
@@ -129,8 +130,8 @@ def _answering(
 
 
 def _saving(options: MapperOptions, bundle: Mapper) -> Autosave | None:
-    from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
     from semantic_mapper.nodes.mapper.autosave import Autosave
+    from semantic_mapper.replay.run_folder import MAP_NAME
 
     if not options.save_every_s:
         return None
@@ -219,7 +220,7 @@ class _Mapper:
 
     def finish(self) -> None:
         """Write what there is."""
-        from semantic_mapper.nodes.mapper.finish import finish_session
+        from semantic_mapper.replay.artifacts import finish_session
         from semantic_mapper.replay.session import MapSession
 
         if self._session is None:
@@ -267,9 +268,9 @@ class _Mapper:
             _log.error("results_not_written", reason=str(second), after=str(error))
 
     def _begin(self, info: StreamInfo) -> None:
-        from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
         from semantic_mapper.nodes.mapper.resume import keep_earlier, noted_worlds
         from semantic_mapper.replay.artifacts import clear_results
+        from semantic_mapper.replay.run_folder import MAP_NAME
         from semantic_mapper.replay.session import MapSession, open_recording
 
         # A stream is announced again to a newcomer, or by a restarted camera; or another camera begins.

@@ -15,8 +15,8 @@ from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.outputs import free_name
 from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.replay.run_folder import free_name
 from semantic_mapper.types import Float64
 
 _EARLIER, _UNSOUND, _WORLDS = "earlier", "unsound", "worlds"  # notes

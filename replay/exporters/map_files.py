@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from semantic_mapper.config import read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
+from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.formats import (
     ColorBy,
@@ -108,6 +109,36 @@ def format_of(path: Path, given: str | None) -> Format:
             f"{'|'.join(get_args(Format))}"
         )
     return SUFFIXES[path.suffix.lower()]
+
+
+def parse_transform(text: str) -> Float64:
+    """``"x y z yaw_deg"``, or the name of a text file that holds a rigid (4, 4) row by row.
+
+    Raises:
+        ConfigError: neither of these.
+        PoseError: the file holds something else than a rigid transform.
+    """
+    words = text.replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return _read_transform(Path(text))
+    if len(numbers) != 4 or not np.isfinite(numbers).all():
+        raise ConfigError(f"--transform '{text}': expected four numbers, x y z in metres and yaw in degrees")
+    return yaw_transform(np.array(numbers[:3]), numbers[3])
+
+
+def _read_transform(path: Path) -> Float64:
+    try:
+        T = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except FileNotFoundError as error:
+        raise ConfigError(f'--transform {path}: neither "x y z yaw_deg" nor a file') from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--transform {path}: cannot be read as numbers: {error}") from error
+    if T.shape != (4, 4):
+        raise ConfigError(f"--transform {path}: expected 4 rows of 4 numbers, got {T.shape[0]} of {T.shape[1]}")
+    check_pose(T, str(path))
+    return T
 
 
 def parse_up(text: str) -> Float64 | None:

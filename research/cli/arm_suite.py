@@ -19,9 +19,9 @@ from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.files import write_json
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.outputs import prepare_file
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.run_folder import prepare_file
 
 ArmT = TypeVar("ArmT")
 ConfigT = TypeVar("ConfigT", bound=Config)

@@ -15,8 +15,8 @@ from research.bench.walk import SLOPE_MINUTES, WalkPlan, bench_walk
 from semantic_mapper.config import MapperConfig, load_config
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.files import write_json
-from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plots import write_picture
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Measure speed, as ratios within one run.")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+
+from rich.table import Table
 
 from research.cli.suite_table import difference_lines, map_rows_table, rows_table, suite_table
 from research.evaluation.sheet import draw_sheet
@@ -38,11 +41,11 @@ from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.fields.nesf import NesfWeights, find_nesf, smoothed_votes
 from semantic_mapper.files import write_json
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.outputs import prepare_file
-from semantic_mapper.nodes.cli.report import write_suite_report
+from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plots import cannot_draw, write_picture
+from semantic_mapper.replay.page import Section, picture_files, write_page
+from semantic_mapper.replay.run_folder import prepare_file
 
 PACKAGES = ("torch", "numpy")
 
@@ -331,3 +334,14 @@ def _fit_title(suite: SuiteConfig) -> str:
     more = f" and {scene.unlabelled} without labels" if scene.unlabelled else ""
     known = "" if scene.labelled_sources else ", labels kept back"
     return f"{scene.keyframes} keyframes{more}{known}, {budget}, {suite.views} views"
+
+
+def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures: Sequence[Path], found: Any) -> None:
+    """Write the report of a benchmark run with its pictures.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    figures = Section(tables=[table], lines=lines)
+    drawn = Section(pictures=list(picture_files(*((path, path.name) for path in pictures))))
+    write_page(path, found["title"], [figures, drawn, Section(folded={"All figures": json.dumps(found, indent=1)})])

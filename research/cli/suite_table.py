@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from semantic_mapper.nodes.cli.summary_table import percent
+from semantic_mapper.replay.summary import percent
 
 STILL_RISING = 0.01  # of mIoU in the last interval of a curve
 

@@ -9,9 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.fleet_run import TrustedOption
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 
 
@@ -34,23 +33,13 @@ def train(
     ] = None,
     encoder: Annotated[Path | None, typer.Option(help="Weights of any kind whose image encoder to take over.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store weights as float16, for shipping.")] = False,
-    ray: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS", help="Train on a Ray cluster: HOST:PORT, auto, or local for one of this machine alone."
-        ),
-    ] = None,
-    trusted_network: TrustedOption = False,
-    ranks: Annotated[int, typer.Option(min=1, help="With --ray: processes that train, each on a GPU of its own.")] = 1,
-    cpus_per_rank: Annotated[int, typer.Option(min=1, help="With --ray: cores of each of these processes.")] = 1,
 ) -> int:
     """Train a field on procedural rooms, which are rendered as it goes.
 
     Keeps the weights that were best on the validation rooms, or with keep = "last" in the TOML file, as some recipes
     have it, those of the last validation. Beside them it writes its state, its history (history.jsonl) and its curves
     (curves.png). Ctrl-C saves the state and the weights kept so far (exit code 130); the same command with --resume
-    goes on. A run in --out is never overwritten. Start it with torchrun to use several GPUs, or with --ray to use those
-    of several machines: lost processes are replaced, and rooms are rendered on any of these machines.
+    goes on. A run in --out is never overwritten. Start it with torchrun to use several GPUs.
 
     With --kind nesf, or a TOML file that says so, the network of `refine` is trained, on maps of procedural rooms or
     of the labelled logs that the file names.
@@ -71,14 +60,11 @@ def train(
     if kind == MAP_KIND or (kind is None and config is not None and _kind_of(config) == MAP_KIND):
         from research.cli.train_nesf import train_on_maps
 
-        if workers or weights or encoder or ray or ranks > 1 or cpus_per_rank > 1 or trusted_network:
+        if workers or weights or encoder:
             raise ConfigError(
-                "--workers, --weights, --encoder, --ray and its options are for fields; --kind nesf starts from random "
-                "weights, in one process"
+                "--workers, --weights and --encoder are for fields; --kind nesf starts from random weights"
             )
         return train_on_maps(output, config, out, resume=resume, seconds=seconds, steps=steps, seed=seed)
-    if ray is None and (ranks > 1 or cpus_per_rank > 1 or trusted_network):
-        raise ConfigError("--ranks, --cpus-per-rank and --trusted-network need --ray; torchrun has --nproc_per_node")
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
     start = None if weights is None else str(weights)
     given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers, "start": start, "kind": kind}
@@ -88,8 +74,6 @@ def train(
     is_file = out.suffix == ".safetensors"
     folder = out.with_name(f"{out.stem}-training") if is_file else out
     here = ranks_from_environment()
-    if ray is not None and here.world > 1:
-        raise ConfigError("--ray starts its ranks itself; run it without torchrun")
     keep_freed_memory()
     # torchrun hands on Ctrl-C and then asks once more in its own way: both mean the same.
     with StopRequest(patient=here.world > 1) as stop, frame_progress("training", None, unit="%") as bar:
@@ -100,22 +84,7 @@ def train(
             score = "" if progress.scores is None else f" mIoU {progress.scores.miou * 100:.1f} %"
             bar.set(int(progress.fraction * 100), f"step {progress.step}{loss}{score}")
 
-        if ray is None:
-            checkpoint = train_here(settings, folder, resume=resume, on_progress=on_progress, stopped=lambda: stop)
-        else:
-            from research.train.ray_ranks import train_on_ray
-            from semantic_mapper.nodes.fleet.cluster import connected
-
-            with connected(ray, trusted_network=trusted_network):
-                checkpoint = train_on_ray(
-                    settings,
-                    folder,
-                    ranks=ranks,
-                    cpus_per_rank=cpus_per_rank,
-                    resume=resume,
-                    on_progress=on_progress,
-                    stopped=lambda: stop,
-                )
+        checkpoint = train_here(settings, folder, resume=resume, on_progress=on_progress, stopped=lambda: stop)
     if here.first:
         file = out if is_file else out / WEIGHTS_FILE
         save_checkpoint(checkpoint, file, half=half)

@@ -11,7 +11,7 @@ from semantic_mapper.config import convert_config, load_config, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, find_checkpoint, load_checkpoint
 from semantic_mapper.fields.nesf import save_nesf
-from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 
 WEIGHTS_FILE = "weights.safetensors"

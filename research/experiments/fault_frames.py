@@ -16,6 +16,7 @@ import pytest
 
 from research.experiments.fault_table import Outcome
 from research.experiments.long_log import INTRINSICS, distinct_frames
+from semantic_mapper.config import load_mapper_config
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses.config import DevicePoses, FixedPose
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
@@ -23,7 +24,6 @@ from semantic_mapper.drivers.poses.sources import make_poses
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
@@ -142,7 +142,7 @@ def _image(frame: PosedFrame) -> CameraImage:
 
 def _map_of(weights: str, config: str, images: Iterable[CameraImage]) -> tuple[list[bytes], dict[str, int]]:
     """The map's surface points as bytes, and what the posed camera has counted."""
-    bundle = Mapper.load(Path(weights) if weights else None, mapper_config(Path(config) if config else None, None))
+    bundle = Mapper.load(Path(weights) if weights else None, load_mapper_config(Path(config) if config else None))
     session = MapSession(bundle, stream_labels=None)
     camera = PosedCamera(_ListCamera(images), make_poses(DevicePoses()))
     with camera:

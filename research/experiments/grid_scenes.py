@@ -1,29 +1,20 @@
-"""Scenes for `research.experiments.scene_grid`: matte objects on a grey floor before white, and a street."""
+"""Scenes for `research.experiments.scene_grid`: matte objects on a grey floor before white."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from research.experiments.street import camera_of_width
-from research.scenes.config import NoiseConfig
 from research.scenes.materials import Material, Pattern, material_table
 from research.scenes.primitives import Assembly, pack, place_parts
 from research.scenes.render import render_view
 from research.scenes.scene import Lights, Scene, extremes, shadow_cubes
-from research.scenes.shots import sequence_shots
-from research.scenes.streets.drive import ORIGIN_M, STEP_M, drive, make_street, render_street
 from semantic_mapper.geometry import look_at
-from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 BOX_M = (-4.1, -4.1, -0.2, 4.1, 4.1, 3.0)  # that the objects stand in
 RADIUS_M = 11.3  # of the sphere that cameras stand on
 SIDE_PX = 72
 FOCAL_PX = 79.0  # the box fills the image
-
-STREET_WIDTH_PX = 352
-_AROUND_M = ((-5.0, -16.0, -1.0), (75.0, 16.0, 13.0))  # what the street's first 50 m show
-STREET_BOX_M = tuple(float(o + d) for corner in _AROUND_M for o, d in zip(ORIGIN_M, corner, strict=True))
 
 
 def objects_scene(seed: int) -> Scene:
@@ -72,16 +63,3 @@ def _frame(scene: Scene, k: CameraIntrinsics, T_world_camera: Float64, number: i
     view = render_view(scene, k, T_world_camera)
     rgb = np.where(view.exact_depth_m[..., None] > 0, view.rgb, np.uint8(255))
     return PosedFrame(number * 10**8, number, "objects", rgb, None, view.label, k, T_world_camera)
-
-
-def street_frames(seed: int, count: int) -> list[PosedFrame]:
-    """A drive down a street, without depth."""
-    k = camera_of_width(STREET_WIDTH_PX)
-    street, noise = make_street(seed, count * STEP_M, LABELS), NoiseConfig()
-    poses = drive(street, count)
-    shots = sequence_shots(poses, seed, noise)
-    frames: list[PosedFrame] = []
-    for i, pose in enumerate(poses):
-        view = render_street(street, k, pose, shots[i], noise, i)
-        frames.append(PosedFrame(i * 10**8, i, "street", view.rgb, None, None, k, pose))
-    return frames

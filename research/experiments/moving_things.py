@@ -27,7 +27,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from research.experiments.ghosts import Thing, place_thing, sees_through, with_thing
+from research.experiments.put_things import Thing, place_thing, sees_through, with_thing
 from research.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig, RoomConfig, room_views
 from research.scenes.moving import make_moving_room, moving_views
 from research.scenes.primitives import PERSON

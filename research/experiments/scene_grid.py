@@ -1,6 +1,6 @@
 """Fit scene grids: held-out PSNR, CPU time and memory, on one thread.
 
-objects: 70 views of 72x72 of matte objects before white. street: 48 views of 352x94, with a trunk. rooms: 40 frames
+objects: 70 views of 72x72 of matte objects before white. rooms: 40 frames
 with depth, beside semantic_nerf at the same CPU time.
 
 Example: python -m research.experiments.scene_grid objects --scenes 4 --out runs/grid
@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 import torch
 
-from research.experiments.grid_scenes import BOX_M, STREET_BOX_M, object_frames, objects_scene, street_frames
+from research.experiments.grid_scenes import BOX_M, object_frames, objects_scene
 from research.peers.semantic_nerf import config_for_scene
 from research.scenes import VALIDATION_SEEDS, NoiseConfig
 from research.scenes.sequence import room_views
@@ -60,23 +60,6 @@ def measure_objects(seed: int, out: Path | None, settings: GridFitConfig) -> str
     _picture(out, f"objects-{seed}", held_out, renders)
     bits = hashlib.sha256(fit.grid.values.detach().numpy().tobytes()).hexdigest()[:12]
     return f"| objects {seed} | {_psnr(held_out, renders):.1f} | {seconds:.1f} | {_memory()} | {bits} |"
-
-
-def measure_street(seed: int, out: Path | None, settings: GridFitConfig) -> str:
-    """Fit 43 of 48 views of a street with a trunk."""
-    frames = street_frames(seed, 48)
-    held_out, seen = frames[7::10], [f for i, f in enumerate(frames) if i % 10 != 7]
-    grid = msgspec.structs.replace(settings, box_m=STREET_BOX_M, voxel_m=0.25, near_m=0.5, held_out=0)
-    start = build_field("grid", {"features": 16}, ROOMS)
-    began = time.process_time()
-    config = FinetuneConfig(seconds=0, steps=grid.steps, width=352, grid=grid)
-    field = fit_scene(seen, ROOMS, start, config).model
-    seconds, memory = time.process_time() - began, _memory()  # of the fit
-    renders = [_render(field, f) for f in held_out]
-    _picture(out, f"street-{seed}", held_out, renders)
-    voxels = int(np.prod(field.config.grid.shape))
-    name, psnr = f"street {seed}, {voxels / 1e6:.1f} M voxels", _psnr(held_out, renders, gain=True)
-    return f"| {name} | {psnr:.1f} | {seconds:.1f} | {memory} | |"
 
 
 def measure_room(seed: int, out: Path | None, settings: GridFitConfig) -> list[str]:
@@ -174,7 +157,7 @@ def _picture(
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("objects", "street", "rooms"))
+    parser.add_argument("what", choices=("objects", "rooms"))
     parser.add_argument("--scenes", type=int, default=1)
     parser.add_argument("--steps", type=int, default=GridFitConfig().steps)
     parser.add_argument("--out", type=Path, help="folder for pictures: truth, render, depth")
@@ -188,7 +171,7 @@ def main() -> None:
             print("\n".join(measure_room(seed, args.out, settings)), flush=True)
         return
     print("| scene | PSNR, dB | CPU s | peak memory | digest |\n|---|---|---|---|---|")
-    measure = measure_objects if args.what == "objects" else measure_street
+    measure = measure_objects
     for seed in range(1, args.scenes + 1):
         print(measure(seed, args.out, settings), flush=True)
 

@@ -20,8 +20,8 @@ from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)
-DEPTH_STEP_M = 0.004  # steps in which depth is stored: 1 to 4 mm of noise compress badly
-SMALL = CodecOptions(rgb="jpeg", jpeg_quality=90, zstd_level=19)
+DEPTH_STEP_M = 0.008  # steps in which depth is stored: finer noise compresses badly
+SMALL = CodecOptions(rgb="jpeg", jpeg_quality=85)
 
 
 def write_room_log(path: Path, room: int, count: int) -> None:
@@ -47,4 +47,4 @@ def write_room_log(path: Path, room: int, count: int) -> None:
 
 
 if __name__ == "__main__":
-    write_room_log(Path(sys.argv[1]), room=0, count=40)
+    write_room_log(Path(sys.argv[1]), room=0, count=24)

@@ -34,6 +34,12 @@ _lock = threading.Lock()
 _authenticators: weakref.WeakKeyDictionary[Any, ThreadAuthenticator] = weakref.WeakKeyDictionary()
 
 
+def user_key_folder() -> Path:
+    """Where this user's keys lie unless set otherwise."""
+    config = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
+    return Path(config).expanduser() / "semantic-mapper" / "keys"
+
+
 @dataclass(frozen=True, slots=True)
 class Keys:
     """Keys of this machine; see ``load_keys``.

@@ -41,7 +41,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli
-from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore, Progress
 from semantic_mapper.nodes.launcher.launch_file import LaunchFile, NodeEntry, load_launch
 from semantic_mapper.nodes.mapper.query_service import QueryService

@@ -117,6 +117,7 @@ def test_two_replays_are_equal_bit_for_bit(room_run: Path, tmp_path: Path) -> No
         assert one[part] == other[part]
 
 
+@pytest.mark.gate
 @pytest.mark.slow
 def test_lockstep_processes_make_the_map_of_one_process_bit_for_bit(room_run: Path, tmp_path: Path) -> None:
     values = {"camera.log": LOG, "mapper.weights": WEIGHTS, "mapper.config": room_run.parent / "room.toml"}

@@ -100,6 +100,7 @@ def test_weights_of_the_package_render_what_they_rendered(weights: str, tmp_path
     assert unlike(read("weights")["rendered"][Path(weights).stem], rendered(weights, tmp_path), ROUNDING) == []
 
 
+@pytest.mark.gate
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", FITTED)
 def test_twenty_steps_of_each_kind_fit_what_they_fitted(kind: str, tmp_path: Path) -> None:

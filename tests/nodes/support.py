@@ -23,7 +23,7 @@ from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli import main as cli
-from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_depth import grid_of_depth

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from research.train.folder_lock import LOCK_FILE, sole_use_of
-from semantic_mapper.nodes.cli.outputs import hold_folder
 from semantic_mapper.replay.log.atomic_file import AtomicFile
+from semantic_mapper.replay.run_folder import hold_folder
 from tests.nodes.support import run_here
 
 RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html")

@@ -64,7 +64,7 @@ print(json.dumps([os.environ["OMP_NUM_THREADS"], "torch" in sys.modules]))
 def test_stray_prints_never_reach_stdout() -> None:
     code = """
 import atexit, ctypes, os
-from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.console import Output
 output = Output.guarded()
 print("python print")
 os.write(1, b"raw write\\n")

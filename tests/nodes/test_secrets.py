@@ -11,9 +11,9 @@ import structlog
 from rich.table import Table
 
 from semantic_mapper.files import write_json
-from semantic_mapper.nodes.cli.console import Output
-from semantic_mapper.nodes.cli.report import Section, table_of, write_page
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import prepare_process
+from semantic_mapper.replay.page import Section, table_of, write_page
 from tests.nodes.support import run_here
 
 SECRET = "wJalrXUtnFEMIbPxRfiCYEXAMPLEKEY"

@@ -12,6 +12,7 @@ from semantic_mapper.config import MapperConfig
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.compare import Run
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import PosedFrame
@@ -55,5 +56,5 @@ def replayed(
     session = MapSession(Mapper.load(weights, config or tiny_config()), stream_labels=ROOMS, source="test")
     for frame in frames:
         session.process(frame)
-    summary = session.finish(out)
+    summary = finish_session(session, out)
     return Run(str(out), session.pipeline.voxel_map, summary), summary

@@ -15,7 +15,7 @@ from semantic_mapper.fields.primitive_rays import PrimitiveSet
 from semantic_mapper.fields.primitives import Primitive, resized
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.labels import ROOMS, make_label_set
-from semantic_mapper.nodes.cli.map_answers import answer_instances
+from semantic_mapper.nodes.map_answers import answer_instances
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.replay.box_values import BoxFile
@@ -214,7 +214,7 @@ def test_an_outline_or_mesh_is_where_it_is_drawn_wherever_its_origin_is(tmp_path
 
 
 def test_the_example_of_the_docs_is_a_file_of_boxes(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "panoptic.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text()
     (tmp_path / "boxes.json").write_text(text.split("```json")[1].split("```")[0])
     car, road = load_boxes(tmp_path / "boxes.json").primitives
     assert (car.thing, road.thing) == (True, False)

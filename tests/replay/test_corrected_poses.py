@@ -15,6 +15,7 @@ from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import Float64, PosedFrame
@@ -60,8 +61,8 @@ def test_the_map_and_the_truth_that_it_is_scored_against_move_with_the_trajector
         at = session.pipeline.corrector.poses()["rooms", frame.stamp_ns]
         np.testing.assert_allclose(at, frame.T_world_camera, atol=1e-6)
     np.testing.assert_allclose(np.median(before, axis=0) - np.median(after, axis=0), [0.5, 0, 0], atol=0.02)
-    summary = session.finish(tmp_path / "out")
-    straight = session_of(tmp_path, list(frames)).finish(tmp_path / "straight")
+    summary = finish_session(session, tmp_path / "out")
+    straight = finish_session(session_of(tmp_path, list(frames)), tmp_path / "straight")
     assert summary["map"]["corrected_poses"] == 3 and straight["map"]["corrected_poses"] == 0
     assert summary["metrics"]["map_miou"] == pytest.approx(straight["metrics"]["map_miou"], abs=0.05)
 

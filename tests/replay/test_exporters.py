@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError, ImportSourceError, LogError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.export_log import export_recording
-from semantic_mapper.nodes.cli.saved_maps import is_log
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.replay.exporters import LogExportReport, LogExportRequest, export_log, log_format_of
 from semantic_mapper.replay.importers import ImportOptions, import_recording
 from semantic_mapper.replay.importers.tum import read_trajectory
 from semantic_mapper.replay.log.format import LogReader, LogWriter
+from semantic_mapper.replay.run_folder import is_log
 from semantic_mapper.transport.codec import encode_frame
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo

@@ -18,12 +18,13 @@ from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.replay import artifacts
+from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.evaluate.methods import MAP, Opinion, baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.session import SNAPSHOTS, MapSession, open_recording
 from semantic_mapper.replay.stats import LatencyHistogram
+from semantic_mapper.replay.summary import notes, summary_table
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
@@ -55,7 +56,7 @@ def test_results_of_an_earlier_map_go(tmp_path):
 
 def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     session = run(weights, tiny_frames(), rerun=tmp_path / "run.rrd")
-    summary = session.finish(tmp_path / "out")
+    summary = finish_session(session, tmp_path / "out")
     on_disk = json.loads((tmp_path / "out/summary.json").read_text())
     assert on_disk == summary
     assert summary["frames"]["published"] == summary["frames"]["fused"] == 6
@@ -81,7 +82,7 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
 def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
     config = tiny_config(quality="fast", render={"scale": 0.5})
     session = MapSession(Mapper.load(weights, config), stream_labels=None)
-    summary = session.finish(tmp_path / "out")
+    summary = finish_session(session, tmp_path / "out")
     assert summary["quality"] == "fast"
     assert (summary["config"]["sampling"]["guided"], summary["config"]["render"]["ray_fraction"]) == (2, 0.12)
     assert summary["config"]["render"]["encode_width"] == 96, "that of the weights"
@@ -94,7 +95,7 @@ def test_the_first_frame_which_may_compile_kernels_does_not_count_in_the_percent
     session.step_ms = LatencyHistogram()
     for ms in [9000.0, *[10.0] * 5]:
         session.step_ms.add(ms)
-    latency = session.finish(tmp_path / "out")["latency_ms"]
+    latency = finish_session(session, tmp_path / "out")["latency_ms"]
     assert latency == {"p50": 10.0, "p95": 10.0, "first": 9000.0}
 
 
@@ -146,7 +147,7 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
         return np.zeros((8, 8, 3), np.uint8)
 
     monkeypatch.setattr(artifacts, "draw_overview", draw)
-    summary = session.finish(tmp_path / "out")
+    summary = finish_session(session, tmp_path / "out")
     without = 1 - measured / 6
     computed = depth == "auto"
     assert summary["frames"]["without_depth"] == (0 if computed else 6 - measured)
@@ -192,7 +193,7 @@ def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights
         ("computed", "auto", without, "poses that are exact"),
         ("measured", "auto", frames, "check depth_scale, the intrinsics and the poses"),
     ):
-        summary = run(weights, given, depth=depth).finish(tmp_path / name)
+        summary = finish_session(run(weights, given, depth=depth), tmp_path / name)
         said = summary["map"]["nearly_empty"]
         assert said.startswith("the map is nearly empty: ") and why in said
         assert f"warning: {said}" in notes(summary)
@@ -201,7 +202,7 @@ def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights
 
 
 def test_a_map_of_measured_depth_is_not_called_empty(tmp_path, weights):
-    assert run(weights, tiny_frames()).finish(tmp_path)["map"]["nearly_empty"] is None
+    assert finish_session(run(weights, tiny_frames()), tmp_path)["map"]["nearly_empty"] is None
 
 
 def test_frames_that_a_player_could_not_read_are_refused_but_not_missed(weights):
@@ -215,15 +216,15 @@ def test_frames_that_a_player_could_not_read_are_refused_but_not_missed(weights)
 def test_poses_that_contradict_the_depth_are_in_summary_table_picture_and_notes(tmp_path, weights, monkeypatch):
     subtitles = []
     monkeypatch.setattr(artifacts, "draw_overview", _draw_nothing_but_tell(subtitles))
-    right = run(weights, tiny_frames(30)).finish(tmp_path / "right")
+    right = finish_session(run(weights, tiny_frames(30)), tmp_path / "right")
     assert right["pose_check"]["warning"] is None and right["pose_check"]["depth_disagreement"] < 0.01
     wrong_poses = [replace(f, T_world_camera=invert_pose(f.T_world_camera)) for f in tiny_frames(30)]
-    wrong = run(weights, wrong_poses).finish(tmp_path / "wrong")
+    wrong = finish_session(run(weights, wrong_poses), tmp_path / "wrong")
     assert "poses inverted" in wrong["pose_check"]["warning"]
     assert right["pose_check"]["worst_contradicting_pairs"] == 0
     assert wrong["pose_check"]["worst_depth_disagreement"] >= wrong["pose_check"]["depth_disagreement"] > 0.02
     assert ["CONTRADICT" in subtitle for subtitle in subtitles] == [False, True]
-    few = run(weights, tiny_frames(30)[:2]).finish(tmp_path / "few")
+    few = finish_session(run(weights, tiny_frames(30)[:2]), tmp_path / "few")
     table = summary_table({"right": right, "wrong": wrong, "few": few})
     names, *values = (list(column.cells) for column in table.columns)
     first, second, third = (column[names.index("depth disagreement")] for column in values)
@@ -237,7 +238,7 @@ def test_the_summary_names_the_kind_of_field(tmp_path):
     field = build_field("unet", {"encoder": to_plain(SMALL_ENCODER)}, ROOMS)
     save_checkpoint(Checkpoint(field, (), {"kind": "train", "width": 96}), tmp_path / "unet.safetensors")
     session = run(tmp_path / "unet.safetensors", tiny_frames()[:2])
-    assert session.finish(tmp_path / "out")["field"]["name"] == "unet"
+    assert finish_session(session, tmp_path / "out")["field"]["name"] == "unet"
     assert set(field_predictors(session.bundle)) == {"unet", "unet, novel view"}
 
 
@@ -269,7 +270,7 @@ def test_refused_frames_are_counted_with_their_reason_and_the_rest_is_mapped(tmp
     session = run(weights, frames)
     session.refuse(9, 0, "message 9: checksum is wrong")
     session.count_dropped(3)
-    summary = session.finish(tmp_path / "out")
+    summary = finish_session(session, tmp_path / "out")
     assert summary["frames"] | {} == summary["frames"]
     assert (summary["frames"]["published"], summary["frames"]["fused"]) == (10, 5)
     assert (summary["frames"]["refused"], summary["frames"]["dropped"]) == (2, 3)
@@ -293,7 +294,7 @@ def test_a_session_of_days_keeps_count_in_memory_that_does_not_grow(tmp_path, we
         session.per_image.add(confusion_of(frames[0].label, frames[0].label, ROOMS))
     grown = len(pickle.dumps((session.refusals, session.damages, session.step_ms, session.stage_ms))) - before
     assert abs(grown) < 2000
-    summary = session.finish(tmp_path / "out")
+    summary = finish_session(session, tmp_path / "out")
     assert summary["frames"]["refused"] == 2000 and summary["frames"]["published"] == 2006
     assert session.refusals.last.seq == 1505
     assert [r["seq"] for r in summary["refusals"]] == [6 + n // 2 for n in range(50)]
@@ -310,7 +311,7 @@ def test_an_unknown_label_id_costs_the_score_but_neither_map_nor_results(tmp_pat
     frames[bad] = replace(frames[bad], label=label)
     session = run(weights, frames)
     assert session.fused == 3 and session.scored == (2 if bad == 1 else 1)
-    summary = session.finish(tmp_path / "out")
+    summary = finish_session(session, tmp_path / "out")
     assert summary["frames"]["labels_refused"] == 1 and summary["frames"]["refused"] == 0
     assert "77" in summary["refusals"][0]["reason"] and f"seq={bad}" in summary["refusals"][0]["reason"]
     assert (tmp_path / "out/overview.png").exists()
@@ -319,13 +320,13 @@ def test_an_unknown_label_id_costs_the_score_but_neither_map_nor_results(tmp_pat
 def test_without_labels_metrics_are_null(tmp_path, weights):
     session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=None)
     session.process(replace(tiny_frames()[0], label=None))
-    summary = session.finish(tmp_path)
+    summary = finish_session(session, tmp_path)
     assert all(v is None for v in summary["metrics"].values()) and summary["metrics_per_image"] is None
 
 
 def test_an_empty_session_still_writes_everything(tmp_path, weights):
     session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=ROOMS)
-    summary = session.finish(tmp_path)
+    summary = finish_session(session, tmp_path)
     assert summary["frames"]["fused"] == 0 and summary["latency_ms"]["p50"] is None
     assert (tmp_path / "overview.png").exists() and (tmp_path / "map.npz").exists()
 

@@ -6,18 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from research.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, camera_path, make_room, render_view
+from research.scenes import CameraPathConfig, RoomConfig, Scene, camera_path, make_room, render_view
 from research.scenes.camera import pose_of
 from research.scenes.fast_cast import cast_pixels
 from research.scenes.materials import MaterialTable, Pattern
 from research.scenes.primitives import Primitives, Shape
-from research.scenes.render import Sensor
 from research.scenes.scene import Lights, extremes, shadow_cubes
 from research.scenes.sensor_depth import depth_edges
-from research.tests.scenes.torch_renderer import render_view_torch, render_views_torch
-from semantic_mapper.errors import ConfigError, PoseError
+from semantic_mapper.errors import PoseError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.types import CameraIntrinsics
 
@@ -52,38 +49,6 @@ def test_a_frustum_is_narrower_at_its_top_than_at_its_foot() -> None:
 COMPARED = (1, 2, 10, 14)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", COMPARED)
-def test_fast_and_plain_renderer_agree(seed: int) -> None:
-    scene = make_room(seed)
-    for pose in camera_path(scene, 2, 4, CameraPathConfig(step_m=0.6)):
-        fast, plain = render_view(scene, CAMERA, pose), render_view_torch(scene, CAMERA, pose)
-        # Ties at edges may fall either way: a handful of pixels out of 6912.
-        same = fast.instance == plain.instance
-        assert (~same).sum() <= 5
-        np.testing.assert_array_equal(fast.label[same], plain.label[same])
-        np.testing.assert_allclose(fast.depth_m[same], plain.depth_m[same], atol=1e-5)
-        difference = np.abs(fast.rgb.astype(int) - plain.rgb.astype(int)).max(-1)
-        assert (difference > 2).sum() <= 20
-
-
-def test_a_batch_of_views_gives_what_single_views_give() -> None:
-    scene = make_room(4, FAST)
-    poses = camera_path(scene, 3, 0, CameraPathConfig(step_m=0.5))
-    sensors = [None, Sensor(5, NoiseConfig()), Sensor(6, NoiseConfig(depth="d435"))]
-    for pose, sensor, batched in zip(poses, sensors, render_views_torch(scene, SMALL, poses, sensors), strict=True):
-        noise = {} if sensor is None else {"noise": sensor.seed, "noise_config": sensor.config}
-        alone = render_view_torch(scene, SMALL, pose, **noise)  # type: ignore[arg-type]
-        for name in ("rgb", "depth_m", "label", "instance", "exact_depth_m"):
-            np.testing.assert_array_equal(getattr(batched, name), getattr(alone, name))
-
-
-def test_a_batch_needs_one_sensor_a_pose() -> None:
-    scene = make_room(4, FAST)
-    with pytest.raises(ConfigError, match="2 poses but 1 sensors"):
-        render_views_torch(scene, CAMERA, camera_path(scene, 2, 0), [None])
-
-
 def mirror_room() -> Scene:
     """A mirror at x = 2 that fills the view of a camera at the origin, and a red box behind the camera."""
     wall, prop = (ROOMS.ids[ROOMS.names.index(name)] for name in ("otherfurniture", "otherprop"))
@@ -109,16 +74,6 @@ def mirror_room() -> Scene:
     return Scene(0, "test", (4.0, 4.0, 3.0), primitives, materials, lights)
 
 
-@pytest.mark.parametrize("render", [render_view, render_view_torch])
-def test_a_mirror_shows_what_stands_behind_the_camera_but_keeps_its_own_depth_and_label(render) -> None:
-    view = render(mirror_room(), CAMERA, pose_of(np.zeros(3), 0.0, 0.0))
-    red, blue = view.rgb[36, 48, 0], view.rgb[36, 48, 2]
-    assert red > 2 * blue
-    assert view.rgb[36, 2, 2] > view.rgb[36, 2, 0]  # beside the image of the box the mirror has its own colour
-    assert view.instance[36, 48] == 1
-    assert view.depth_m[36, 48] == pytest.approx(2.0)
-
-
 @pytest.mark.parametrize("seed", [0, 3])
 def test_quick_answers_of_the_shadow_extremes_change_no_picture(seed: int) -> None:
     scene = make_room(seed)
@@ -136,24 +91,6 @@ def test_soft_shadows_have_wider_edges_than_hard_ones() -> None:
         lights = replace(scene.lights, softness=np.full_like(scene.lights.softness, softness))
         between.append(render_view(replace(scene, lights=lights), CAMERA, pose).rgb.astype(int))
     assert (np.abs(between[0] - between[1]).max(-1) > 2).mean() > 0.005
-
-
-def test_single_precision_as_on_a_gpu_gives_nearly_the_same_picture() -> None:
-    scene = make_room(2)
-    pose = camera_path(scene, 1, 0)[0]
-    fast, single = render_view(scene, SMALL, pose), render_view_torch(scene, SMALL, pose, dtype=torch.float32)
-    assert (fast.label != single.label).mean() < 0.005
-    assert np.median(np.abs(fast.depth_m - single.depth_m)) < 1e-4
-    assert (np.abs(fast.rgb.astype(int) - single.rgb.astype(int)).max(-1) > 6).mean() < 0.02
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
-def test_the_plain_renderer_gives_the_same_on_a_gpu() -> None:
-    scene = make_room(1)
-    pose = camera_path(scene, 1, 0)[0]
-    cpu, gpu = render_view_torch(scene, CAMERA, pose), render_view_torch(scene, CAMERA, pose, device="cuda")
-    assert (cpu.label != gpu.label).mean() < 0.005
-    assert np.median(np.abs(cpu.depth_m - gpu.depth_m)) < 1e-4
 
 
 def test_every_pattern_is_compared() -> None:

@@ -4,13 +4,14 @@ promised."""
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from research.scenes.scene import scene_at
 from research.scenes.sequence import RoomView
-from research.scenes.streets.boxes import street_boxes
+from research.scenes.streets.boxes import StreetBox, street_boxes
 from research.scenes.streets.layout import IGNORED, make_streets_street
 from research.scenes.streets.pseudo import LEAST_MIOU, MIOU, MOST_MIOU, pseudo_labels, pseudo_miou
 from research.scenes.streets.views import (
@@ -25,7 +26,7 @@ from research.scenes.streets.views import (
     street_views,
 )
 from research.scenes.suite import STREETS_SUITE
-from research.scenes.survey import box_overlap
+from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import KITTI360
 
 CAMERA = street_camera(88)
@@ -142,3 +143,20 @@ def test_ten_streets_show_every_class_and_have_boxes_that_overlap() -> None:
             streets[name] += KITTI360.id_of(name) in seen
     assert min(streets.values()) >= 4, streets
     assert np.mean(overlaps) >= 0.1, overlaps
+
+
+def box_overlap(views: Sequence[RoomView], boxes: Sequence[StreetBox]) -> tuple[float, float]:
+    """Fraction of the surface pixels that lie in a box of their class, and of those in boxes of two classes."""
+    names = sorted({box.name for box in boxes})
+    covered = several = count = 0
+    for view in views:
+        exact = view.rendered.exact_depth_m
+        points = transform(view.T_world_camera, unproject(exact, view.frame.intrinsics)).reshape(-1, 3)
+        points, label = points[exact.ravel() > 0], view.rendered.label.ravel()[exact.ravel() > 0]
+        inside = np.zeros((len(names), len(points)), np.bool_)
+        for box in boxes:
+            inside[names.index(box.name)] |= box.contains(points)
+        own = np.array([KITTI360.id_of(name) for name in names])[:, None] == label
+        covered, several = covered + (inside & own).any(axis=0).sum(), several + (inside.sum(axis=0) > 1).sum()
+        count += len(points)
+    return float(covered / count), float(several / count)

@@ -16,21 +16,23 @@ import pytest
 from research.bench.render import log_scenes
 from research.peers.config import SemanticNeRFConfig
 from research.peers.semantic_nerf import SemanticNeRF
+from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import is_measured
-from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.cli.labelling import choose_keyframes
 from semantic_mapper.nodes.cli.log_info import autolabel_rows
-from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.autolabel import RENDERED_SPREAD, AutolabelReport, AutolabelRequest, autolabel
+from semantic_mapper.replay.autolabel import RENDERED_SPREAD, AutolabelReport, AutolabelRequest, autolabel_log
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.exporters import LogExportRequest, export_log
 from semantic_mapper.replay.importers import import_recording
+from semantic_mapper.replay.job_monitor import JobMonitor
+from semantic_mapper.replay.jobs import OFFLINE
 from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log
@@ -45,6 +47,20 @@ CALIBRATION = LogAttachment("calibration.json", "application/json", b'{"lens": 1
 STATUS = Status("camera", "running", 5, {"frames": 3})
 
 
+class StopsAfter(JobMonitor):
+    """Asks for an end after so many frames."""
+
+    def __init__(self, frames: int) -> None:
+        self.left = frames
+
+    @property
+    def stopped_by(self) -> str:
+        return "" if self.left > 0 else "SIGINT"
+
+    def set(self, done: int, note: str = "") -> None:
+        self.left -= 1
+
+
 def unlabelled(frames: tuple[PosedFrame, ...], labelled: int = 0) -> list[PosedFrame]:
     """Frames of which only the first few have labels."""
     return [f if i < labelled else dataclasses.replace(f, label=None) for i, f in enumerate(frames)]
@@ -52,7 +68,7 @@ def unlabelled(frames: tuple[PosedFrame, ...], labelled: int = 0) -> list[PosedF
 
 def relabelled(log: Path, out: Path, weights: Path, **options: Any) -> AutolabelReport:
     request = AutolabelRequest((log,), out, weights, tiny_config(), **options)
-    return autolabel(request, lambda: False, lambda total: None, lambda done: None)
+    return autolabel_log(request)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +122,7 @@ def test_labels_that_are_there_stay_and_others_are_marked(new: Path) -> None:
 
 
 def test_labels_are_those_that_replay_renders(new: Path, part_labelled: Path, weights: Path) -> None:
-    mapper = Mapper.load(weights, mapper_config(None, None, delay_frames=REPLAY_DELAY_FRAMES))
+    mapper = Mapper.load(weights, load_mapper_config(None, defaults=OFFLINE))
     with LogReader(part_labelled) as log, LogReader(new) as labelled:
         for frame, other in zip(log, labelled, strict=True):
             update = mapper.step(frame)
@@ -270,7 +286,7 @@ def with_depth(folder: Path, weights: Path) -> Path:
     request = AutolabelRequest(
         (plain,), folder / "deep.mcap", weights, tiny_config(depth={"from_motion": {"delay_frames": 2}}), depth=True
     )
-    report = autolabel(request, lambda: False, lambda total: None, lambda done: None)
+    report = autolabel_log(request)
     assert report.note.depth_written > 2
     return folder / "deep.mcap"
 
@@ -454,10 +470,9 @@ def test_max_frames_ends_the_log(part_labelled: Path, weights: Path, tmp_path: P
 
 
 def test_a_stop_leaves_nothing(log: Path, weights: Path, tmp_path: Path) -> None:
-    calls = iter([False, False, True, True])
     request = AutolabelRequest((log,), tmp_path / "new.mcap", weights, tiny_config(), overwrite_labels=True)
     with pytest.raises(KeyboardInterrupt):
-        autolabel(request, lambda: next(calls), lambda total: None, lambda done: None)
+        autolabel_log(request, StopsAfter(2))
     assert list(tmp_path.iterdir()) == []
 
 

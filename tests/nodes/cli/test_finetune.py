@@ -15,7 +15,7 @@ import pytest
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.irt import IRT
-from semantic_mapper.nodes.cli.console import FrameProgress
+from semantic_mapper.nodes.console import FrameProgress
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.messages import StreamInfo

@@ -14,14 +14,14 @@ import pytest
 
 from semantic_mapper import plots
 from semantic_mapper.nodes.cli import fleet_report
-from semantic_mapper.nodes.cli.report import linked, safe_link
 from semantic_mapper.nodes.fleet.results import ClassRow, Failure, TaskResult
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.plots import Histogram, PercentileBox
+from semantic_mapper.replay.page import linked, safe_link
 from semantic_mapper.types import UInt8
-from tests.nodes.cli.test_report import cells, pictures, read_page
 from tests.nodes.fleet.made_up import FINISHED_NS, made_up, store_of, with_files
 from tests.nodes.support import error_line, run
+from tests.replay.test_page import cells, pictures, read_page
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "fleet-results.md"
 

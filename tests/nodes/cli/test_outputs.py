@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.outputs import free_name, hold_folder
+from semantic_mapper.replay.run_folder import free_name, hold_folder
 from tests.nodes.support import REPLAY_LAUNCH, error_line, run, run_here
 
 

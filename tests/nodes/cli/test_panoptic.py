@@ -15,26 +15,22 @@ import pytest
 
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, make_label_set
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.nodes.cli.console import frame_progress
-from semantic_mapper.nodes.cli.pseudo_labels import (
-    choose_frames,
-    match_boxes,
-    open_pseudo_labels,
-    read_pseudo_labelled,
-)
-from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_lines, finetune_log
-from semantic_mapper.nodes.cli.run_replay import mapper_config
+from semantic_mapper.nodes.cli.finetune import finetune_lines
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel
 from semantic_mapper.replay.boxes import load_boxes
+from semantic_mapper.replay.finetune_log import FrameSource, choose_frames, match_boxes, open_pseudo_labels
 from semantic_mapper.replay.importers.kitti360 import LABELS
+from semantic_mapper.replay.job_monitor import JobMonitor
+from semantic_mapper.replay.jobs import AutolabelRequest, FinetuneRequest, FinetuneResult, autolabel_log, finetune_log
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.finetune import FinetuneConfig
+from tests.nodes.cli.test_autolabel import StopsAfter
 from tests.nodes.support import error_line, run, write_log
 from tests.replay.test_boxes import kitti_xml
 from tests.small import tiny_frames
@@ -129,9 +125,8 @@ def test_a_stop_leaves_no_images_of_things(log: Path, fitted: tuple[Path, str], 
     for before in ([], ["mine"]):
         for name in before:
             (things / name).mkdir(parents=True)
-        calls = iter([False, False, True])
         with pytest.raises(KeyboardInterrupt):
-            autolabel(request, lambda calls=calls: next(calls), lambda total: None, lambda done: None)
+            autolabel_log(request, StopsAfter(2))
         assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == (
             ["things", "things/mine"] * len(before)
         )
@@ -141,25 +136,25 @@ def test_ctrl_c_while_geometry_is_fitted_leaves_what_the_boxes_say(
     log: Path, boxes: Path, settings: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "w.safetensors"
-    sensor = mapper_config(None, None, depth="sensor", delay_frames=0).depth
     config = load_config(settings, FinetuneConfig)
-    request = FinetuneRequest(log, 0, out, config, None, False, sensor, "panoptic", boxes=boxes)
+    request = FinetuneRequest(log, out, config=config, kind="panoptic", boxes=boxes)
 
-    def fit_and_press_at(note: str, stop: StopRequest) -> Checkpoint:
+    def fit_and_press_at(note: str, stop: StopRequest) -> FinetuneResult:
         def set_and_press(done: int, said: str = "") -> None:
             if said.startswith(note):
                 os.kill(os.getpid(), signal.SIGINT)
 
-        with frame_progress("fit", None) as bar, patch.object(bar, "set", set_and_press):
-            return finetune_log(request, stop, bar)[0]
+        with frame_progress("fit", None, stop=stop) as bar, patch.object(bar, "set", set_and_press):
+            return finetune_log(request, bar)
 
     with StopRequest() as stop, pytest.raises(KeyboardInterrupt):
         fit_and_press_at("reading", stop)
     assert not out.exists()
     with StopRequest() as stop:
-        checkpoint = fit_and_press_at("step 3", stop)
+        result = fit_and_press_at("step 3", stop)
+    checkpoint = result.checkpoint
     assert (checkpoint.recipe["grid_steps"], checkpoint.recipe["steps"]) == (3, 0)
-    assert "those of the boxes alone" in " ".join(finetune_lines(checkpoint, [], request))
+    assert "those of the boxes alone" in " ".join(finetune_lines(result, request))
     assert load_checkpoint(out).model.config.classes == "fixed"
 
 
@@ -279,9 +274,10 @@ def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights:
 
 
 def test_weights_teach_with_the_map_that_they_make_of_the_frames(log: Path, weights: Path) -> None:
-    with open_log(log) as opened, frame_progress("read", len(opened)) as bar:
+    request = FinetuneRequest(log, log, config=FinetuneConfig(width=96), unlabelled=0)
+    with open_log(log) as opened:
         labels = open_pseudo_labels(opened, str(weights))
-        taught = read_pseudo_labelled(opened, labels, lambda frame: frame, 0, 96, StopRequest(), bar)
+        taught = FrameSource(opened, None, request, {}).pseudo_labelled(labels, JobMonitor())
         mapper = Mapper.load(weights)
         own = [mapper.step(replace(frame, label=None)).label for frame in opened]
     nothing, mapped, changed = mapper.label_set.ignore_id, 0, 0

@@ -80,9 +80,9 @@ def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pyt
     assert open_to_all.state == "bad" and f"chmod 600 {secret}" in open_to_all.mend
     assert own.secret.decode() not in str(of(ROBOT, *settings))
 
-    monkeypatch.setattr(doctor_launch, "default_folder", lambda: tmp_path / "nowhere")
+    monkeypatch.setattr(doctor_launch, "user_key_folder", lambda: tmp_path / "nowhere")
     assert [c.state for c in doctor_launch.own_keys()] == ["ok"]
-    monkeypatch.setattr(doctor_launch, "default_folder", lambda: folder)
+    monkeypatch.setattr(doctor_launch, "user_key_folder", lambda: folder)
     assert [c.state for c in doctor_launch.own_keys()] == ["bad"]
 
 

@@ -25,14 +25,14 @@ from semantic_mapper.geometry import invert_pose
 from semantic_mapper.localization.places import Place
 from semantic_mapper.mapping.files.tiles import TILES_NAME, parse_tiles
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.console import frame_progress
-from semantic_mapper.nodes.cli.saved_maps import holds_tiles
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.fleet import merge as merge_module
 from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.fleet.merge import Alignment, MergeReport, map_names, merge_maps, read_poses, run_on_ray
 from semantic_mapper.nodes.fleet.results import ResultFile
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.tile_reading import open_tiles
+from semantic_mapper.replay.run_folder import holds_tiles
 from semantic_mapper.types import Float64
 from tests.mapping.files.test_merge import fuse_views, turned
 from tests.mapping.rendered_views import small_map

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from research.experiments.browser import PROGRAM, Browser
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.labeller.server import LabelServer
 from semantic_mapper.nodes.labeller.session import LabelSession
 from semantic_mapper.replay.label_folder import make_label_folder
 from semantic_mapper.replay.log.sequence import open_log
+from tests.browser import PROGRAM, Browser
 
 pytestmark = pytest.mark.skipif(
     not PROGRAM.is_file(), reason="no browser in .tools/chromium; `make test-web` fetches one and runs these tests"

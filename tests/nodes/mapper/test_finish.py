@@ -21,7 +21,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
+from semantic_mapper.replay.jobs import ReplayRequest, replay_log
 from semantic_mapper.nodes.process import StopRequest, prepare_process
 prepare_process()
 load_open3d()
@@ -34,8 +34,8 @@ def killed_at(name):
             os.kill(os.getpid(), signal.SIGKILL)
         rename(source, target)
     os.replace = replace
-    request = ReplayRequest(log, out / name, weights, mapper_config(config, None), max_frames=2)
-    replay_log(request, StopRequest(), lambda count: None, lambda done: None)
+    request = ReplayRequest(log, out / name, weights, load_mapper_config(config), max_frames=2)
+    replay_log(request)
 
 for name in [n.name for n in names]:
     (out / name).mkdir(parents=True)

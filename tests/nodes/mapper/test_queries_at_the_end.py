@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import semantic_mapper.nodes.mapper.finish
+import semantic_mapper.replay.artifacts
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -31,7 +31,7 @@ def test_questions_are_answered_while_a_correction_ends_and_while_the_map_is_wri
     """Nobody has asked before; then somebody asks twice, each time while the mapper does something else."""
     frames = tiny_frames(8)
     about_old, writing, about_new = threading.Event(), threading.Event(), threading.Event()
-    advance, finish_session = LiveCorrection._advance, semantic_mapper.nodes.mapper.finish.finish_session
+    advance, finish_session = LiveCorrection._advance, semantic_mapper.replay.artifacts.finish_session
 
     def wait_and_advance(correction: LiveCorrection, count: int) -> None:
         if correction._ended and not about_old.wait(0.05):
@@ -44,7 +44,7 @@ def test_questions_are_answered_while_a_correction_ends_and_while_the_map_is_wri
         return finish_session(*args)
 
     monkeypatch.setattr(LiveCorrection, "_advance", wait_and_advance)
-    monkeypatch.setattr(semantic_mapper.nodes.mapper.finish, "finish_session", wait_and_finish)
+    monkeypatch.setattr(semantic_mapper.replay.artifacts, "finish_session", wait_and_finish)
     monkeypatch.setattr("semantic_mapper.nodes.mapper.query_service.FIRST_CATCH_UP_S", 5.0)
     monkeypatch.setattr("semantic_mapper.nodes.mapper.query_service.ASKED_LATELY_S", 0.5)
     with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:

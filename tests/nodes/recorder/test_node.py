@@ -22,15 +22,12 @@ import pytest
 from structlog.testing import capture_logs
 
 import semantic_mapper.nodes.recorder.node
-from semantic_mapper.config import convert_config
+from semantic_mapper.config import convert_config, load_mapper_config
 from semantic_mapper.errors import ConfigError, LogError, TransportError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.log_info import describe_log
 from semantic_mapper.nodes.cli.record import _join
-from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
-from semantic_mapper.nodes.cli.saved_maps import is_log
-from semantic_mapper.nodes.cli.scoring import ScoreRequest, score_log
 from semantic_mapper.nodes.frame_gaps import MAX_MISSED
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder, read_launch_note
@@ -38,9 +35,11 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
+from semantic_mapper.replay.jobs import EvaluateRequest, ReplayRequest, evaluate_log, replay_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
+from semantic_mapper.replay.run_folder import is_log
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import MAX_COUNT, EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
@@ -340,12 +339,10 @@ def test_parts_are_replayed_as_one_log(weights: Path, config: Path, tmp_path: Pa
         with_parts.write(encode_frame(frame))
     with_parts.close()
     first, second, *more = parts_on_disk(tmp_path / "a.mcap").values()
-    settings = mapper_config(config, None)
+    settings = load_mapper_config(config)
     request = ReplayRequest(second, tmp_path / "out", weights, settings, further_parts=(*more, first))
-    summary = replay_log(request, StopRequest(), lambda count: None, lambda done: None)
+    summary = replay_log(request).summary
     assert summary["frames"]["fused"] == 6 == VoxelMap.load(tmp_path / "out" / "map.npz").frames
     assert is_log(tmp_path) and not is_log(tmp_path / "out")
-    scored = score_log(
-        ScoreRequest(tmp_path, weights, baselines=False, seconds=0, max_frames=5, config=settings, seed=0)
-    )
+    scored = evaluate_log(EvaluateRequest(tmp_path, weights, settings, max_frames=5)).scores
     assert scored["scored"] + scored["excluded"] + scored["refused"] == 5  # more than one part holds

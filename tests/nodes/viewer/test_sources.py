@@ -24,8 +24,8 @@ import pytest
 import rerun.chunk
 
 from semantic_mapper.errors import MapError, TransportError
-from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.view import _find_live, _Page
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.process import StopRequest

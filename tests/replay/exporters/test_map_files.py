@@ -149,7 +149,7 @@ def test_costs_are_read_by_class(corner: VoxelMap, tmp_path: Path) -> None:
 
 
 def test_the_costs_that_the_howto_shows_are_those_of_a_map_of_rooms(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[3] / "docs" / "howto.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "robots.md").read_text(encoding="utf-8")
     shown = text.split("`costs.toml` has lines")[1].split("```toml\n")[1].split("```")[0]
     (tmp_path / "costs.toml").write_text(shown)
     costs = read_costs(tmp_path / "costs.toml", ROOMS)

@@ -1,0 +1,200 @@
+"""What people and programs see of the command line: results on stdout, everything else on stderr.
+
+Text is shown as it is: nothing in it is markup, and what would steer the terminal is made visible (``PlainConsole``).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+import structlog
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.segment import Segment
+from rich.table import Table
+from rich.text import Text
+
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import plain_without_secrets, without_secrets
+from semantic_mapper.replay.job_monitor import JobMonitor
+
+_log = structlog.get_logger(__name__)
+
+PIPED_WIDTH = 10_000  # columns of what is no terminal: nothing is wrapped or cut there
+LOG_PERIOD_S = 15.0  # how often progress is logged where there is no terminal to draw a bar on
+
+
+class PlainConsole(Console):
+    r"""A console on which every text is plain, wherever it stands: in a line, a cell, a title or beside a bar.
+
+    Names of classes, cameras and files come from logs, maps and weights of others. Markup and emoji codes in them are
+    text, and control characters are shown as escapes (``\x1b``), so that no name can end a verb, hide, forge a line or
+    command the terminal. Colours are given as ``style``.
+
+    Args:
+        file: Where to write; None = stdout.
+        stderr: Write to the current ``sys.stderr``.
+    """
+
+    def __init__(self, file: TextIO | None = None, *, stderr: bool = False) -> None:
+        super().__init__(file=file, stderr=stderr, markup=False, emoji=False, highlight=False)
+        if not self.is_terminal:
+            self.width = PIPED_WIDTH
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Every string that rich is given comes by here, whatever it is part of."""
+        plain = {"markup": False, "emoji": False, "highlight": False}
+        return super().render_str(visible(without_secrets(text)), **{**options, **plain})
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """And every ``Text``, which may hold line breaks of its own."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=visible(segment.text, keep="\n"))
+
+
+class Output:
+    """Where results go. ``guarded`` keeps stray prints (Open3D prints memory statistics at exit) off stdout."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.console = PlainConsole(stream)
+        self.quiet = False  # ``print`` shows nothing: for verbs that were requested JSON alone
+        self._stream = stream
+
+    @classmethod
+    def guarded(cls) -> Output:
+        """Keep the real stdout for results; from now on anything else that is written to it lands on stderr."""
+        sys.stdout.flush()
+        stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        os.dup2(2, 1)  # C and C++ code
+        sys.stdout = sys.stderr  # Python code
+        return cls(stream)
+
+    def print(self, *things: Any) -> None:
+        """Show something to people; what is in a text is shown as it is, on one line."""
+        if self.quiet:
+            return
+        if self.console.is_terminal:
+            self.console.print(*things, soft_wrap=True)
+        else:  # a pipe gets columns, without lines round them or blanks behind them
+            for thing in things:
+                if isinstance(thing, Table):
+                    thing.box, thing.pad_edge = None, False
+            with self.console.capture() as printed:
+                self.console.print(*things, soft_wrap=True)
+            self._stream.write("\n".join(line.rstrip(" ") for line in printed.get().split("\n")))
+        self._stream.flush()
+
+    def address(self, said: str, url: str) -> None:
+        """Show an address of this machine that people are to open, whole; ``print`` hides its parameters."""
+        if not self.quiet:
+            self._stream.write(f"{said} {url}\n")
+            self._stream.flush()
+
+    def json(self, data: Any) -> None:
+        """Write one JSON document, without secrets of the addresses in it."""
+        self._stream.write(json.dumps(plain_without_secrets(data), indent=1, allow_nan=False) + "\n")
+        self._stream.flush()
+
+
+def stderr_console() -> PlainConsole:
+    """For messages and progress."""
+    return PlainConsole(stderr=True)
+
+
+class FrameProgress(JobMonitor):
+    """A bar with frames a second and time left; events in the log where stderr is no terminal."""
+
+    def __init__(
+        self, progress: Progress, task: Any, what: str, total: int | None, unit: str, stop: StopRequest | None
+    ) -> None:
+        self._progress = progress
+        self._task = task
+        self._what = what
+        self._total = total
+        self._unit = unit
+        self._stop = stop
+        self._done = 0
+        self._began = self._told = time.monotonic()
+
+    @property
+    def stopped_by(self) -> str:
+        """The signal that asks for an early end; empty = none has come."""
+        return self._stop.name if self._stop is not None else ""
+
+    def start(self, total: int | None) -> None:
+        """Now it is known how many there are, and work begins."""
+        self._total = total
+        self._began = self._told = time.monotonic()
+        self._progress.reset(self._task, total=total, description=self._what)
+
+    def advance(self, count: int = 1) -> None:
+        """This many more are done."""
+        self.set(self._done + count)
+
+    def set(self, done: int, note: str = "") -> None:
+        """This many are done by now; ``note`` replaces the text beside the bar."""
+        self._done = done
+        changes: dict[str, Any] = {"note": note} if note else {}
+        self._progress.update(self._task, completed=done, **changes)
+        now = time.monotonic()
+        if not self._progress.console.is_terminal and now - self._told >= LOG_PERIOD_S:
+            self._told = now
+            rate = done / max(now - self._began, 1e-9)
+            more = {"note": note} if note else {}
+            _log.info(self._what, done=done, total=self._total, rate=f"{rate:.2f} {self._unit}/s", **more)
+
+
+@contextmanager
+def frame_progress(
+    what: str, total: int | None, unit: str = "frames", stop: StopRequest | None = None
+) -> Iterator[FrameProgress]:
+    """Show progress while inside; ``total`` None where nobody knows it. ``stop`` is what ends the job early."""
+    columns = (
+        _TextColumn(lambda task: task.description, "bold"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _RateColumn(unit),
+        _TextColumn(lambda task: "eta"),
+        TimeRemainingColumn(),
+        TimeElapsedColumn(),
+        _TextColumn(lambda task: task.fields["note"]),
+    )
+    console = stderr_console()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit, stop)
+
+
+class _TextColumn(ProgressColumn):
+    """Rich's own reads markup."""
+
+    def __init__(self, text: Callable[[Task], str], style: str = "") -> None:
+        super().__init__()
+        self._text, self._style = text, style
+
+    def render(self, task: Task) -> Text:
+        return Text(visible(self._text(task)), style=self._style)
+
+
+class _RateColumn(ProgressColumn):
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.1f} {self._unit}/s", style="cyan")

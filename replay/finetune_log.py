@@ -1,0 +1,548 @@
+"""Finetuning on a log: choose keyframes, train, write the weights.
+
+Kinds of fields that are fitted to one scene take the other frames, too; "panoptic" takes all frames with pseudo labels:
+of a folder, of weights, or the log's own images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import structlog
+
+from semantic_mapper.config import DepthConfig, PanopticConfig
+from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
+from semantic_mapper.fields.checkpoint import (
+    Checkpoint,
+    anchor_from_frame,
+    default_checkpoint_path,
+    load_checkpoint,
+    save_checkpoint,
+    shipped_checkpoint,
+)
+from semantic_mapper.fields.irt import IRT
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.panoptic import Panoptic, box_config
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.box_times import with_times
+from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_classes
+from semantic_mapper.replay.job_monitor import JobMonitor
+from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
+from semantic_mapper.replay.log.sequence import Log, open_log
+from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
+from semantic_mapper.replay.run_folder import prepare_file
+from semantic_mapper.training.boxes_in_view import boxes_in_view
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
+from semantic_mapper.training.fitters import FITTERS, fitter_of
+from semantic_mapper.training.frame_rays import usable_frames
+from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
+from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
+from semantic_mapper.types import PosedFrame
+
+LEAST_KEYFRAMES = 2
+MAX_SCENE_FRAMES = 300  # that a field of one scene is fitted to
+OWN = "the log's own label images"
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FinetuneRequest:
+    """What to finetune, and on what.
+
+    Args:
+        log: The log.
+        out: Weights to write.
+        keyframes: How many labelled frames to use; 0 for a kind that learns no classes, and for all frames that the
+            folder ``labels`` has labels of.
+        config: Of the training.
+        weights: To start from; None = those in the package.
+        from_scratch: Start from random weights.
+        depth: Where the frames' depth comes from.
+        kind: Of a field that is fitted to one scene, from nothing; None = that of the weights.
+        labels: Folder of label images in place of the log's.
+        frames: Numbers in the log of the labelled frames, in place of ``keyframes``.
+        unlabelled: How many other frames a kind of one scene uses at most; 0 = all, None = 300.
+        boxes, pseudo, uncovered: Of the kind "panoptic": file of boxes, folder or weights of pseudo labels, and what is
+            outside of all boxes.
+        strokes: Label images are strokes, and grow.
+    """
+
+    log: Path
+    out: Path
+    keyframes: int = 0
+    config: FinetuneConfig = field(default_factory=FinetuneConfig)
+    weights: Path | None = None
+    from_scratch: bool = False
+    depth: DepthConfig = field(default_factory=lambda: DepthConfig(source="sensor"))
+    kind: str | None = None
+    labels: Path | None = None
+    frames: Sequence[int] = ()
+    unlabelled: int | None = None
+    boxes: Path | None = None
+    pseudo: str | None = None
+    uncovered: str = "stuff"
+    strokes: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinetuneResult:
+    """What was learned.
+
+    Args:
+        checkpoint: The weights, as written; ``recipe`` holds the figures.
+        chosen: Numbers in the log of the labelled frames that they were fitted to.
+    """
+
+    checkpoint: Checkpoint
+    chosen: list[int]
+
+
+def finetune_log(request: FinetuneRequest, monitor: JobMonitor | None = None) -> FinetuneResult:
+    """Finetune on keyframes of a log and write the weights: after a stop request, the best so far.
+
+    Raises:
+        LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong, and what to do.
+        KeyboardInterrupt: a stop request came before anything was learned.
+    """
+    monitor = monitor or JobMonitor()
+    if request.out.resolve() == request.log.resolve():
+        raise ConfigError(f"{request.out}: is the log itself; choose another name for the weights")
+    if request.out.is_file() and request.out.suffix != ".safetensors":
+        raise ConfigError(f"{request.out}: is there, and no weights file; give --out a name that ends in .safetensors")
+    prepare_file(request.out)
+    if request.boxes is not None:
+        result = _finetune_boxes(request, load_boxes(request.boxes), request.boxes, monitor)
+    else:
+        result = _finetune_labels(request, monitor)
+    save_checkpoint(result.checkpoint, request.out)
+    return result
+
+
+def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> FinetuneResult:
+    # First, so that a wrong path does not cost the reading of a log.
+    nothing = request.from_scratch or request.kind is not None
+    start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
+    kind = request.kind or (SRay.kind if start is None else start.model.kind)
+    _check_options(request, kind)
+    with open_log(request.log) as log:
+        folder = None if request.labels is None else open_label_folder(request.labels, log)
+        label_set = log.info.label_set if folder is None else folder.label_set
+        if label_set is None and (request.keyframes or request.frames):
+            raise LabelError(
+                f"{request.log}: has no label images; finetuning needs labelled keyframes. Make some with "
+                "`semantic-mapper label LOG --serve`, and give their folder with --labels"
+            )
+        label_set = label_set or ROOMS
+        source = FrameSource(log, folder, request, _compute_depths(log, request.depth, monitor))
+        by_number: dict[int, PosedFrame] = {}
+        if request.frames:
+            by_number = source.named()
+        elif request.keyframes or folder is not None:  # a folder without a number: all that it has
+            by_number = source.choose_labelled(label_set, monitor)
+        frames = list(by_number.values())
+        pseudo = sum(f.label_is_pseudo for f in frames)
+        grown: dict[str, float] = {}
+        if request.strokes:
+            grown["painted"] = labelled_fraction(frames, label_set)
+            frames = [grow_strokes(frame, label_set) for frame in frames]
+            grown["grown"] = labelled_fraction(frames, label_set)
+        if kind in FITTERS:
+            frames += source.unlabelled(frames, monitor)
+        note = read_note(log.attachments())
+    seen = frozenset[int]() if start is None else start.train_stamps_ns
+    if pseudo and note is not None:
+        seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
+    checkpoint = _fit(kind, frames, label_set, None if start is None else start.model, seen, request, monitor)
+    if pseudo:
+        checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
+    if grown:
+        checkpoint.recipe["strokes"] = grown
+    return FinetuneResult(checkpoint, list(by_number))
+
+
+def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, path: Path, monitor: JobMonitor) -> FinetuneResult:
+    """A field of kind "panoptic"."""
+    with open_log(request.log) as log:
+        labels = open_pseudo_labels(log, request.pseudo)
+        boxes, label_set = match_boxes(boxes, path, labels)
+        boxes, dropped = with_times(boxes, path, log)
+        source = FrameSource(log, None, request, _compute_depths(log, request.depth, monitor))
+        frames = source.pseudo_labelled(labels, monitor)
+        note = read_note(log.attachments())
+    start, unseen = boxed_field(boxes, usable_frames(frames), label_set, request.uncovered)
+    seen = labels.train_stamps_ns
+    if note is not None and any(f.label_is_pseudo for f in frames):
+        seen |= frozenset(note.train_stamps_ns)
+    checkpoint = _fit(Panoptic.kind, frames, label_set, start, seen, request, monitor)
+    figures = checkpoint.recipe["panoptic"]
+    figures |= {"left_out": boxes.left_out, "unseen": unseen, "pseudo": labels.source}
+    figures["lost"] += len(dropped)
+    return FinetuneResult(checkpoint, [])
+
+
+def _fit(
+    kind: str,
+    frames: list[PosedFrame],
+    label_set: LabelSet,
+    start: LearnedField | None,
+    seen: frozenset[int],
+    request: FinetuneRequest,
+    monitor: JobMonitor,
+) -> Checkpoint:
+    """Fit, with progress.
+
+    Raises:
+        KeyboardInterrupt: a stop request came before anything was learned: no reason to touch the file.
+    """
+    monitor.start(100)
+
+    def on_progress(progress: FinetuneProgress) -> None:
+        note = f"step {progress.step}"
+        if math.isfinite(progress.held_out_loss):
+            note += f" held-out loss {progress.held_out_loss:.3f}"
+        if not math.isnan(progress.held_out_accuracy):
+            note += f" accuracy {progress.held_out_accuracy * 100:.1f} %"
+        monitor.set(int(progress.fraction * 100), note)
+
+    def stopped() -> bool:
+        return monitor.stopped_by != ""
+
+    checkpoint = fitter_of(kind)(frames, label_set, start, request.config, on_progress, stopped, seen)
+    learned = "grid_steps" if kind == Panoptic.kind else "steps"  # boxes need no more than geometry
+    if monitor.stopped_by and not checkpoint.recipe[learned]:
+        raise KeyboardInterrupt
+    checkpoint.recipe["source"] = request.log.name
+    return checkpoint
+
+
+def _check_options(request: FinetuneRequest, kind: str) -> None:
+    """Refuse options that go with other weights.
+
+    Raises:
+        ConfigError: which.
+    """
+    if request.unlabelled is not None and kind not in FITTERS:
+        raise ConfigError(f"--unlabelled: weights of kind '{kind}' learn from labelled frames alone; leave it out")
+    if request.config.irt.variant is not None and kind != IRT.kind:
+        raise ConfigError(f"--variant (irt.variant): goes with weights of kind 'irt', not with '{kind}'; leave it out")
+
+
+def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[tuple[str, int], ComputedFrame]:
+    """What ``config`` asks to compute; nothing of a log whose first frame has depth, unless it says "computed".
+
+    Raises:
+        KeyboardInterrupt: a stop request came.
+    """
+    if config.source not in ("auto", "computed"):
+        return {}
+    if config.source == "auto" and next(iter(log)).depth_m is not None:
+        return {}
+    monitor.start(len(log))
+    return compute_depths(log, config, lambda done: _go_on(monitor, done, "computing depth from pictures"))
+
+
+def _go_on(monitor: JobMonitor, done: int, note: str) -> None:
+    """Report progress.
+
+    Raises:
+        KeyboardInterrupt: a stop request came.
+    """
+    monitor.set(done, note)
+    if monitor.stopped_by:
+        raise KeyboardInterrupt
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSource:
+    """The frames of a log as a request has them: labels of the folder before the log's, with the depth asked for."""
+
+    log: Log
+    folder: LabelFolder | None
+    request: FinetuneRequest
+    computed: Mapping[tuple[str, int], ComputedFrame]
+
+    def named(self) -> dict[int, PosedFrame]:
+        """The labelled frames that the request names, by number in the log.
+
+        Raises:
+            LogError: the log has no such frame, or it has no label image.
+        """
+        frames: dict[int, PosedFrame] = {}
+        for number in sorted(set(self.request.frames)):
+            if number >= len(self.log):
+                raise LogError(f"{self.request.log}: has no frame {number}; it has {len(self.log)}")
+            frame = self._read(number)
+            if frame.label is None:
+                raise LogError(
+                    f"{self.request.log}: frame {number} has no label image; give one in a folder with --labels"
+                )
+            frames[number] = self._with_depth(frame)
+        return frames
+
+    def choose_labelled(self, label_set: LabelSet, monitor: JobMonitor) -> dict[int, PosedFrame]:
+        """The labelled frames that show most of what the log shows, by number in it.
+
+        Of a log whose depth is computed, frames that it could be computed for. Without a number of keyframes, all.
+
+        Raises:
+            LogError: fewer usable labelled frames than requested.
+            KeyboardInterrupt: a stop request came.
+        """
+        candidates, numbers = [], []
+        size: tuple[int, int] | None = None
+        readable = range(len(self.log)) if self.folder is None else self.folder.numbers()
+        monitor.start(len(readable))
+        for done, number in enumerate(readable, 1):
+            _go_on(monitor, done, "choosing keyframes")
+            try:
+                frame = self._read(number)
+                if frame.label is None or (self.computed and (frame.camera_id, frame.stamp_ns) not in self.computed):
+                    continue
+                check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
+                label_set.to_channels(frame.label, f"frame seq={frame.seq}")
+                size = size or (frame.intrinsics.width, frame.intrinsics.height)
+                _check_size(frame, size)
+            except (LogError, FrameError, LabelError) as error:
+                _log.warning("frame_left_out", frame=number, reason=str(error))
+                continue
+            candidate = candidate_from_frame(self._with_depth(frame))
+            if self.computed and len(candidate.cells) == 0:  # the camera had not moved yet
+                continue
+            candidates.append(candidate)
+            numbers.append(number)
+        count = self.request.keyframes
+        if len(candidates) < (count or LEAST_KEYFRAMES):
+            more = f"--keyframes {count} is more than that" if count else "finetuning needs two"
+            where = self.request.log if self.folder is None else self.folder.path
+            raise LogError(f"{where}: {len(candidates)} of the {len(self.log)} frames have usable labels; {more}")
+        chosen = choose_keyframes(candidates, count, self.request.config.seed) if count else range(len(candidates))
+        return {numbers[i]: self._with_depth(self._read(numbers[i])) for i in chosen}
+
+    def unlabelled(self, labelled: list[PosedFrame], monitor: JobMonitor) -> list[PosedFrame]:
+        """The other frames of the log at working width, without labels: as many as requested, evenly spread.
+
+        Frames that cannot be read are left out and counted.
+
+        Raises:
+            KeyboardInterrupt: a stop request came.
+        """
+        known = {(f.camera_id, f.stamp_ns) for f in labelled}
+        frames: list[PosedFrame] = []
+        damaged = 0
+        monitor.start(len(self.log))
+        for number in sorted(set(_evenly(range(len(self.log)), self._most))):
+            _go_on(monitor, number + 1, "reading frames")
+            try:
+                frame = self.log.frame(number)
+            except (LogError, FrameError):
+                damaged += 1
+                continue
+            if (frame.camera_id, frame.stamp_ns) not in known:
+                given = replace(self._with_depth(frame), label=None)
+                frames.append(anchor_from_frame(given, self.request.config.width))
+        if damaged:
+            _log.warning("frames_left_out", count=damaged, reason="they cannot be read; `import` may save some")
+        return frames
+
+    def pseudo_labelled(self, labels: PseudoLabels, monitor: JobMonitor) -> list[PosedFrame]:
+        """Frames at working width with their pseudo labels, as many as requested; see ``choose_frames``.
+
+        A frame whose label image is missing or cannot be used gives its colours alone; these are counted.
+
+        Raises:
+            LogError: no frame has a pseudo label.
+            KeyboardInterrupt: a stop request came.
+        """
+        frames: list[PosedFrame] = []
+        reasons: list[str] = []
+        monitor.start(len(self.log))
+        for number in choose_frames(len(self.log), self._most, labels.numbers):
+            _go_on(monitor, number + 1, "reading frames and pseudo labels")
+            try:
+                frame = self._with_depth(self.log.frame(number))
+            except (LogError, FrameError) as error:
+                reasons.append(str(error))
+                continue
+            try:
+                labelled = labels.of(frame, number)
+                if labelled.label is not None:
+                    labels.label_set.to_channels(labelled.label, f"frame seq={frame.seq}")
+            except (LogError, LabelError, FrameError) as error:
+                reasons.append(str(error))
+                labelled = replace(frame, label=None)
+            small = anchor_from_frame(labelled, self.request.config.width)
+            frames.append(replace(small, label_is_pseudo=labelled.label_is_pseudo and labelled.label is not None))
+        if not any(f.label is not None for f in frames):
+            raise LogError(f"{self.log.path}: no frame has a pseudo label ({reasons[0] if reasons else labels.source})")
+        if reasons:
+            _log.warning("frames_without_pseudo_label", count=len(reasons), reason=reasons[0])
+        return [labels.once_all_are_seen(frame) for frame in frames]
+
+    @property
+    def _most(self) -> int:
+        """Frames of the log that a field of one scene uses at most."""
+        most = MAX_SCENE_FRAMES if self.request.unlabelled is None else self.request.unlabelled
+        return most or len(self.log)
+
+    def _read(self, number: int) -> PosedFrame:
+        frame = self.log.frame(number)
+        return frame if self.folder is None else self.folder.labelled(frame, number)
+
+    def _with_depth(self, frame: PosedFrame) -> PosedFrame:
+        """The frame with the depth that it is trained with."""
+        source = self.request.depth.source
+        if frame.depth_sigma_m is not None:  # the log's depth is no sensor's
+            if source in ("off", "sensor"):
+                frame = replace(frame, depth_m=None, depth_sigma_m=None)
+        elif source in ("off", "computed") and frame.depth_m is not None:
+            frame = replace(frame, depth_m=None)
+        found = self.computed.get((frame.camera_id, frame.stamp_ns))
+        return frame if frame.depth_m is not None or found is None else found.on(frame)
+
+
+def _check_size(frame: PosedFrame, size: tuple[int, int]) -> None:
+    """One finetuning takes views of one size.
+
+    Raises:
+        FrameError: another size.
+    """
+    k = frame.intrinsics
+    if (k.width, k.height) != size:
+        raise FrameError(f"frame seq={frame.seq}: {k.width}x{k.height}, but the first one is {size[0]}x{size[1]}")
+
+
+@dataclass(frozen=True, slots=True)
+class PseudoLabels:
+    """Where label images come from.
+
+    Args:
+        label_set: Of them.
+        of: The frame, by number in the log, with its pseudo label, or without a label.
+        source: For people.
+        numbers: Frames that have one; None = all.
+        train_stamps_ns: Frames whose true labels those who made them have learned from.
+        once_all_are_seen: A frame and its label, once ``of`` has seen all of them.
+    """
+
+    label_set: LabelSet
+    of: Callable[[PosedFrame, int], PosedFrame]
+    source: str
+    numbers: frozenset[int] | None = None
+    train_stamps_ns: frozenset[int] = frozenset()
+    once_all_are_seen: Callable[[PosedFrame], PosedFrame] = lambda frame: frame
+
+
+def open_pseudo_labels(log: Log, pseudo: str | None) -> PseudoLabels:
+    """The pseudo labels of a log.
+
+    Args:
+        log: The log.
+        pseudo: Folder of label images, or weights; None = the log's own label images, else the shipped weights.
+
+    Raises:
+        ConfigError: ``pseudo`` names both a folder and weights in the package.
+        LabelError, LogError, WeightsError: they cannot be read.
+    """
+    if pseudo is not None and Path(pseudo).is_dir():
+        if "/" not in pseudo and shipped_checkpoint(Path(pseudo)) is not None:
+            raise ConfigError(
+                f"--pseudo {pseudo}: is a folder here, and weights in the package have this name. Give ./{pseudo} for "
+                "the label images in the folder; for the weights run the command elsewhere, or rename the folder"
+            )
+        folder = open_label_folder(Path(pseudo), log)
+        source, numbers = f"the folder {pseudo}", frozenset(folder.numbers())
+        return PseudoLabels(folder.label_set, lambda f, n: _of_folder(folder, f, n), source, numbers)
+    if pseudo is None and log.info.label_set is not None:
+        numbers = frozenset(n for n, (envelope, _) in enumerate(log.frame_parts()) if envelope.has_label)
+        if numbers:
+            return PseudoLabels(log.info.label_set, lambda frame, _: frame, OWN, numbers)
+    mapper = Mapper.load(pseudo)
+    mapper.voxel_map.note_scale(log.info.scale_known)
+    source = f"the map that {mapper.weights_path.name} makes of the frames"
+    stamps = mapper.checkpoint.train_stamps_ns
+    return PseudoLabels(
+        mapper.label_set, lambda f, _: _rendered(mapper, f), source, None, stamps, lambda f: _cast_back(mapper, f)
+    )
+
+
+def choose_frames(total: int, count: int, labelled: frozenset[int] | None) -> list[int]:
+    """Numbers of ``count`` of ``total`` frames at most, ascending: labelled ones first, evenly spread."""
+    first = range(total) if labelled is None else sorted(labelled)
+    chosen = _evenly(first, count)
+    rest = sorted(set(range(total)) - set(first))
+    return sorted(chosen + _evenly(rest, count - len(chosen)))
+
+
+def match_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> tuple[BoxFile, LabelSet]:
+    """Boxes that can go with pseudo labels, and the label set of a field of them; see ``with_classes``.
+
+    Raises:
+        ConfigError: a class that these lack, with where they come from and what may be done; or no box.
+    """
+    needed = {p.class_name for p in boxes.primitives}.union(*([name, *others] for name, others in boxes.merge.items()))
+    try:
+        boxes, label_set = with_classes(boxes, labels.label_set, path)
+    except ConfigError as error:
+        end = "" if str(error).endswith("?") else "."
+        raise ConfigError(f"{error}{end} {_where_classes_come_from(labels, needed)}") from error
+    if not boxes.primitives:
+        raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
+    return boxes, label_set
+
+
+def boxed_field(
+    boxes: BoxFile, frames: Sequence[PosedFrame], label_set: LabelSet, uncovered: str
+) -> tuple[Panoptic, int]:
+    """An empty field with the boxes that frames may see, and how many they cannot.
+
+    Raises:
+        ConfigError: they can see none.
+    """
+    seen = boxes_in_view(boxes.primitives, frames)
+    config = PanopticConfig(
+        boxes=tuple(box_config(p) for p, there in zip(boxes.primitives, seen, strict=True) if there),
+        merge=dict(boxes.merge),
+        uncovered="empty" if uncovered == "empty" else "stuff",
+    )
+    return Panoptic(config, label_set), int((~seen).sum())
+
+
+def _where_classes_come_from(labels: PseudoLabels, needed: set[str]) -> str:
+    said = f"Pseudo labels are {labels.source}"
+    path = default_checkpoint_path()
+    if labels.source == OWN and needed <= set(load_checkpoint(path).label_set.names):
+        return f"{said}; weights '{path.stem}' have all classes of the boxes: --pseudo {path.stem} takes their labels"
+    return (
+        f"{said}: correct the classes of the boxes, say in `merge` of the file which class of the "
+        "labels stands for it, or give other labels (--pseudo)"
+    )
+
+
+def _evenly(numbers: Sequence[int], count: int) -> list[int]:
+    count = min(count, len(numbers))
+    return [numbers[round(i * (len(numbers) - 1) / max(count - 1, 1))] for i in range(count)]
+
+
+def _of_folder(folder: LabelFolder, frame: PosedFrame, number: int) -> PosedFrame:
+    return replace(folder.labelled(frame, number), label_is_pseudo=True)
+
+
+def _rendered(mapper: Mapper, frame: PosedFrame) -> PosedFrame:
+    label = mapper.step(replace(frame, label=None, label_is_pseudo=False)).label
+    return replace(frame, label=label, label_is_pseudo=True)
+
+
+def _cast_back(mapper: Mapper, frame: PosedFrame) -> PosedFrame:
+    """A frame with the labels of the map, and its own where the map has none: many views err less than one."""
+    if frame.label is None:
+        return frame
+    seen = mapper.voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics).label
+    return replace(frame, label=np.where(seen == mapper.label_set.ignore_id, frame.label, seen))

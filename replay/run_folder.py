@@ -1,0 +1,165 @@
+"""Folders and files of results: checked before minutes are spent on them, held by one run, found by their names."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import remove_stale
+from semantic_mapper.log_events import get_logger
+
+MAP_NAME = "map.npz"
+MAP_SUFFIX = ".npz"
+LOG_SUFFIX = ".mcap"
+TILES_NAME = "tiles.json"
+STORE_MARK = "fleet.json"
+SOCKETS = ("ipc", "inproc", "tcp")  # schemes of running mappers
+
+_log = get_logger(__name__)
+
+
+def prepare_file(path: Path) -> None:
+    """Make sure that a file can be written, before minutes are spent on what is to be in it.
+
+    Raises:
+        ConfigError: it is a folder, or nothing can be written next to it.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a folder; give the name of a file")
+    prepare_folder(path.parent)
+
+
+def prepare_folder(out: Path) -> None:
+    """Make the folder for results, before minutes are spent on them.
+
+    Raises:
+        ConfigError: it cannot be made or written to.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot hold the results ({error.strerror}); choose another folder") from error
+
+
+def free_name(path: Path) -> Path:
+    """The path, or the first of "NAME-1", "NAME-2", ... where nothing is yet."""
+    names = (path, *(path.with_stem(f"{path.stem}-{n}") for n in range(1, 1000)))
+    return next(p for p in names if not p.exists())
+
+
+@contextmanager
+def folder_for_results(out: Path) -> Iterator[None]:
+    """Make the folder, and remove it again where an error leaves it empty.
+
+    Raises:
+        ConfigError: it cannot be made or written to.
+    """
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        prepare_folder(out)
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # something is in it
+                folder.rmdir()
+        raise
+
+
+@contextmanager
+def hold_folder(out: Path) -> Iterator[None]:
+    """Make the folder for results, and keep other runs out of it for as long as this one lasts.
+
+    Where an error leaves a new folder empty, it is removed again.
+
+    Raises:
+        ConfigError: it cannot be made or written to, or another run writes its results there.
+    """
+    with folder_for_results(out), _lock(out):
+        for left in remove_stale(out):
+            _log.info("unfinished_file_removed", path=str(left))
+        yield
+
+
+@contextmanager
+def _lock(out: Path) -> Iterator[None]:
+    folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"{out}: another run writes its results there; choose another folder (--out), or wait until it ends"
+            ) from None
+        except OSError as error:  # file systems without locks
+            _log.warning("folder_not_held", folder=str(out), reason=error.strerror)
+        yield
+    finally:
+        os.close(folder)
+
+
+def map_path(path: Path) -> Path:
+    """The file of a map that is named itself, or by the folder it is in.
+
+    Raises:
+        ConfigError: no map is there, or it is a log.
+    """
+    if path.is_dir() and not (path / MAP_NAME).is_file():
+        raise ConfigError(f"{path}: no {MAP_NAME} in this folder; {_instead_of_map(path)}")
+    if not path.exists():
+        raise ConfigError(f"{path}: no such map file or folder")
+    if is_log(path):
+        raise ConfigError(f"{path}: is a log; `semantic-mapper replay {path} --out FOLDER` makes a map of it")
+    return path / MAP_NAME if path.is_dir() else path
+
+
+def _instead_of_map(folder: Path) -> str:
+    """What to do about a folder without a map, from what is in it."""
+    if holds_tiles(str(folder)):
+        return "it holds a map in tiles, which `query` and `export` read"
+    maps = sorted(file.name for file in folder.glob(f"*{MAP_SUFFIX}"))
+    if (folder / STORE_MARK).is_file():
+        return "a fleet's store, and no merge into it has finished; run `fleet merge` again, or name a map in results/"
+    if maps:
+        return f"name the map itself, such as {folder / maps[0]}"
+    results = sorted(file.parent.name for file in folder.glob(f"*/{MAP_NAME}"))
+    if results:
+        return f"there is one in {folder / results[0]}"
+    if is_log(folder):
+        return f"its logs hold frames: `semantic-mapper replay {folder} --out FOLDER` makes a map of them"
+    return "give a saved map or a folder that `replay` has written"
+
+
+def holds_tiles(source: str) -> bool:
+    """Whether a map in tiles is meant, as `fleet merge` writes it: a folder with their manifest, this, or a URL."""
+    scheme, found, _ = source.partition("://")
+    path = Path(source)
+    return scheme not in SOCKETS if scheme and found else path.name == TILES_NAME or (path / TILES_NAME).is_file()
+
+
+def refuse_overwriting(out: Path, *sources: Path) -> None:
+    """Refuse a result under the name of what it is made from.
+
+    Raises:
+        ConfigError: naming the file.
+    """
+    if out.resolve() in {source.resolve() for source in sources}:
+        raise ConfigError(f"{out}: is the map itself; choose another name for the result")
+
+
+def is_map(source: Path) -> bool:
+    """Whether a saved map is meant: a map file, or a folder with one."""
+    return source.suffix == MAP_SUFFIX or (source / MAP_NAME).is_file()
+
+
+def is_log(source: Path) -> bool:
+    """Whether a log is meant rather than a map: a log file, or a folder with logs and no map."""
+    if source.is_dir():
+        return not (source / MAP_NAME).exists() and any(source.glob(f"*{LOG_SUFFIX}"))
+    return source.suffix == LOG_SUFFIX

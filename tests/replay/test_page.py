@@ -1,0 +1,171 @@
+"""Reports: one well-formed page, whose pictures are inside and which asks nobody for anything."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+from rich.table import Table
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.artifacts import finish_session
+from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
+from semantic_mapper.replay.page import (
+    MAX_VIEW_POINTS,
+    Section,
+    point_view,
+    write_page,
+    write_suite_report,
+)
+from semantic_mapper.replay.session import MapSession
+from tests.nodes.support import write_weights
+from tests.small import tiny_config, tiny_frames
+
+
+def read_page(path: Path, *, links: bool = False) -> ElementTree.Element:
+    """The page, checked to be one that stands alone; it may have links that a reader can follow."""
+    text = path.read_text(encoding="utf-8")
+    doctype, _, rest = text.partition("\n")
+    assert doctype == "<!DOCTYPE html>"
+    page = ElementTree.fromstring(rest)
+    (policy,) = [m.get("content") or "" for m in page.iter("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'; img-src data:; ")
+    scripts = [s.text or "" for s in page.iter("script") if s.get("type") is None]
+    for script in scripts:  # as a browser that reads HTML does, which knows no CDATA
+        whole = text.partition("<script>")[2].partition("</script>")[0]
+        digest = base64.b64encode(hashlib.sha256(whole.encode()).digest()).decode()
+        assert f"script-src 'sha256-{digest}'" in policy and script in whole.replace("<![CDATA[", "").replace("]]>", "")
+    for element in page.iter():
+        for name in ("src", "href", "srcset", "action", "data"):
+            if links and element.tag == "a" and name == "href":
+                continue
+            assert element.get(name, "data:").startswith("data:"), f"{element.tag} asks for {element.get(name)}"
+    assert "url(" not in text.partition("</style>")[0] and "@import" not in text
+    return page
+
+
+def pictures(page: ElementTree.Element) -> list[np.ndarray]:
+    found = []
+    for image in page.iter("img"):
+        kind, _, data = (image.get("src") or "").partition(";base64,")
+        assert kind in ("data:image/png", "data:image/jpeg") and image.get("alt")
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(data, validate=True), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None and picture.std() > 5
+        found.append(picture)
+    return found
+
+
+def cells(page: ElementTree.Element) -> dict[str, list[str]]:
+    """Rows of all tables, by their first cell."""
+    rows = [["".join(c.itertext()) for c in row] for row in page.iter("tr")]
+    return {row[0]: row[1:] for row in rows}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a session of three frames and a refused one leaves."""
+    out = tmp_path_factory.mktemp("run")
+    bundle = Mapper.load(write_weights(out / "w.safetensors"), tiny_config())
+    session = MapSession(bundle, stream_labels=ROOMS, source="<room> & hall")
+    for frame in tiny_frames()[:3]:
+        session.process(frame)
+    session.refuse(3, 77, "a pose that is no <pose>")
+    session.note_damage("bytes 5 to 9")
+    finish_session(session, out, "SIGINT")
+    return out
+
+
+def test_a_replay_leaves_a_report_with_its_figures_and_pictures(run: Path) -> None:
+    page, summary = read_page(run / "report.html"), json.loads((run / "summary.json").read_text())
+    assert page.findtext("body/h1") == "Replay of <room> & hall"
+    shown = cells(page)
+    assert shown["frames refused"] == ["1"] and shown["scored"] == ["3"]
+    assert shown["mIoU"] == [f"{summary['metrics']['miou'] * 100:.1f} %"]
+    assert shown["3"] == ["77", "a pose that is no <pose>"]
+    assert shown["fuse"] == [f"{summary['stages_ms']['fuse'][fraction]:.2f}" for fraction in ("p50", "p95")]
+    assert shown["torch"] == [summary["versions"]["torch"]]
+    found = pictures(page)
+    assert len(found) == 1 + 3 + 2, "overview, a strip a frame, stages and classes"
+    overview = cv2.imread(str(run / "overview.png"))
+    assert overview is not None and found[0].shape == overview.shape
+    assert np.abs(found[0].astype(int) - overview).mean() < 6, "the overview itself"
+    text = "".join(page.itertext())
+    assert "stopped by SIGINT" in text and "Damaged: bytes 5 to 9" in text
+    assert json.loads(page.findtext(".//details/pre") or "") == summary["config"]
+
+
+def test_the_map_is_on_the_page_in_3d_with_a_legend(run: Path) -> None:
+    page, summary = read_page(run / "report.html"), json.loads((run / "summary.json").read_text())
+    data = json.loads(page.findtext(".//script[@id='points']") or "")
+    points = VoxelMap.load(run / "map.npz").points()
+    assert data["count"] == len(points.xyz) == summary["map"]["surface_points"]
+    xyz, rgb = (np.frombuffer(base64.b64decode(data[name]), kind) for name, kind in (("xyz", "<u2"), ("rgb", "u1")))
+    placed = np.array(data["low"]) + np.array(data["extent"]) * xyz.reshape(-1, 3) / 65535
+    spread = [np.sort(np.linalg.norm(p - p.mean(axis=0), axis=1)) for p in (placed, points.xyz.astype(float))]
+    np.testing.assert_allclose(*spread, atol=2e-3), "turned upright, no more"
+    np.testing.assert_array_equal(np.sort(rgb), np.sort(points.rgb.ravel()))
+    boxes = [int(box.get("value") or 0) for box in page.iter("input") if box.get("type") == "checkbox"]
+    label = np.frombuffer(base64.b64decode(data["label"]), np.uint8)
+    assert sorted(boxes) == np.unique(label).tolist() == np.unique(points.label).tolist()
+    assert "viewport" in {meta.get("name") for meta in page.iter("meta")}
+
+
+def test_a_large_map_is_thinned_out_evenly() -> None:
+    side = np.linspace(0, 10, 800)
+    floor = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3).astype(np.float32)
+    points = MapPoints(
+        floor, np.zeros((len(floor), 3), np.uint8), np.full(len(floor), 1, np.uint8), np.ones(len(floor))
+    )
+    data = point_view(points, ROOMS, np.array((0.0, 0.0, 1.0)))["data"]
+    xyz = np.frombuffer(base64.b64decode(data["xyz"]), "<u2").reshape(-1, 3)
+    assert len(xyz) == data["count"] == MAX_VIEW_POINTS < len(floor)
+    counts = np.histogram2d(*xyz[:, :2].T, bins=4)[0]
+    assert counts.min() > 0.95 * counts.max() and 0.0125 < data["spacing"] < 0.05
+
+
+def test_replays_and_logs_are_compared_on_a_page(run: Path, tmp_path: Path) -> None:
+    summary = json.loads((run / "summary.json").read_text())
+    scores = {"methods": {}, "scored": 2, "excluded": 1, "pseudo_labelled": 0, "notes": ["S-Ray is below U-Net"]}
+    for name, miou in (("S-Ray", 0.5), ("U-Net", 0.25)):
+        figures = dict.fromkeys(("miou", "total_accuracy", "average_accuracy", "coverage"), miou)
+        scores["methods"][name] = {**figures, "per_class": {"wall": miou, "floor": None}}
+    found = {"replays": {"a": summary, "b": summary}, "logs": {"x/kitchen.mcap": scores}}
+    tables = {"x/kitchen.mcap": score_table("kitchen.mcap", scores)}
+    write_eval_report(tmp_path / "eval.html", found["replays"], [run, tmp_path], tables, found)
+    page = read_page(tmp_path / "eval.html")
+    assert page.findtext("body/h1") == "Evaluation of a, b, kitchen.mcap"
+    shown = cells(page)
+    assert shown["coverage"] == ["50.0 %", "25.0 %"] and shown["IoU floor"] == ["-", "-"]
+    assert "S-Ray is below U-Net" in "".join(page.itertext())
+    assert len(shown["frames fused"]) == 2
+    assert len(pictures(page)) == 2 + 1 + 1, (
+        "stages and classes of both, one overview that is there, classes of the log"
+    )
+
+
+def test_a_benchmark_run_has_a_page_with_its_pictures(tmp_path: Path) -> None:
+    ramp = np.tile(np.arange(0, 250, 5, np.uint8)[None, :, None], (40, 1, 3))
+    cv2.imwrite(str(tmp_path / "sheet.png"), ramp)
+    table = Table("", "a")
+    table.add_row("mIoU", "50.0 %")
+    found = {"title": "ROOMS test", "weights": {}}
+    write_suite_report(tmp_path / "s.html", table, ["a minus b: 3"], [tmp_path / "sheet.png"], found)
+    page = read_page(tmp_path / "s.html")
+    assert cells(page)["mIoU"] == ["50.0 %"] and "a minus b: 3" in "".join(page.itertext())
+    assert pictures(page)[0].shape == ramp.shape
+
+
+def test_a_page_that_cannot_be_written_says_so_and_leaves_the_old_one(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"page\.html: cannot be written"):
+        write_page(tmp_path / "file" / "page.html", "x", [Section()])
