@@ -23,8 +23,8 @@ from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.graph import GraphTracker, find_graph
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
+from semantic_mapper.replay.exporters.rerun_layout import rr
 from semantic_mapper.replay.exporters.rerun_log import RerunLog
-from semantic_mapper.replay.exporters.rerun_sdk import rr
 from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import NewestSubscriber

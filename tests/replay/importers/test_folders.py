@@ -1,0 +1,456 @@
+"""Sequence folders, TUM, ScanNet, Replica and KITTI-360: right values of what they hold."""
+
+from __future__ import annotations
+
+import json
+import os
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ImportSourceError, LogError
+from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.importers import ImportOptions, ImportReport, detect_format, import_recording
+from semantic_mapper.replay.importers.kitti360 import LABELS, depth_of_scan
+from semantic_mapper.replay.importers.tum import match_nearest
+from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.types import CameraIntrinsics
+from tests.replay import recordings as rec
+from tests.replay.recordings import DRIVE, add_scans, make_kitti360, make_replica
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return rec.make_folder(tmp_path / "kitchen")
+
+
+@pytest.fixture
+def tum(tmp_path: Path) -> Path:
+    return rec.make_tum(tmp_path / "desk")
+
+
+@pytest.fixture
+def scannet(tmp_path: Path) -> Path:
+    return rec.make_scannet(tmp_path / "scene0000_00")
+
+
+def imported(src: Path, **options: object) -> tuple[ImportReport, LogReader]:
+    dst = src.parent / "log.mcap"
+    report = import_recording(src, dst, options=ImportOptions(**options), overwrite=True)  # type: ignore[arg-type]
+    return report, LogReader(dst)
+
+
+def reasons(report: ImportReport) -> dict[int, str]:
+    return {skipped.frame: f"{skipped.file.name}: {skipped.reason}" for skipped in report.skipped}
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_a_sequence_folder_is_imported_without_loss(tmp_path: Path, suffix: str) -> None:
+    src = rec.make_folder(tmp_path / "kitchen", suffix=suffix)
+    report, log = imported(src)
+    assert (report.format, report.frames, report.labelled, report.skipped) == ("folder", 6, 6, ())
+    assert log.info.source == "folder kitchen" and not log.errors and len(log) == 6
+    for i, frame in enumerate(log):
+        file = src / "color" / f"{i:06d}.{suffix}"
+        assert np.array_equal(frame.rgb[..., ::-1], cv2.imread(str(file)))
+        assert frame.depth_m is not None and np.array_equal(frame.depth_m, rec.depth(i).astype(np.float32) / 1000)
+        assert frame.label is not None and np.array_equal(frame.label, rec.label(i))
+        assert np.array_equal(frame.T_world_camera, rec.pose(i))
+        assert (frame.seq, frame.stamp_ns, frame.intrinsics.fy) == (i, round(i * 1e9 / 6), 31.0)
+    files = [parts[2] for _, parts in log.frame_parts()]
+    assert files == [file.read_bytes() for file in sorted((src / "color").iterdir())]
+
+
+def test_classes_keep_their_ids_and_the_colours_of_the_known_set(folder: Path) -> None:
+    report, _ = imported(folder)
+    labels = report.info.label_set
+    assert labels is not None
+    assert (labels.name, labels.ids, labels.names, labels.ignore_id) == (
+        "nyu40",
+        (1, 2, 5),
+        ("wall", "floor", "chair"),
+        0,
+    )
+    assert labels.colors == tuple(rec.nyu40_color(name) for name in labels.names)
+
+
+def test_labels_without_an_ignore_id_keep_all_their_classes(folder: Path) -> None:
+    classes = {"0": "wall", "1": "floor", "2": "chair", "5": "lamp"}
+    (folder / "labels.json").write_text(json.dumps({"classes": classes, "ignore": None}))
+    report, log = imported(folder)
+    labels = log.info.label_set
+    assert labels is not None and (labels.ids, labels.ignore_id) == ((0, 1, 2, 5), 255)
+    assert report.labelled == 6 and np.array_equal(log.frame(0).label, rec.label(0))
+    assert (labels.to_channels(rec.label(0)) >= 0).all()
+    assert any("no ignore id; 255" in notice for notice in report.notices)
+    (folder / "labels.json").write_text(json.dumps({"classes": classes}))
+    report, _ = imported(folder)
+    assert any("class 0 'wall' is read as unknown" in notice for notice in report.notices)
+
+
+def test_each_bad_frame_is_left_out_with_its_reason_and_the_rest_kept(tmp_path: Path) -> None:
+    src = rec.make_folder(tmp_path / "kitchen", count=14)
+    rows = (src / "poses.txt").read_text().splitlines()
+    rows[1] = rows[1].replace("1.5", "nan")
+    rows[2] = " ".join(["2"] * 12 + ["0", "0", "0", "1"])
+    rows[3] = "1 2 3"
+    rows[4] = rows[4] + "x"
+    (src / "poses.txt").write_text("# poses\n\n" + "\n".join(rows) + "\n")
+    (src / "color" / "000005.jpg").unlink()
+    (src / "color" / "000006.jpg").write_bytes((src / "color" / "000006.jpg").read_bytes()[:-40])
+    rec.write_image(src / "color" / "000007.jpg", rec.color(7, 40, 30))
+    (src / "depth" / "000008.png").write_bytes(b"no image")
+    rec.write_image(src / "depth" / "000009.png", rec.label(9))  # 8 bits
+    rec.write_image(src / "depth" / "000010.png", rec.depth(10)[:10])
+    report, log = imported(src)
+    assert [frame.seq for frame in log] == [0, 11, 12, 13]
+    said = reasons(report)
+    for number, words in {
+        1: "poses.txt: line 4: the pose holds NaN",
+        2: "not a rotation",
+        3: "expected 16 numbers (4x4, row by row), got 3",
+        4: "poses.txt: line 7: could not convert",
+        5: "000005.jpg: cannot be read (No such file",
+        6: "000006.jpg: JPEG image is cut off",
+        7: "the image is 40x30, the camera's intrinsics say 32x24",
+        8: "000008.png: the depth image is damaged",
+        9: "one uint16 channel, this one has 1 of uint8",
+        10: "the depth image is 32x10, the colour image 32x24",
+    }.items():
+        assert words in said[number], (words, said[number])
+    assert set(said) == set(range(1, 11))
+
+
+def test_a_bad_label_image_costs_the_label_only(folder: Path) -> None:
+    strange = rec.label(1)
+    strange[3, 4] = 77
+    rec.write_image(folder / "label" / "000001.png", strange)
+    (folder / "label" / "000002.png").unlink()
+    report, log = imported(folder)
+    assert (report.frames, report.labelled) == (6, 4)
+    assert [frame.seq for frame in log if frame.label is None] == [1, 2]
+    assert all(skipped.label_only for skipped in report.skipped)
+    assert "class ids [77] are not in label set 'nyu40'" in reasons(report)[1]
+    assert "000002.png" in reasons(report)[2]
+
+
+@pytest.mark.parametrize(
+    ("text", "stamps"),
+    [
+        ("10000000\n25000000\n47000000\n50000000\n60000000\n70000000", [10**7, 25 * 10**6, 47 * 10**6]),
+        ("0.5\n1.25\n2.000000001\n3.\n4.0\n5.0", [5 * 10**8, 125 * 10**7, 2 * 10**9 + 1]),
+    ],
+)
+def test_stamps_come_from_timestamps_txt_where_there_is_one(folder: Path, text: str, stamps: list[int]) -> None:
+    (folder / "timestamps.txt").write_text(text)
+    report, log = imported(folder)
+    assert [frame.stamp_ns for frame in islice(log, 3)] == stamps and not report.notices
+
+
+def test_an_import_without_one_good_frame_fails_and_leaves_an_older_log_alone(folder: Path) -> None:
+    dst = folder.parent / "log.mcap"
+    import_recording(folder, dst)
+    before = dst.read_bytes()
+    (folder / "poses.txt").write_text("\n".join(["nan " * 16] * 6))
+    with pytest.raises(ImportSourceError, match="none of its 6 frames can be used"):
+        import_recording(folder, dst, overwrite=True)
+    with pytest.raises(LogError, match=r"log\.mcap: exists already; choose another name, or --overwrite it"):
+        import_recording(folder, dst)
+    assert dst.read_bytes() == before
+    assert sorted(p.name for p in folder.parent.iterdir()) == ["kitchen", "log.mcap"]
+
+
+def test_every_second_frame_is_imported(folder: Path) -> None:
+    dst, told = folder.parent / "log.mcap", list[tuple[int, int]]()
+    import_recording(folder, dst)
+    with LogReader(dst) as log:
+        stamps = [log.frame(number).stamp_ns for number in range(len(log))]
+    options = ImportOptions(every=2, max_frames=2)
+    import_recording(folder, dst, "folder", lambda *at: told.append(at), options=options, overwrite=True)
+    with LogReader(dst) as log:
+        assert [log.frame(number).stamp_ns for number in range(len(log))] == stamps[:3:2]
+    assert told == [(1, 2), (2, 2)]
+
+
+def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path: Path) -> None:
+    assert [detect_format(src) for src in (folder, tum, scannet)] == ["folder", "tum", "scannet"]
+    for name in ("nothing", "half/color", "bag"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("half/poses.txt", "bag/metadata.yaml", "bag/day_0.db3", "day.bag", "film.MP4", "day.zip"):
+        (tmp_path / name).touch()
+    (tmp_path / "log.mcap").touch()
+    for src, complaint in (
+        ("nothing", "no recording of a known format"),
+        (".", "holds recordings; name one of them: .*bag, .*day.bag, .*desk, .*kitchen, .*scene0000_00"),
+        ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json"),
+        ("film.MP4", "is a film, which has no poses"),
+        ("day.zip", "is packed; unpack it"),
+        ("no", "no such file or folder"),
+        ("log.mcap", "nor a log of semantic-mapper"),
+    ):
+        with pytest.raises(ImportSourceError, match=complaint):
+            detect_format(tmp_path / src)
+    assert [detect_format(tmp_path / src) for src in ("bag", "day.bag")] == ["rosbag", "rosbag"]
+    with pytest.raises(ImportSourceError, match="no format 'film'"):
+        import_recording(folder, tmp_path / "x.mcap", "film")
+
+
+def test_a_tum_sequence_gets_matched_depth_and_interpolated_poses(tum: Path) -> None:
+    report, log = imported(tum)
+    assert (report.format, report.frames, report.skipped) == ("tum", 6, ())
+    assert report.info.label_set is None
+    first = None
+    for i, frame in enumerate(log):
+        first = frame.stamp_ns if first is None else first
+        assert np.array_equal(frame.rgb[..., ::-1], rec.color(i))
+        assert frame.depth_m is not None and np.abs(frame.depth_m - rec.depth(i) / 1000).max() < 1e-6
+        after_s = (frame.stamp_ns - first) / 1e9
+        angle = rec.tum_angle(frame.stamp_ns - first)
+        assert np.allclose(frame.T_world_camera[:3, 3], (after_s, 0, 1.5), atol=1e-6)
+        assert np.allclose(frame.T_world_camera[:2, 0], (np.cos(angle), np.sin(angle)), atol=1e-6)
+    assert first == 1_305_031_102_175_304_000  # to the nanosecond
+
+
+@pytest.mark.parametrize("kind", ["folder", "tum"])
+def test_depth_is_read_by_the_convention_of_its_format_where_no_scale_is_given(tmp_path: Path, kind: str) -> None:
+    src = {"folder": rec.make_folder, "tum": rec.make_tum}[kind](tmp_path / kind)
+    given, log = imported(src)
+    expected = log.frame(0).depth_m
+    plain = {key: value for key, value in rec.INTRINSICS.items() if key != "depth_scale"}
+    (src / "intrinsics.json").write_text(json.dumps(plain))
+    assumed, log = imported(src)
+    assert np.array_equal(log.frame(0).depth_m, expected)
+    assert given.depth_scale.units_per_m == assumed.depth_scale.units_per_m == {"folder": 1000, "tum": 5000}[kind]
+    assert given.depth_scale.given_in == src / "intrinsics.json" and assumed.depth_scale.given_in is None
+    assert assumed.with_depth == 6 and assumed.median_depth_m == pytest.approx(np.median(rec.depth(0)) / 1000)
+
+
+def test_tum_frames_without_depth_are_kept_and_those_without_a_pose_left_out(tum: Path) -> None:
+    depth = (tum / "depth.txt").read_text().splitlines()
+    (tum / "depth.txt").write_text("\n".join([*depth[:2], "no time at all", *depth[3:]]))
+    truth = (tum / "groundtruth.txt").read_text().splitlines()
+    truth[5] = "1305031102.195304 nan 0 0 0 0 0 1"
+    (tum / "groundtruth.txt").write_text("\n".join(truth[:15]))
+    report, log = imported(tum)
+    said = reasons(report)
+    assert "groundtruth.txt has no pose near" in said[5]
+    assert 1 not in said and [frame.seq for frame in log] == [n for n in range(6) if n not in said]
+    assert [frame.seq for frame in log if frame.depth_m is None] == [1]
+    assert report.with_depth == report.frames - 1
+    assert any("depth.txt, line 3" in notice for notice in report.notices)
+    assert any("groundtruth.txt, line 6" in notice for notice in report.notices)
+
+
+def test_tum_calibrations_go_by_the_name_of_the_sequence(tmp_path: Path) -> None:
+    for name, fx, notice in (
+        ("freiburg1_desk", 546.755, ""),  # 517.3 before its lens is undone
+        ("freiburg3_office", 535.4, ""),
+        ("mine", 525.0, "ROS"),
+    ):
+        src = rec.make_tum(tmp_path / name, count=2)
+        (src / "intrinsics.json").unlink()
+        for file in (src / "rgb").iterdir():
+            rec.write_image(file, rec.color(0, 640, 480))
+        for file in (src / "depth").iterdir():
+            rec.write_image(file, np.full((480, 640), 5000, np.uint16))
+        report, _ = imported(src)
+        assert report.info.cameras["camera"].fx == pytest.approx(fx, abs=1e-3)
+        assert notice in " ".join(report.notices)
+
+
+def test_each_depth_image_is_matched_once_to_its_nearest() -> None:
+    a = np.array([0, 10, 20, 100], np.int64)
+    assert match_nearest(a, np.array([9, 21], np.int64), 15) == [-1, 0, 1, -1]
+    assert match_nearest(a, np.array([12], np.int64), 15) == [-1, 0, -1, -1]
+
+
+def test_a_scannet_scene_is_brought_to_the_pixels_of_its_depth(scannet: Path) -> None:
+    report, log = imported(scannet)
+    assert (report.format, report.frames, report.labelled, report.skipped) == ("scannet", 6, 6, ())
+    assert report.info.label_set == NYU40
+    for i, frame in enumerate(log):
+        assert frame.rgb.shape == (rec.HEIGHT, rec.WIDTH, 3) and (frame.seq, frame.intrinsics.fx) == (i, 30.0)
+        assert frame.stamp_ns == round(i * 20 * 1e9 / 30)
+        large = cv2.imread(str(scannet / "color" / f"{i * 20}.jpg"))
+        area = large.reshape(rec.HEIGHT, 2, rec.WIDTH, 2, 3).mean((1, 3))
+        assert np.abs(frame.rgb[..., ::-1] - area).max() <= 1
+        assert frame.depth_m is not None and np.array_equal(frame.depth_m, rec.depth(i).astype(np.float32) / 1000)
+        assert np.array_equal(frame.label, rec.label(i))
+        assert np.array_equal(frame.T_world_camera, rec.pose(i))
+
+
+def test_scannet_colour_and_labels_follow_the_ray_where_the_cameras_differ(scannet: Path) -> None:
+    # The colour camera looks 4 depth pixels further to the right: what was at u is at u - 4.
+    rec.write_matrix(scannet / "intrinsic" / "intrinsic_color.txt", 60.0, 62.0, 31.5 - 8.0, 23.5)
+    _, log = imported(scannet)
+    frame = log.frame(0)
+    assert frame.label is not None
+    assert np.array_equal(frame.label[:, 4:], rec.label(0)[:, :-4])
+    assert not frame.label[:, :4].any()  # outside the colour image: unknown
+    red = frame.rgb[:, 10, 2].astype(int)
+    expected = cv2.imread(str(scannet / "color" / "0.jpg"))[::2, 12, 0].astype(int)
+    assert np.abs(red - expected).max() <= 8
+
+
+def test_lost_scannet_poses_and_odd_images_are_left_out(scannet: Path) -> None:
+    (scannet / "pose" / "20.txt").write_text("-inf " * 16)
+    (scannet / "pose" / "40.txt").unlink()
+    (scannet / "depth" / "60.png").unlink()
+    rec.write_image(scannet / "color" / "80.jpg", rec.color(4))
+    rec.write_image(scannet / "label-filt" / "100.png", rec.label(5)[:5])
+    report, log = imported(scannet)
+    assert [frame.seq for frame in log] == [0, 3, 5]
+    assert log.frame(1).depth_m is None and report.with_depth == 2
+    said = reasons(report)
+    for number, words in {
+        1: "lost track of its pose here (-inf)",
+        2: "40.txt: cannot be read",
+        4: "the image is 32x24, the others 64x48",
+        5: "neither the size of colour nor of depth",
+    }.items():
+        assert words in said[number], said[number]
+
+
+def test_raw_scannet_ids_need_the_table_of_the_data_set(scannet: Path) -> None:
+    for i in range(6):
+        raw = np.repeat(np.repeat(rec.label(i), 2, 0), 2, 1).astype(np.uint16)
+        raw[raw == 5] = 1163
+        rec.write_image(scannet / "label-filt" / f"{i * 20}.png", raw)
+    report, _ = imported(scannet)
+    assert (report.frames, report.labelled) == (6, 0) and "scannetv2-labels.combined.tsv" in reasons(report)[0]
+    table = "id\traw_category\tnyu40id\n1\twall\t1\n2\tfloor\t2\n1163\tobject\t40\n1164\tnothing\t\n"
+    (scannet.parent / "scannetv2-labels.combined.tsv").write_text(table)
+    report, log = imported(scannet)
+    assert report.labelled == 6
+    expected = np.where(rec.label(0) == 5, 40, rec.label(0))
+    assert np.array_equal(log.frame(0).label, expected)
+
+
+@pytest.mark.parametrize("name", ["color/000001.jpg", "depth/000001.png", "label/000001.png"])
+def test_an_image_that_is_a_pipe_or_a_device_is_left_out(folder: Path, tmp_path: Path, name: str) -> None:
+    (folder / name).unlink()
+    for make in (lambda: os.mkfifo(folder / name), lambda: (folder / name).symlink_to("/dev/zero")):
+        make()
+        report = import_recording(folder, tmp_path / "out.mcap")
+        assert [(skipped.frame, skipped.file) for skipped in report.skipped] == [(1, folder / name)]
+        assert "is no regular file" in report.skipped[0].reason
+        (folder / name).unlink()
+        (tmp_path / "out.mcap").unlink()
+
+
+def test_classes_are_renamed_and_joined_on_the_way_in(folder: Path) -> None:
+    dst = folder.parent / "log.mcap"
+    report = import_recording(folder, dst, renames={"floor": "ground", "chair": "ground"})
+    assert report.frames == report.labelled == 6
+    log = LogReader(dst)
+    assert log.info.label_set is not None
+    assert dict(zip(log.info.label_set.names, log.info.label_set.ids, strict=True)) == {"wall": 1, "ground": 2}
+    for i, frame in enumerate(log):
+        assert frame.label is not None
+        assert np.array_equal(frame.label, np.where(rec.label(i) == 5, 2, rec.label(i)))
+
+
+def test_images_of_a_camera_on_its_side_are_turned_with_their_poses(folder: Path) -> None:
+    dst = folder.parent / "turned.mcap"
+    report = import_recording(folder, dst, options=ImportOptions(quarters=1))
+    log = LogReader(dst)
+    assert report.frames == 6 and not report.skipped
+    assert (log.info.cameras["camera"].width, log.info.cameras["camera"].height) == (rec.HEIGHT, rec.WIDTH)
+    import_recording(folder, folder.parent / "upright.mcap")
+    upright = LogReader(folder.parent / "upright.mcap")
+    for turned, frame in zip(log, upright, strict=True):
+        assert turned.label is not None and frame.label is not None and turned.depth_m is not None
+        assert np.array_equal(turned.rgb, np.rot90(frame.rgb, -1))
+        assert np.array_equal(turned.label, np.rot90(frame.label, -1))
+        assert turned.intrinsics == log.info.cameras["camera"]
+        np.testing.assert_allclose(turned.T_world_camera[:3, 2], frame.T_world_camera[:3, 2])
+        np.testing.assert_allclose(turned.T_world_camera[:3, 1], frame.T_world_camera[:3, 0])
+
+
+def test_a_replica_sequence_is_imported_without_loss(tmp_path: Path) -> None:
+    sequence = make_replica(tmp_path)
+    report = import_recording(sequence, tmp_path / "log.mcap")
+    assert (report.format, report.frames, report.labelled, report.skipped) == ("replica", 3, 3, ())
+    with LogReader(tmp_path / "log.mcap") as log:
+        k = log.info.cameras["camera"]
+        assert (k.width, k.height, k.cx, k.cy) == (640, 480, 319.5, 239.5)
+        assert k.fx == k.fy == pytest.approx(320.0)
+        assert log.info.source == "replica room_0 Sequence_1"
+        assert log.info.label_set is not None and log.info.label_set.ids == (3, 93, 97)
+        assert log.info.label_set.names == ("basket", "wall", "window")
+        for i, frame in enumerate(log):
+            assert np.array_equal(frame.rgb[..., ::-1], rec.color(i, 640, 480))
+            assert frame.depth_m is not None and (frame.depth_m == np.float32(1500 + i) / np.float32(1000)).all()
+            assert np.array_equal(frame.T_world_camera, rec.pose(i)) and frame.stamp_ns == round(i * 1e9 / 30)
+            assert frame.label is not None and frame.label[0, 0] == 97 and frame.label[1, 1] == (0, 3, 93)[i]
+
+
+def test_a_kitti360_drive_is_imported_with_both_cameras(tmp_path: Path) -> None:
+    root = make_kitti360(tmp_path / "KITTI-360")
+    assert detect_format(root) == detect_format(root / "data_2d_raw" / DRIVE) == "kitti360"
+    report = import_recording(root, tmp_path / "log.mcap")
+    assert (report.frames, report.labelled) == (4, 4) and "without depth" in report.notices[0]
+    assert [(s.frame, s.file.name) for s in report.skipped] == [(2, "cam0_to_world.txt"), (3, "cam0_to_world.txt")]
+    with LogReader(tmp_path / "log.mcap") as log:
+        frames = list(log)
+        assert [(f.camera_id, f.seq) for f in frames] == [
+            ("image_00", 250),
+            ("image_01", 250),
+            ("image_00", 252),
+            ("image_01", 252),
+        ]
+        for f in frames:
+            assert f.depth_m is None and (f.intrinsics.fx, f.intrinsics.cx) == (52.554261, 31.049453)
+            assert (f.intrinsics.width, f.intrinsics.height) == (64, 24) and log.info.cameras[f.camera_id]
+            seconds = f.seq // 10
+            second = datetime(2013, 5, 28, 8, 46, seconds, tzinfo=UTC).timestamp()
+            assert f.stamp_ns == int(second) * 10**9 + (f.seq % 10) * 100_000_000 + 4_547_200
+            assert f.label is not None and f.label[0, 0] == 26 and not f.label[1:3].any() and (f.label[3:] == 7).all()
+            shift = np.array((0.594184, 0, 0)) if f.camera_id == "image_01" else np.zeros(3)
+            left = rec.pose(f.seq - 250)
+            assert np.array_equal(f.T_world_camera[:3, :3], left[:3, :3])
+            np.testing.assert_allclose(f.T_world_camera[:3, 3], left[:3, :3] @ shift + left[:3, 3], atol=1e-6)
+        assert log.info.label_set == LABELS
+
+
+def test_laser_scans_give_depth_to_both_cameras(tmp_path: Path) -> None:
+    root = make_kitti360(tmp_path / "KITTI-360")
+    add_scans(root, np.array([[4.0, 0.0, -0.5], [-4.0, 0, 0], [np.nan, 0, 0]]))  # the second lies behind the camera
+    report = import_recording(root, tmp_path / "log.mcap")
+    assert (report.frames, report.with_depth) == (4, 2) and not any("depth" in n for n in report.notices)
+    with LogReader(tmp_path / "log.mcap") as log:
+        left, right, later, _ = log
+    for frame, shift_m in ((left, 0.0), (right, 0.594184)):
+        assert frame.depth_m is not None
+        k = frame.intrinsics
+        row, column = np.nonzero(frame.depth_m)
+        assert len(row) == 1 and frame.depth_m[row, column] == pytest.approx(4.0, abs=0.05)
+        assert abs(column[0] - (k.cx - k.fx * shift_m / 4)) < 1.5 and abs(row[0] - k.cy) < 1.5
+    assert later.depth_m is None
+
+
+def test_a_scan_fills_the_pixels_between_its_beams() -> None:
+    camera = CameraIntrinsics(552.6, 552.6, 100.0, 50.0, 200, 100)
+    depth = depth_of_scan(np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 9.0]]), np.eye(4), camera)
+    row, column = np.nonzero(depth)
+    assert (row.min(), row.max(), column.min(), column.max()) == (48, 52, 99, 101) and (depth[row, column] == 5).all()
+    assert not depth_of_scan(np.zeros((0, 3)), np.eye(4), camera).any()
+
+
+def test_the_label_table_is_the_published_one() -> None:
+    name = dict(zip(LABELS.ids, LABELS.names, strict=True))
+    color = dict(zip(LABELS.ids, LABELS.colors, strict=True))
+    assert (name[7], name[11], name[21], name[26], name[34], name[41]) == (
+        "road",
+        "building",
+        "vegetation",
+        "car",
+        "garage",
+        "box",
+    )
+    assert (color[7], color[23], color[39], color[41]) == ((128, 64, 128), (70, 130, 180), (0, 128, 192), (64, 64, 128))
+    assert len(LABELS) == 35 and LABELS.ids[-1] == 41
