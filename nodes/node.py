@@ -16,10 +16,17 @@ from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.failures import failure_message
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
-from semantic_mapper.nodes.process import STOP_SIGNAL, StopRequest, prepare_process
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.nodes.supervisor.node_process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT
+from semantic_mapper.nodes.process import (
+    EXIT_LOSS,
+    FAILURE_EVENT,
+    JOB_PREFIX,
+    LOSS_EVENT,
+    STOP_SIGNAL,
+    StopRequest,
+    prepare_process,
+)
 
 _log = structlog.get_logger(__name__)
 
@@ -125,6 +132,8 @@ def run_node(
                 restartable=job.restartable,
             )
             losses = work(context, options)
+            # A request that comes from here on finds a process that ends anyway, and must not hide how it ended.
+            signal.signal(STOP_SIGNAL, signal.SIG_IGN)
         code = stop.exit_code if job.heartbeat_fd >= 0 else 0
         if losses and not code:
             _log.error(LOSS_EVENT, lost=losses)

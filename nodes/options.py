@@ -232,32 +232,13 @@ class FoxgloveOptions(BridgeOptions, frozen=True):
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8765  # 0 = any that is free
 
 
-class ZenohOptions(BridgeOptions, frozen=True):
-    """Publishes to Zenoh. Beyond this machine both sides prove who they are by certificates (mutual TLS)."""
-
-    prefix: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*\Z")] = (
-        "semantic_mapper"  # of keys
-    )
-    listen: str = (
-        "tcp/127.0.0.1:7447"  # where clients connect; with certificates also tls/ADDRESS:PORT; empty = nowhere
-    )
-    connect: str = ""  # a router to connect to, in the same form; empty = none
-    # Folder with ca.pem (of the authority that signed all sides), own.pem and own.key (of this one); empty = none.
-    certificates: str = ""
-
-    def __post_init__(self) -> None:
-        if not (self.listen or self.connect):
-            raise ValueError("give `listen`, `connect` or both: with neither nobody could receive anything")
-
-
-NodeOptions = CameraOptions | MapperOptions | RecorderOptions | FinetunerOptions | FoxgloveOptions | ZenohOptions
+NodeOptions = CameraOptions | MapperOptions | RecorderOptions | FinetunerOptions | FoxgloveOptions
 OPTIONS: dict[str, type[NodeOptions]] = {
     "camera": CameraOptions,
     "mapper": MapperOptions,
     "recorder": RecorderOptions,
     "finetuner": FinetunerOptions,
     "foxglove": FoxgloveOptions,
-    "zenoh": ZenohOptions,
 }
 
 

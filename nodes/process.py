@@ -18,6 +18,9 @@ from semantic_mapper.plain_text import visible
 from semantic_mapper.redaction import without_secrets
 
 STOP_SIGNAL = signal.SIGUSR1  # by which a launcher asks its nodes to end: SIGTERM may come from anybody
+EXIT_LOSS = 3  # of a node that came to its end in order, but a part of what it was to keep is lost
+FAILURE_EVENT, LOSS_EVENT = "node_failed", "node_lost_data"  # log events with a node's last words
+JOB_PREFIX = "fd:"  # of a node's argument that names an open file with its job
 MAX_THREADS = 16  # more gain nothing on the small work of one frame
 
 
@@ -108,7 +111,8 @@ class StopRequest:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for signum, handler in self._previous.items():
-            signal.signal(signum, handler)
+            if signal.getsignal(signum) == self._note:  # else somebody has set another one meanwhile
+                signal.signal(signum, handler)
 
     def _note(self, signum: int, frame: FrameType | None) -> None:
         if self.signum and not self._patient:

@@ -11,7 +11,7 @@ import pytest
 HIDDEN = """
 import sys
 FLEET = ("ray", "duckdb", "pyarrow", "fsspec", "s3fs", "gcsfs")
-for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh", *FLEET):
+for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", *FLEET):
     sys.modules[name] = None
 """
 
@@ -53,7 +53,7 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh
                 """,
                 f"pip install 'semantic-mapper[{kind}]'",
             )
-            for kind in ("foxglove", "zenoh")
+            for kind in ("foxglove",)
         ),
         *(
             (

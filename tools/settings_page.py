@@ -18,8 +18,8 @@ import semantic_mapper.drivers.stereo.config
 import semantic_mapper.drivers.v4l2.config
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.config import KINDS
+from semantic_mapper.nodes.launcher.launch_file import LaunchFile
 from semantic_mapper.nodes.options import OPTIONS
-from semantic_mapper.nodes.supervisor.launch_config import LaunchFile
 from semantic_mapper.setting_docs import Setting, settings_of
 from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.online import OnlineConfig

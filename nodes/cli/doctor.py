@@ -15,7 +15,7 @@ from semantic_mapper.drivers.registry import KINDS, find_cameras
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.doctor.machine import examine
-from semantic_mapper.nodes.supervisor.packaged_files import find_launch
+from semantic_mapper.nodes.launcher.launch_file import find_launch
 
 _STYLES = {"ok": "green", "note": "yellow", "bad": "bold red"}
 
@@ -45,7 +45,7 @@ def doctor(
     camera whose packages are missing is reported, too.
 
     Example: semantic-mapper doctor
-    Example: semantic-mapper doctor launch/headless-onboard.toml --set keys=~/.config/semantic-mapper/keys
+    Example: semantic-mapper doctor onboard --set keys=~/.config/semantic-mapper/keys
     Example: semantic-mapper doctor --cameras --kind v4l2 --json
     """
     if kind and not cameras:

@@ -21,7 +21,7 @@ from semantic_mapper.mapping.map_scale import length_unit, voxel_size_text
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
-from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
+from semantic_mapper.nodes.launcher.running import map_endpoint
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.autolabel_note import read_note

@@ -13,8 +13,8 @@ from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.labeller.server import LabelServer
 from semantic_mapper.nodes.labeller.session import LabelSession
+from semantic_mapper.nodes.launcher.running import NOTE, read_launch_note
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.launch_note import NOTE, read_launch_note
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.messages import LabelledKeyframe

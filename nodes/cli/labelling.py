@@ -16,8 +16,8 @@ from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_chec
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.console import FrameProgress
+from semantic_mapper.nodes.launcher.running import running_launches
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.running_launches import running_launches
 from semantic_mapper.replay.finetune_log import FinetuneRequest, FrameSource
 from semantic_mapper.replay.importers.folder import read_label_set
 from semantic_mapper.replay.label_folder import (

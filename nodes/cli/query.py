@@ -18,7 +18,7 @@ from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file, verb
 from semantic_mapper.nodes.console import Output, frame_progress
-from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
+from semantic_mapper.nodes.launcher.running import map_endpoint
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.graph_picture import draw_graph

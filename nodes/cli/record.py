@@ -14,14 +14,13 @@ from semantic_mapper.errors import ConfigError, LogError
 from semantic_mapper.nodes.cli.options import SettingOptions
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
+from semantic_mapper.nodes.launcher.running import launch_folder, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder
 from semantic_mapper.nodes.recorder.node import record as record_until_end
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
-from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.run_folder import prepare_file
 
@@ -72,7 +71,7 @@ def record(
 
     The log keeps the calibration and the launch's settings as attachments. Exit code 1 where something is missing,
     such as where the disk was full; what was written is whole. A launch can also have a recorder of its own
-    (launch/record.toml).
+    (`--set recorder.enabled=true`).
 
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """

@@ -12,12 +12,11 @@ from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.eval import print_results
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
+from semantic_mapper.nodes.launcher.launcher import Launcher
+from semantic_mapper.nodes.launcher.systemd import Notifier
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.launch_config import load_launch
-from semantic_mapper.nodes.supervisor.launcher import Launcher
-from semantic_mapper.nodes.supervisor.packaged_files import find_launch
-from semantic_mapper.nodes.supervisor.systemd import Notifier
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.run_folder import hold_folder
 
@@ -35,7 +34,11 @@ def up(
     launch: LaunchArgument,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Replace a value of the file's [set] table; may be repeated."),
+        typer.Option(
+            "--set",
+            metavar="NODE.OPTION=VALUE",
+            help="Set an option of a node, or `out`, `restart`, ...; may be repeated.",
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results; the same as --set out=DIR.")
@@ -48,8 +51,8 @@ def up(
     where the launch file says so it is restarted first (`restart`). The exit code is 1, too, where a recorder knows at
     its end that frames are not in its log. `semantic-mapper view --status` shows how the nodes are.
 
-    Example: semantic-mapper up replay --set log=kitchen.mcap --out runs/up
-    Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
+    Example: semantic-mapper up replay --set camera.log=kitchen.mcap --out runs/up
+    Example: semantic-mapper up camera --set camera.kind=oak
     """
     output = Output.guarded()
 

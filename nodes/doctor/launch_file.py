@@ -10,8 +10,8 @@ from pathlib import Path
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.nodes.doctor.check import Check, failed
 from semantic_mapper.nodes.doctor.launch_nodes import node_settings
-from semantic_mapper.nodes.options import FoxgloveOptions, MapperOptions, ZenohOptions
-from semantic_mapper.nodes.supervisor.launch_config import Launch, load_launch
+from semantic_mapper.nodes.launcher.launch_file import Launch, load_launch
+from semantic_mapper.nodes.options import FoxgloveOptions, MapperOptions
 from semantic_mapper.transport.endpoints import check_bind
 from semantic_mapper.transport.keys import load_keys, user_key_folder
 
@@ -67,8 +67,6 @@ def _listening(launch: Launch) -> list[tuple[str, str]]:
             found += [(options.query, options.keys), (options.publish, options.keys)]
         elif isinstance(options, FoxgloveOptions):
             found.append((f"tcp://127.0.0.1:{options.port}", ""))
-        elif isinstance(options, ZenohOptions) and options.listen.startswith("tcp/"):
-            found.append((options.listen.replace("/", "://", 1), ""))
     return [(endpoint, keys) for endpoint, keys in found if "://" in endpoint]
 
 

@@ -8,15 +8,14 @@ from pathlib import Path
 
 from semantic_mapper.errors import CameraError, ConfigError, SemanticMapperError
 from semantic_mapper.nodes.doctor.check import Check, failed
+from semantic_mapper.nodes.launcher.launch_file import Launch, NodeEntry
 from semantic_mapper.nodes.options import (
     CameraOptions,
     FinetunerOptions,
     FoxgloveOptions,
     LiveCamera,
     MapperOptions,
-    ZenohOptions,
 )
-from semantic_mapper.nodes.supervisor.launch_config import Launch, NodeEntry
 
 
 def node_settings(launch: Launch) -> Iterator[Check]:
@@ -65,12 +64,6 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
         case FoxgloveOptions():
             import_module("semantic_mapper.nodes.foxglove.sdk")
             return "its package"
-        case ZenohOptions() as options:
-            from semantic_mapper.nodes.zenoh.addresses import zenoh_settings
-
-            import_module("semantic_mapper.nodes.zenoh.sdk")
-            zenoh_settings(options)
-            return "its package and addresses"
         case _:
             return ""
 

@@ -297,7 +297,7 @@ class Recorder:
         return LogAttachment("calibration.json", "application/json", cameras)
 
     def _attachments(self) -> list[LogAttachment]:
-        from semantic_mapper.nodes.supervisor.launch_note import NOTE as LAUNCH
+        from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
         from semantic_mapper.replay.log.reader import LogAttachment
 
         kept = [self._calibration()]

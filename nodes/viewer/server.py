@@ -22,9 +22,8 @@ from urllib.parse import quote
 import structlog
 
 from semantic_mapper.errors import DependencyError, TransportError
+from semantic_mapper.nodes.launcher.liveness import ProgressLimit, cpu_seconds, end_with_launcher
 from semantic_mapper.nodes.process_folder import OwnFolder
-from semantic_mapper.nodes.supervisor.heartbeat import end_with_launcher
-from semantic_mapper.nodes.supervisor.progress import ProgressLimit, cpu_seconds
 from semantic_mapper.nodes.viewer.privacy_proxy import QuietPage
 
 HOST = "127.0.0.1"  # what is seen has neither keys nor passwords: other machines come in by `ssh -L`

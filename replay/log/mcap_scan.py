@@ -98,7 +98,7 @@ def scan(fd: int, where: str) -> Scan:
         what = f"it {kind or 'does not start like one'}" if start else "it is empty"
         raise LogError(
             f"{where}: not an MCAP log ({what}); make one with `semantic-mapper import` or by "
-            "`semantic-mapper up launch/record.toml`"
+            "`semantic-mapper up replay --set recorder.enabled=true`"
         )
     return _read_index(fd, size) or _walk(fd, len(MAGIC), size)
 

@@ -17,7 +17,7 @@ from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe, Status
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
-NODES = ("camera", "mapper", "finetuner")  # of replay-learning.toml
+NODES = ("camera", "mapper", "finetuner")  # of learning.toml
 KEYFRAMES = 8
 FAULTS = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP}
 SETTLE_S = 1.5  # between two faults
@@ -32,7 +32,7 @@ def finetuner_faults(settings: Sequence[str], out: Path, rounds: int) -> Iterato
 
 
 def _finetuner_faults(settings: Sequence[str], out: Path) -> Iterator[Outcome]:
-    with LiveLaunch(settings, out, name="replay-learning.toml", nodes=NODES) as launch:
+    with LiveLaunch(settings, out, name="learning.toml", nodes=NODES) as launch:
         folder = launch.sockets()
         camera, mapper = launch.listen()
         with (

@@ -24,10 +24,10 @@ from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.launcher.launcher import process_stats
+from semantic_mapper.nodes.launcher.processes import NodeProcess
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.nodes.supervisor.hang_detector import process_stats
-from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.transport.codec import decode, decode_request, encode, encode_frame, unpack_parts
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import StreamInfo

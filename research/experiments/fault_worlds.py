@@ -79,7 +79,7 @@ def _map(out: Path, frames: list[PosedFrame]) -> tuple[VoxelMap, dict[str, float
         for seq, frame in enumerate(frames):
             log.write_frame(replace(frame, seq=seq, stamp_ns=(seq + 1) * 66_666_667, label=None))
     command = [str(Path(sys.executable).with_name("semantic-mapper")), "up", "replay"]
-    command += ["--set", f"log={log_path}", "--set", "voxel_size=0.03", "--out", str(out)]
+    command += ["--set", f"camera.log={log_path}", "--set", "mapper.voxel_size_m=0.03", "--out", str(out)]
     told: dict[str, float] = {}
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(

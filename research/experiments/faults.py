@@ -1,7 +1,7 @@
 """Breaks a live launch in every way we know, again and again: how long until it is back, and what was lost.
 
-Nodes are killed and frozen in a long launch (launch/replay-live.toml: a log in the time of its recording, with camera,
-mapper and recorder), a finetuner in another (launch/replay-learning.toml); the clock is stepped in a third; each kill
+Nodes are killed and frozen in a long launch (launch/camera.toml: a log in the time of its recording, with camera,
+mapper and recorder), a finetuner in another (launch/learning.toml); the clock is stepped in a third; each kill
 of the launcher has one of its own; floods of garbage hit a mapper node; a small disk is filled; camera and frames are
 spoiled in process; a camera comes back in another world in launches of its own.
 
@@ -68,8 +68,8 @@ def _run(case: str, arguments: argparse.Namespace, folder: Path) -> Iterable[fau
         log = arguments.log or folder / "long.mcap"
         if not log.exists():
             write_long_log(log, LOG_S, HZ)
-        settings = [f"log={log.absolute()}", "save_every=2"]
-        settings += [f"{name}={value}" for name, value in (("weights", weights), ("config", config)) if value]
+        settings = [f"camera.log={log.absolute()}", "mapper.save_every_s=2"]
+        settings += [f"mapper.{name}={value}" for name, value in (("weights", weights), ("config", config)) if value]
         if case == "nodes":
             return fault_nodes.node_faults(settings, folder / "nodes", rounds)
         if case == "finetuner":

@@ -23,7 +23,7 @@ from semantic_mapper.types import MapUpdate
 
 COMMAND = Path(sys.executable).parent / "semantic-mapper"
 LAUNCH_FOLDER = Path(__file__).resolve().parents[2] / "launch"
-NODES = ("camera", "recorder", "mapper")  # of replay-live.toml
+NODES = ("camera", "recorder", "mapper")  # of camera.toml
 PATIENCE_S = 600.0
 
 Key = tuple[str, str, int, int]  # topic, source, stamp, number
@@ -133,11 +133,12 @@ class LiveLaunch:
         settings: Iterable[str],
         out: Path,
         variables: Mapping[str, str] | None = None,
-        name: str = "replay-live.toml",
+        name: str = "camera.toml",
         nodes: Sequence[str] = NODES,
     ) -> None:
         out.mkdir(parents=True, exist_ok=True)
-        chosen = [word for setting in settings for word in ("--set", setting)]
+        more = ["recorder.enabled=true"] if "recorder" in nodes else []
+        chosen = [word for setting in (*settings, *more) for word in ("--set", setting)]
         self.out = out
         self.nodes = tuple(nodes)
         self.process = subprocess.Popen(

@@ -198,14 +198,14 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--warm-up", type=float, default=3.0, help="minutes that slopes leave out")
     parser.add_argument("--log", type=Path, help="of 30 frames a second, numbered from 0; made where it is not given")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="as of `semantic-mapper up`")
+    parser.add_argument("--set", action="append", default=[], metavar="SETTING", help="as of `semantic-mapper up`")
     parser.add_argument("--out", type=Path, default=Path("runs/soak"), help="OUT.json, OUT.md and OUT.png are written")
     arguments = parser.parse_args()
     before = os.getloadavg()
     with tempfile.TemporaryDirectory(prefix="soak-") as name:
         seconds = 60 * arguments.minutes + START_S
         log = arguments.log or write_long_log(Path(name) / "long.mcap", seconds, HZ)
-        settings = (f"log={log.absolute()}", f"save_every={SAVE_EVERY_S}", *arguments.set)
+        settings = (f"camera.log={log.absolute()}", f"mapper.save_every_s={SAVE_EVERY_S}", *arguments.set)
         with LiveLaunch(settings, Path(name) / "up") as launch:
             seen = watch(launch, arguments.minutes)
             launch.process.send_signal(signal.SIGINT)

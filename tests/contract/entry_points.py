@@ -43,6 +43,7 @@ from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore, Progress
+from semantic_mapper.nodes.launcher.launch_file import LaunchFile, NodeEntry, load_launch
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import (
     CameraOptions,
@@ -51,9 +52,7 @@ from semantic_mapper.nodes.options import (
     LiveCamera,
     MapperOptions,
     RecorderOptions,
-    ZenohOptions,
 )
-from semantic_mapper.nodes.supervisor.launch_config import LaunchFile, NodeEntry, load_launch
 from semantic_mapper.replay.compare import Tolerances
 from semantic_mapper.replay.corrected_poses import read_corrections
 from semantic_mapper.replay.importers.base import RenameConfig
@@ -259,7 +258,6 @@ SETTINGS: dict[str, tuple[type[msgspec.Struct], dict[str, Any]]] = {
     "launch.recorder": (RecorderOptions, {"out": "a"}),
     "launch.finetuner": (FinetunerOptions, {}),
     "launch.foxglove": (FoxgloveOptions, {}),
-    "launch.zenoh": (ZenohOptions, {}),
     "camera.v4l2": (semantic_mapper.drivers.v4l2.config.Config, {}),
     "camera.opencv": (semantic_mapper.drivers.opencv.config.Config, {"source": "a.mp4"}),
     "camera.stereo": (semantic_mapper.drivers.stereo.config.Config, {}),
@@ -285,9 +283,9 @@ def parse_settings(name: str, values: Mapping[str, Any]) -> Any:
     return convert_config(dict(values), SETTINGS[name][0], name)
 
 
-def load_launch_values(path: Path) -> dict[str, Any]:
-    """A launch file's [set] table."""
-    return dict(load_config(path, LaunchFile).set)
+def launch_nodes(path: Path) -> list[str]:
+    """Names of the nodes of a launch file."""
+    return [node.name for node in load_config(path, LaunchFile).node]
 
 
 # Names of then that are called otherwise now: `replay`, `nodes` and `drivers` are no longer top-level modules, because

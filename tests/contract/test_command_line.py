@@ -58,7 +58,7 @@ COMMANDS: dict[str, str] = {
     "compare other runs": "compare {map} {int16}",
     "compare with a tolerance that is none": "compare {map} {map} -t labels",
     "compare a log": "compare {log} {map}",
-    "up with an unknown setting": "up replay --set log={log} --set colour=red",
+    "up with an unknown setting": "up replay --set camera.log={log} --set colour=red",
     "up without a log": "up replay",
     "up of what is no launch file": "up {tmp}/none.toml",
     "keys make": "keys make --keys {tmp}/keys",

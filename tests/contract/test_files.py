@@ -52,16 +52,8 @@ rms_px = 0.21
 _JSON = '{"fx": 80, "fy": 80, "cx": 47.5, "cy": 35.5, "width": 96, "height": 72, "distortion": [0, 0, 0, 0]}'
 _ALL_KINDS = """# One node of each kind, each kind of camera and of poses, with what launch files of then say.
 heartbeat_s = 1.5
-stall_s = 120.0
-start_s = 200.0
-stop_s = 10.0
-finish_s = 100.0
 publish = "tcp://127.0.0.1:5571"
-
-[set]
-out = "runs/live/{now}"
-rate = 0.5
-device = ""
+out = "runs/live"
 
 [[node]]
 name = "log"
@@ -69,7 +61,7 @@ kind = "camera"
 [node.options]
 log = "room.mcap"
 mode = "realtime"
-rate = "{rate}"
+rate = 0.5
 max_frames = 9
 subscriber_timeout_s = 60.0
 ack_timeout_s = 60.0
@@ -78,16 +70,13 @@ ack_timeout_s = 60.0
 name = "oak"
 kind = "camera"
 restart = "on-failure"
-backoff_s = 0.2
-max_restarts = 5
-standby = true
 [node.options.camera]
 kind = "oak"
 id = "oak"
 open_s = 3.0
 T_rig_camera = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 [node.options.camera.config]
-device = "{device}"
+device = ""
 fps = 20.0
 odometry = true
 [node.options.camera.poses]
@@ -260,11 +249,11 @@ def look_at_corrections(_: Path) -> dict[str, Any]:
 
 def look_at_launch(_: Path) -> dict[str, Any]:
     """Nodes with their options."""
-    launch = api.load_launch(LAUNCH_FILE, ["now=then"])
+    launch = api.load_launch(LAUNCH_FILE)
     return {
         "nodes": {node.name: {"kind": node.kind, "entry": leaves(node)} for node in launch.nodes},
         "options": {name: leaves(options) for name, options in launch.options.items()},
-        "inputs": {node.name: list(launch.inputs(node.name)) for node in launch.nodes},
+        "inputs": {name: list(options.inputs()) for name, options in launch.options.items()},
         "all": leaves(launch),
     }
 

@@ -120,7 +120,7 @@ def test_two_replays_are_equal_bit_for_bit(room_run: Path, tmp_path: Path) -> No
 @pytest.mark.gate
 @pytest.mark.slow
 def test_lockstep_processes_make_the_map_of_one_process_bit_for_bit(room_run: Path, tmp_path: Path) -> None:
-    values = {"log": LOG, "weights": WEIGHTS, "config": room_run.parent / "room.toml"}
+    values = {"camera.log": LOG, "mapper.weights": WEIGHTS, "mapper.config": room_run.parent / "room.toml"}
     settings = [word for name, value in values.items() for word in ("--set", f"{name}={value}")]
     ran = api.run_command("up", api.LAUNCH / "replay.toml", *settings, "--out", tmp_path / "up")
     assert ran.code == 0, ran.stderr

@@ -24,8 +24,8 @@ EXAMPLES: dict[str, Any] = {
 
 
 def observe() -> dict[str, Any]:
-    """Defaults of all settings, by table and dotted name; of shipped launch files, what ``--set`` may replace."""
-    files = {path.name: sorted(api.load_launch_values(path)) for path in sorted(api.LAUNCH.glob("*.toml"))}
+    """Defaults of all settings, by table and dotted name; nodes of shipped launch files."""
+    files = {path.name: api.launch_nodes(path) for path in sorted(api.LAUNCH.glob("*.toml"))}
     return {"defaults": {name: defaults(name) for name in api.SETTINGS}, "launch": files}
 
 
@@ -130,14 +130,12 @@ def _toml_files() -> list[Path]:
 @pytest.mark.parametrize("path", _toml_files(), ids=lambda p: p.name)
 def test_shipped_files_are_read(path: Path, tmp_path: Path) -> None:
     if path.is_relative_to(api.LAUNCH):
-        names = {"log", "video", "calibration", "left", "right", "keys", "device", "kind", "poses"}
-        empty = [name for name, value in api.load_launch_values(path).items() if value == "" and name in names]
-        given = {name: {"kind": "v4l2"}.get(name, f"a-{name}") for name in empty}
-        assert api.load_launch(path, [f"{name}={value}" for name, value in given.items()], tmp_path).nodes
+        given = {"camera": ["camera.kind=oak"], "replay": ["camera.log=a.mcap"]}.get(path.stem, [])
+        assert api.load_launch(path, given, tmp_path).nodes
     else:
         assert api.load_config(path, api.SETTINGS["rename"][0])
 
 
 @pytest.mark.parametrize("name", _FILE["launch"])
-def test_a_shipped_launch_file_takes_the_same_settings(name: str) -> None:
-    assert set(_FILE["launch"][name]) <= set(api.load_launch_values(api.LAUNCH / name))
+def test_a_shipped_launch_file_has_the_same_nodes(name: str) -> None:
+    assert _FILE["launch"][name] == api.launch_nodes(api.LAUNCH / name)

@@ -18,13 +18,6 @@ from tests.contract import entry_points as api
 from tests.contract.golden import LOG, ROOM_SETTINGS, WEIGHTS, parts_of, read
 
 LAUNCH = """
-[set]
-log = ""
-out = ""
-weights = ""
-config = ""
-place = ""
-
 [[node]]
 name = "mapper"
 kind = "mapper"
@@ -32,16 +25,12 @@ kind = "mapper"
 input = "camera"
 delivery = "newest"
 out = "{out}"
-weights = "{weights}"
-config = "{config}"
-query = "ipc://{place}/query"
-publish = "ipc://{place}/updates"
 
 [[node]]
 name = "camera"
 kind = "camera"
 [node.options]
-log = "{log}"
+log = ""
 mode = "realtime"
 rate = 0.01
 """
@@ -56,7 +45,8 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, su
     (folder / "up.toml").write_text(LAUNCH)
     (folder / "room.toml").write_text(ROOM_SETTINGS + "[history]\nmax_frames = 100\n")
     with tempfile.TemporaryDirectory(prefix="sm-") as place:
-        values = {"log": LOG, "weights": WEIGHTS, "config": folder / "room.toml", "place": place}
+        values = {"camera.log": LOG, "mapper.weights": WEIGHTS, "mapper.config": folder / "room.toml"}
+        values |= {"mapper.query": f"ipc://{place}/query", "mapper.publish": f"ipc://{place}/updates"}
         settings = [word for name, value in values.items() for word in ("--set", f"{name}={value}")]
         process = subprocess.Popen(
             [str(api.COMMAND), "up", str(folder / "up.toml"), *settings, "--out", str(folder / "out")],

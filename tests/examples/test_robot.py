@@ -9,14 +9,15 @@ import re
 import subprocess
 import sys
 import tempfile
-import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
+from semantic_mapper.config import load_config
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.launcher.launch_file import LaunchFile
 from tests.nodes.support import TIMEOUT_S, eventually, repeated_frames, write_log
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -92,7 +93,10 @@ def test_it_reaches_the_mapper_of_a_launch_where_its_file_says(
     robot = importlib.import_module("robot")
     asked: list[tuple[object, ...]] = []
     monkeypatch.setattr(robot, "sightings", lambda *given: asked.append(given) or iter(()))
-    places = tomllib.loads((ROOT / "launch" / "headless-onboard.toml").read_text(encoding="utf-8"))["set"]
+    (mapper,) = (
+        node for node in load_config(ROOT / "launch" / "onboard.toml", LaunchFile).node if node.kind == "mapper"
+    )
+    places = mapper.options
     flags = ["--updates", places["publish"], "--questions", places["query"]]
     for given in ([], flags):
         monkeypatch.setattr(sys, "argv", ["robot.py", "chair", "0", "0", "1", *given])

@@ -48,7 +48,7 @@ def test_what_is_no_file_is_refused_by_its_name(tmp_path: Path) -> None:
     "words",
     [
         ("replay", "room\0.mcap", "--out", "x"),
-        ("up", "replay\0", "--set", "log=a"),
+        ("up", "replay\0", "--set", "camera.log=a"),
         ("query", "map\0.npz", "info"),
         ("view", "tcp://127.0.0.1:1\0"),
         ("label", "room.mcap", "--out", "x\0y"),
@@ -66,7 +66,7 @@ def test_a_nul_in_a_name_is_wrong_usage(
 
 
 def test_a_nul_in_a_value_of_a_launch_is_named(log: Path) -> None:
-    code, said = run_here("up", "replay", "--set", f"log={log}", "--set", 'out="a\\u0000b"')
+    code, said = run_here("up", "replay", "--set", f"camera.log={log}", "--set", 'out="a\\u0000b"')
     assert code == 1 and "NUL" in said, said
 
 

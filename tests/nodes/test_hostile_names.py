@@ -11,8 +11,8 @@ from rich.table import Table
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.launcher.processes import NodeProcess
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.plain_text import visible
 from semantic_mapper.replay.log.format import LogAttachment, LogWriter
 from semantic_mapper.replay.page import Card, Section, table_of, write_page

@@ -42,7 +42,7 @@ FORMS = (
         ("export", "{}", "--out", "a.rrd"),
         ("eval", "{}"),
         ("up", "{}"),
-        ("up", "replay", "--set", "log={}", "--set", "mode={}"),
+        ("up", "replay", "--set", "camera.log={}", "--set", "camera.mode={}"),
         ("record", "a.mcap", "--launch", "{}"),
         ("{}",),
         ("info", "--{}"),

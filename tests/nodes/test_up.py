@@ -27,11 +27,11 @@ from tests.nodes.support import (
 )
 from tests.small import tiny_frames
 
-RECORD_LAUNCH = REPLAY_LAUNCH.with_name("record.toml")
+RECORD_LAUNCH = (REPLAY_LAUNCH, "--set", "recorder.enabled=true")
 
 
 def _settings(log: Path, weights: Path, config: Path) -> tuple[str, ...]:
-    return ("--set", f"log={log}", "--set", f"weights={weights}", "--set", f"config={config}")
+    return ("--set", f"camera.log={log}", "--set", f"mapper.weights={weights}", "--set", f"mapper.config={config}")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def long_log(folder: Path) -> Path:
 def recorded(folder: Path, log: Path, weights: Path, config: Path) -> Path:
     """Results of all three nodes in lockstep."""
     out = folder / "up"
-    done = run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
+    done = run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
     assert done.returncode == 0, done.stderr
     assert "frames fused" in done.stdout
     return out
@@ -74,7 +74,7 @@ def test_recorder_keeps_every_frame_byte_for_byte(recorded: Path, log: Path) -> 
 def test_ctrl_c_writes_the_map_so_far_and_leaves_no_process(
     long_log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
-    with Running("up", RECORD_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
+    with Running("up", *RECORD_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
         running.wait_for_line("stream_begins")
         sockets = Path(running.wait_for_line(r"sockets=").split("sockets=")[1].split()[0])
         assert sockets.stat().st_mode & 0o777 == 0o700
@@ -132,9 +132,8 @@ def test_nodes_of_a_killed_launcher_write_their_results_and_end(
 
 @pytest.mark.slow
 def test_frozen_node_is_found_out_and_killed(long_log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
-    launch = tmp_path / "impatient.toml"
-    launch.write_text("heartbeat_s = 6.0\n" + REPLAY_LAUNCH.read_text())
-    with Running("up", launch, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
+    settings = (*_settings(long_log, weights, config), "--set", "heartbeat_s=6")
+    with Running("up", REPLAY_LAUNCH, *settings, "--out", tmp_path / "up") as running:
         running.wait_for_line("stream_begins")  # a node that starts may be silent for longer
         os.kill(running.node_pid("camera"), signal.SIGSTOP)
         assert running.wait() == 1, running.text
@@ -149,10 +148,8 @@ def test_without_lockstep_every_frame_is_fused_or_counted_as_dropped(
     mode: str, delivery: str, weights: Path, config: Path, tmp_path: Path
 ) -> None:
     log = write_log(tmp_path / "forty.mcap", repeated_frames(40))
-    launch = tmp_path / "live.toml"
-    launch.write_text(REPLAY_LAUNCH.read_text().replace('delivery = "all"', f'delivery = "{delivery}"'))
-    settings = (*_settings(log, weights, config), "--set", f"mode={mode}")
-    done = run("up", launch, *settings, "--out", tmp_path / "up")
+    more = ("--set", f"camera.mode={mode}", "--set", f"mapper.delivery={delivery}")
+    done = run("up", REPLAY_LAUNCH, *_settings(log, weights, config), *more, "--out", tmp_path / "up")
     assert done.returncode == 0, done.stderr
     frames = json.loads((tmp_path / "up" / "summary.json").read_text())["frames"]
     assert frames["published"] == 40
@@ -167,7 +164,7 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
     skewed[:3, :3] *= 2
     frames[1] = dataclasses.replace(frames[1], T_world_camera=skewed)
     log = write_log(tmp_path / "skewed.mcap", frames)
-    done = run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
+    done = run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "up" / "summary.json").read_text())
     assert summary["frames"]["published"] == 4 and summary["frames"]["fused"] == 3
@@ -203,9 +200,9 @@ def test_recording_to_a_file_that_exists_touches_neither_it_nor_the_map(
     log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "up"
-    assert run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", out).returncode == 0
+    assert run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out).returncode == 0
     before = _digests(out)
-    again = run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
+    again = run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
     assert again.returncode == 1 and "recorded.mcap: exists already" in error_line(again.stderr)
     assert _digests(out) == before
 
@@ -233,10 +230,12 @@ def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, co
     lens.write_text("fx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 35.5\nwidth = 96\nheight = 72\n")
     rendered = tmp_path / "rendered.toml"  # a fixed camera shows no depth: the field has to guess it
     rendered.write_text(f'{config.read_text()}\n[depth]\nsource = "sensor"\n')
-    settings = {"video": film, "calibration": lens, "poses": "fixed", "weights": weights, "config": rendered}
-    options = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+    camera = {"kind": "opencv", "config.source": film, "config.calibration": lens, "config.pace": "fast"}
+    settings = [f"camera.{name}={value}" for name, value in {**camera, "poses.kind": "fixed"}.items()]
+    settings += [f"mapper.weights={weights}", f"mapper.config={rendered}"]
+    options = [word for setting in settings for word in ("--set", setting)]
     out = tmp_path / "out"
-    done = run("up", REPLAY_LAUNCH.with_name("video.toml"), *options, "--out", out)
+    done = run("up", REPLAY_LAUNCH, *options, "--out", out)
     assert done.returncode == 0, done.stderr
     frames = json.loads((out / "summary.json").read_text())["frames"]
     assert (frames["published"], frames["without_depth"], frames["dropped"], frames["refused"]) == (40, 40, 0, 0)

@@ -35,7 +35,7 @@ def test_a_camera_that_was_unplugged_comes_back() -> None:
 @pytest.mark.slow
 def test_a_finetuner_that_is_killed_or_frozen_is_back_with_its_keyframes(tmp_path: Path) -> None:
     log = long_log.write_long_log(tmp_path / "long.mcap", 400.0, 5.0)
-    killed, frozen = fault_finetuner.finetuner_faults([f"log={log}"], tmp_path / "launch", 1)
+    killed, frozen = fault_finetuner.finetuner_faults([f"camera.log={log}"], tmp_path / "launch", 1)
     assert (killed.case, frozen.case) == ("kill -9 finetuner", "SIGSTOP finetuner")
     for outcome in (killed, frozen):
         assert outcome.counts["keyframes lost"] == outcome.others == 0

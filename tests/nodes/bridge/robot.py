@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import BridgeOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.messages import EndOfStream, Status

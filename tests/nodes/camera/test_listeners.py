@@ -13,9 +13,9 @@ import pytest
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.camera import listeners
 from semantic_mapper.nodes.camera.listeners import drain
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo

@@ -21,23 +21,19 @@ import pytest
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
 from semantic_mapper.drivers.mounts import Mount
-from semantic_mapper.drivers.poses.sources import read_pose_config
-from semantic_mapper.drivers.registry import load_driver
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
 from semantic_mapper.nodes.camera import live as live_camera
 from semantic_mapper.nodes.camera.node import run_camera
+from semantic_mapper.nodes.launcher.liveness import TURN, HeartbeatWriter
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import TURN, HeartbeatWriter
-from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.transport.messages import EndOfStream, Message, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.types import PosedFrame
 from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine, write_calibration
-from tests.nodes.support import REPLAY_LAUNCH, eventually
+from tests.nodes.support import eventually
 
-V4L2_LAUNCH = REPLAY_LAUNCH.with_name("v4l2.toml")
 PATIENCE_S = 20.0
 COUNT = 9
 
@@ -443,49 +439,3 @@ def test_mistakes_are_told_before_the_camera_is_waited_for(
 def test_options_name_a_log_or_a_camera_with_poses(options: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         convert_config(options, CameraOptions, "test")
-
-
-def test_the_launch_file_for_a_webcam_is_filled_in() -> None:
-    launch = load_launch(V4L2_LAUNCH, ["device=/dev/video3", "calibration=lens.toml", "fps=15.0"], Path("somewhere"))
-    options = launch.options["camera"]
-    assert isinstance(options, CameraOptions) and options.log is None and options.inputs() == ()
-    assert options.camera is not None and options.camera.kind == "v4l2"
-    assert options.camera.config == {
-        "device": "/dev/video3",
-        "calibration": "lens.toml",
-        "fps": 15.0,
-        "exposure_ms": 0.0,
-    }
-    poses = options.camera.poses
-    assert isinstance(poses, dict) and (poses["kind"], poses["endpoint"]) == ("topic", "tcp://127.0.0.1:5560")
-    assert np.allclose(np.array(poses["T_base_camera"])[:3, 2], (1, 0, 0)), "it looks ahead"
-
-
-@pytest.mark.parametrize("name", ["oak.toml", "learning.toml"])
-def test_the_launch_file_for_an_oak_is_filled_in_and_fits_driver_and_poses(name: str) -> None:
-    launch = load_launch(V4L2_LAUNCH.with_name(name), ["device=169.254.1.222"], Path("somewhere"))
-    options = launch.options["camera"]
-    assert isinstance(options, CameraOptions) and options.camera is not None and options.camera.kind == "oak"
-    assert isinstance(options.camera.config, dict) and isinstance(options.camera.poses, dict)
-    config = convert_config(options.camera.config, load_driver("oak").Config, "test")
-    assert (config.device, config.fps, config.odometry) == ("169.254.1.222", 20.0, True)  # type: ignore[attr-defined]
-    assert read_pose_config(options.camera.poses).kind == "device"
-
-
-@pytest.mark.parametrize(
-    ("kind", "settings", "expected"),
-    [
-        ("realsense", ["device=0123", "fps=15"], {"device": "0123", "fps": 15, "preset": "high_accuracy"}),
-        ("stereo", ["device=/dev/video1", "calibration=pair.toml"], {"calibration": "pair.toml", "width": 640}),
-    ],
-)
-def test_the_launch_file_for_a_depth_camera_is_filled_in_and_fits_driver_and_poses(
-    kind: str, settings: list[str], expected: dict[str, object]
-) -> None:
-    launch = load_launch(V4L2_LAUNCH.with_name(f"{kind}.toml"), settings, Path("somewhere"))
-    options = launch.options["camera"]
-    assert isinstance(options, CameraOptions) and options.camera is not None and options.camera.kind == kind
-    assert isinstance(options.camera.config, dict) and isinstance(options.camera.poses, dict)
-    config = convert_config(options.camera.config, load_driver(kind).Config, "test")
-    assert {key: getattr(config, key) for key in expected} == expected
-    assert read_pose_config(options.camera.poses).kind == "rgbd"

@@ -14,7 +14,7 @@ from tests.nodes.support import REPLAY_LAUNCH, error_line, run, run_here
 def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with hold_folder(out):
-        for words in (("up", REPLAY_LAUNCH, "--set", f"log={log}"), ("replay", log)):
+        for words in (("up", REPLAY_LAUNCH, "--set", f"camera.log={log}"), ("replay", log)):
             refused = run(*words, "--out", out)
             assert refused.returncode != 0 and "another run writes its results there" in error_line(refused.stderr)
         with hold_folder(tmp_path / "other"):

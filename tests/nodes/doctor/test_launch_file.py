@@ -15,8 +15,7 @@ from semantic_mapper.nodes.doctor.check import Check
 from semantic_mapper.transport.keys import allow, make_keys
 from tests.nodes.support import REPLAY_LAUNCH
 
-ROBOT = REPLAY_LAUNCH.with_name("headless-onboard.toml")
-REMOTE = REPLAY_LAUNCH.with_name("remote-viewer.toml")
+ROBOT, CAMERA = REPLAY_LAUNCH.with_name("onboard.toml"), REPLAY_LAUNCH.with_name("camera.toml")
 
 
 def of(path: Path, *settings: str) -> dict[str, list[Check]]:
@@ -28,7 +27,7 @@ def of(path: Path, *settings: str) -> dict[str, list[Check]]:
 
 def test_launch_file_that_up_would_refuse_is_bad(tmp_path: Path) -> None:
     (refused,) = of(REPLAY_LAUNCH)["replay.toml"]
-    assert refused.state == "bad" and "needs 'log'" in refused.found and "--set log=" in refused.mend
+    assert refused.state == "bad" and "needs 'log'" in refused.found and "--set camera.log=" in refused.mend
     assert of(tmp_path / "none.toml")["none.toml"][0].state == "bad"
 
 
@@ -37,7 +36,7 @@ def test_addresses_are_told_with_who_has_them() -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         taken = f"tcp://127.0.0.1:{other.getsockname()[1]}"
-        found = of(ROBOT, f"query={taken}", "status=tcp://127.0.0.1:0", "publish=tcp://127.0.0.1:0")
+        found = of(ROBOT, f"mapper.query={taken}", "publish=tcp://127.0.0.1:0", "mapper.publish=tcp://127.0.0.1:0")
         everywhere = taken.replace("127.0.0.1", "0.0.0.0")
         assert doctor_launch._port_is_taken(int(taken.rpartition(":")[2]), "0.0.0.0")
     assert [(c.state, c.found) for c in found["address"]] == [
@@ -46,13 +45,13 @@ def test_addresses_are_told_with_who_has_them() -> None:
         ("ok", "tcp://127.0.0.1:0"),
     ]
     assert f"sport = :{taken.rpartition(':')[2]}" in found["address"][1].mend
-    (refused,) = [c for c in of(ROBOT, f"query={everywhere}")["address"] if c.state == "bad"]
+    (refused,) = [c for c in of(ROBOT, f"mapper.query={everywhere}")["address"] if c.state == "bad"]
     assert "which needs keys" in refused.found + refused.mend
 
 
 def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "keys"
-    settings = [f"keys={folder}", "query=tcp://0.0.0.0:0", "status=tcp://127.0.0.1:0", "publish=tcp://127.0.0.1:0"]
+    folder, quiet = tmp_path / "keys", ("publish=tcp://127.0.0.1:0", "mapper.publish=tcp://127.0.0.1:0")
+    settings = [f"keys={folder}", "mapper.query=tcp://0.0.0.0:0", *quiet]
     found = of(ROBOT, *settings)
     (none,) = found["keys"]
     assert "address" not in found, "told once"
@@ -78,44 +77,34 @@ def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pyt
 
 
 def test_what_a_node_would_refuse_as_it_starts_is_told_before(tmp_path: Path) -> None:
-    found = of(REPLAY_LAUNCH, f"log={tmp_path / 'none.mcap'}")
+    found = of(REPLAY_LAUNCH, f"camera.log={tmp_path / 'none.mcap'}")
     assert (found["camera"][0].state, found["mapper"][0].state) == ("bad", "ok")
     assert "no such log" in found["camera"][0].found
-    assert "fps" in of(ROBOT, "fps=-1")["camera"][0].found
-    file = tmp_path / "learning.toml"
-    text = ROBOT.with_name("learning.toml").read_text(encoding="utf-8")
-    text = text.replace('restart = "never"', 'restart = "on-failure"').replace('kind = "device"', 'kind = "visual"')
-    file.write_text(text, encoding="utf-8")
+    assert "fps" in of(ROBOT, "camera.config.fps=-1")["camera"][0].found
     (tmp_path / "mapper.toml").write_text("[voxel_map]\nvoxel_size = 0.1\n", encoding="utf-8")
     (tmp_path / "broken.safetensors").write_bytes(b"no weights")
-    settings = (f"config={tmp_path / 'mapper.toml'}", f"weights={tmp_path / 'broken.safetensors'}")
-    found = of(file, *settings)
+    weights = tmp_path / "broken.safetensors"
+    settings = (f"mapper.config={tmp_path / 'mapper.toml'}", f"finetuner.weights={weights}", "camera.poses.kind=visual")
+    found = of(ROBOT.with_name("learning.toml"), *settings)
     assert "begin in another world" in found["camera"][0].found
     assert "voxel_size" in found["mapper"][0].found and "broken.safetensors" in found["finetuner"][0].found
     assert {found[name][0].state for name in ("camera", "mapper", "finetuner")} == {"bad"}
 
 
-def test_addresses_and_packages_of_bridges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = ("kind=v4l2", "poses=poses.toml")
-    zenoh, foxglove = (ROBOT.with_name(f"{kind}.toml") for kind in ("zenoh", "foxglove"))
-    assert of(zenoh, *given)["zenoh"] == [Check("zenoh", "ok", "its package and addresses")]
-    (refused,) = (
-        c for checks in of(zenoh, *given, "listen=tcp/0.0.0.0:7447").values() for c in checks if c.state != "ok"
-    )
-    assert refused.state == "bad" and "certificates on both sides" in refused.found + refused.mend
+def test_packages_of_bridges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "semantic_mapper.nodes.foxglove.sdk", None)
     monkeypatch.delitem(sys.modules, "semantic_mapper.nodes.foxglove.sdk")
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    (missing,) = of(foxglove, *given)["foxglove"]
+    (missing,) = of(CAMERA, "camera.kind=oak", "foxglove.enabled=true")["foxglove"]
     assert missing.state == "bad" and "semantic-mapper[foxglove]" in missing.found + missing.mend
 
 
 def test_a_camera_that_is_not_connected_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     connected: list[FoundCamera] = []
     monkeypatch.setattr(registry, "find_cameras", lambda kinds: (connected, {}))
-    found = "camera 'oak': no oak camera is connected"
+    found = "camera 'camera': no oak camera is connected"
     assert of(ROBOT)["camera"][0] == Check("camera", "bad", found, "plug it in (`up` waits for it)")
     connected.append(FoundCamera("oak", "OAK-D", "1844"))
     assert of(ROBOT)["camera"][0] == Check("camera", "ok", "oak 1844; its settings and poses")
-    assert "oak 17 is not connected, there are 1844" in of(ROBOT, "device=17")["camera"][0].found
-    assert of(ROBOT, "device=10.0.0.2")["camera"][0].state == "ok", "it may lie behind a router"
+    assert "oak 17 is not connected, there are 1844" in of(ROBOT, "camera.config.device=17")["camera"][0].found
+    assert of(ROBOT, "camera.config.device=10.0.0.2")["camera"][0].state == "ok", "it may lie behind a router"

@@ -22,11 +22,11 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.finetuner import finetune_round, finetuner
 from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
 from semantic_mapper.nodes.finetuner.node import run_finetuner
+from semantic_mapper.nodes.launcher.launch_file import load_launch
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
 from semantic_mapper.nodes.process import StopRequest, run_when_idle
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.training.finetune import FinetuneProgress
 from semantic_mapper.training.keyframe_pool import KeyframeSplit
 from semantic_mapper.training.online import OnlineConfig
@@ -311,17 +311,13 @@ def test_a_round_rests_as_its_share_says_and_can_be_cancelled(monkeypatch: pytes
     assert under_way.has_ended(60) and under_way.cancelled and under_way.result is None
 
 
-@pytest.mark.parametrize(
-    ("name", "given"), [("replay-learning.toml", ["log=kitchen.mcap"]), ("learning.toml", ["niceness=18"])]
-)
-def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(
-    name: str, given: list[str], tmp_path: Path
-) -> None:
-    path = REPLAY_LAUNCH.with_name(name)
-    launch = load_launch(path, [*given, "cpu_fraction=0.25"], tmp_path)
+@pytest.mark.parametrize("given", [["camera.log=kitchen.mcap", "camera.mode=realtime"], ["finetuner.niceness=18"]])
+def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(given: list[str], tmp_path: Path) -> None:
+    path = REPLAY_LAUNCH.with_name("learning.toml")
+    launch = load_launch(path, [*given, "finetuner.cpu_fraction=0.25"], tmp_path)
     options = launch.options["finetuner"]
     assert isinstance(options, FinetunerOptions) and options.cpu_fraction == 0.25 and options.inputs() == ("mapper",)
-    assert options.niceness == (18 if name == "learning.toml" else 19)
+    assert options.niceness == (18 if "finetuner.niceness=18" in given else 19)
     mapper = launch.options["mapper"]
     assert isinstance(mapper, MapperOptions) and mapper.inputs() == ("camera", "finetuner")
     assert options.out == mapper.out == str(tmp_path) and options.weights == mapper.weights

@@ -30,7 +30,13 @@ def test_a_killed_mapper_leaves_the_map_of_a_frame(weights: Path, tmp_path: Path
     config = write_config(tmp_path / "fine.toml")
     config.write_text(config.read_text().replace("voxel_size_m = 0.05", "voxel_size_m = 0.015"), encoding="utf-8")
     out, again = tmp_path / "up", tmp_path / "again"
-    sets = [f"log={log}", f"weights={weights}", f"config={config}", "save_every=0.3", "query="]
+    sets = [
+        f"camera.log={log}",
+        f"mapper.weights={weights}",
+        f"mapper.config={config}",
+        "mapper.save_every_s=0.3",
+        "mapper.query=",
+    ]
     with Running("up", REPLAY_LAUNCH, *[w for s in sets for w in ("--set", s)], "--out", out) as running:
         first = int(running.wait_for_line(r"map_saved").split("frames=")[1].split()[0])
         assert eventually(lambda: describe_map(out / "map.npz").frames > first)  # another in its place

@@ -25,13 +25,13 @@ from semantic_mapper.mapping.correction.pose_correction import ALWAYS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.corrections import CorrectionSender
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import encode, encode_frame, encode_request

@@ -17,6 +17,7 @@ from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import make_place
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.node import Playback
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.resume import (
     forbid,
@@ -30,7 +31,6 @@ from semantic_mapper.nodes.mapper.resume import (
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import Publisher

@@ -12,7 +12,7 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.supervisor.launch_config import load_launch
+from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.queries.mirror import MapMirror
 from tests.nodes.mapper.test_query_service import a_folder
 from tests.nodes.support import REPLAY_LAUNCH, Running, repeated_frames, write_log
@@ -23,7 +23,12 @@ def test_a_mapper_is_asked_while_it_replays(weights: Path, config: Path, tmp_pat
     log = write_log(tmp_path / "long.mcap", repeated_frames(600))
     with a_folder() as folder:
         endpoint = f"ipc://{folder / 'query'}"
-        settings = [f"log={log}", f"weights={weights}", f"config={config}", f"query={endpoint}"]
+        settings = [
+            f"camera.log={log}",
+            f"mapper.weights={weights}",
+            f"mapper.config={config}",
+            f"mapper.query={endpoint}",
+        ]
         sets = [word for setting in settings for word in ("--set", setting)]
         with Running("up", REPLAY_LAUNCH, *sets, "--out", tmp_path / "up") as running:
             running.wait_for_line("stream_begins")
@@ -45,15 +50,19 @@ def test_a_mapper_is_asked_while_it_replays(weights: Path, config: Path, tmp_pat
 
 
 def test_without_a_query_endpoint_there_is_none_and_names_must_differ(tmp_path: Path) -> None:
-    launch = load_launch(REPLAY_LAUNCH, ["log=x"], tmp_path)
+    launch = load_launch(REPLAY_LAUNCH, ["camera.log=x"], tmp_path)
     assert launch.sockets() == ("launch", "mapper", "camera", "query")
-    assert load_launch(REPLAY_LAUNCH, ["log=x", "query="], tmp_path).sockets() == ("launch", "mapper", "camera")
-    assert load_launch(REPLAY_LAUNCH, ["log=x", "query=ipc:///a/b"], tmp_path).sockets() == (
+    assert load_launch(REPLAY_LAUNCH, ["camera.log=x", "mapper.query="], tmp_path).sockets() == (
+        "launch",
+        "mapper",
+        "camera",
+    )
+    assert load_launch(REPLAY_LAUNCH, ["camera.log=x", "mapper.query=ipc:///a/b"], tmp_path).sockets() == (
         "launch",
         "mapper",
         "camera",
     )
     with pytest.raises(ConfigError, match="camera: names two endpoints"):
-        load_launch(REPLAY_LAUNCH, ["log=x", "query=camera"], tmp_path)
+        load_launch(REPLAY_LAUNCH, ["camera.log=x", "mapper.query=camera"], tmp_path)
     with pytest.raises(ConfigError, match="query"):
-        load_launch(REPLAY_LAUNCH, ["log=x", "query=../up"], tmp_path)
+        load_launch(REPLAY_LAUNCH, ["camera.log=x", "mapper.query=../up"], tmp_path)

@@ -29,20 +29,18 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.nodes.cli.record import _join
 from semantic_mapper.nodes.frame_gaps import MAX_MISSED
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
+from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
-from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote, read_launch_note
-from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 from semantic_mapper.replay.jobs import EvaluateRequest, ReplayRequest, evaluate_log, replay_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.replay.run_folder import is_log
-from semantic_mapper.transport.codec import encode, encode_frame, repack_rgb
-from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import MAX_COUNT, EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from tests.nodes.support import Running, error_line, eventually, repeated_frames, run, write_log
@@ -221,18 +219,6 @@ def test_numbers_that_jump_cost_no_frame_and_no_status(tmp_path: Path, sockets: 
         assert [envelope.seq for envelope, _ in log.frame_parts()] == numbers
 
 
-def test_a_launch_records_every_frame_whatever_its_number(tmp_path: Path) -> None:
-    numbers = [n for i in range(24) for n in (i, 2**62 + i, MAX_COUNT - i, 0, 2**62 - i)]
-    frames = [dataclasses.replace(f, seq=n) for f, n in zip(repeated_frames(120), numbers, strict=True)]
-    log, launch = write_log(tmp_path / "jumps.mcap", frames), tmp_path / "recorded.toml"
-    text = RECORDED.format(log=log, out=tmp_path / "a.mcap", policy='restart = "never"', option="reserve_mb = 0")
-    launch.write_text(text.replace("realtime", "fast"))
-    with Running("up", launch) as running:
-        assert running.wait() == 0, running.text
-    with LogReader(tmp_path / "a.mcap") as recorded:
-        assert [envelope.seq for envelope, _ in recorded.frame_parts()] == numbers
-
-
 @pytest.mark.parametrize(
     ("kill", "extra", "reason"),
     [
@@ -301,16 +287,6 @@ def test_what_waits_when_the_recorder_is_stopped_is_written_or_counted(
     with LogReader(tmp_path / "a.mcap") as log:
         assert [envelope.seq for envelope, _ in log.frame_parts()] == list(range(40 if time_left else 1))
     assert (told["recorded"], told["lost"]) == ((40, 0) if time_left else (1, 39))
-
-
-def test_frames_are_packed_anew_without_touching_anything_else() -> None:
-    frame = samples.make_frame()
-    for options in (CodecOptions(rgb="raw"), CodecOptions(rgb="raw")):
-        raw = encode_frame(frame, options)
-        png = repack_rgb(raw, CodecOptions(rgb="png"))
-        assert png[2].startswith(b"\x89PNG") and png[3:] == raw[3:]
-        assert repack_rgb(png, CodecOptions(rgb="raw")) == raw  # there and back, header included
-        assert repack_rgb(png, CodecOptions(rgb="png", jpeg_quality=3)) == png
 
 
 def test_options_that_contradict_each_other_are_refused() -> None:

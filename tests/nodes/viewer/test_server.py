@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.nodes.supervisor.progress import ProgressLimit
+from semantic_mapper.nodes.launcher.liveness import ProgressLimit
 from semantic_mapper.nodes.viewer import server
 
 PROGRAM = """#!{python} -I

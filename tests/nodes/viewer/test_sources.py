@@ -27,9 +27,9 @@ from semantic_mapper.errors import MapError, TransportError
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.view import _find_live, _Page
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
+from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
-from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.viewer.mapped_log import show_log
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved

@@ -1,0 +1,269 @@
+"""Starts the nodes of a launch, watches over them, ends them in order, and publishes how each of them is."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import psutil
+import structlog
+from msgspec.structs import replace
+
+from semantic_mapper.errors import CodecError, NodeError, TransportError
+from semantic_mapper.nodes.launcher.fork_server import ForkServer
+from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
+from semantic_mapper.nodes.launcher.processes import PROCESS_TABLE, ManagedProcess, node_environment
+from semantic_mapper.nodes.launcher.running import leave_launch_note
+from semantic_mapper.nodes.launcher.systemd import Notifier
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.process_folder import OwnFolder, sweep
+from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.messages import NodeState, Status
+from semantic_mapper.transport.sockets import NewestSubscriber
+
+POLL_S = 0.05
+STATUS_PERIOD_S = 0.5
+MAX_SENTENCE, MAX_SENTENCES = 400, 32  # last words of a node may be long
+END_HEARD_S = 2.0  # after the last camera has ended, a node that was not there then will not hear of it
+
+_log = structlog.get_logger(__name__)
+
+
+class Launcher:
+    """The processes of one launch; a context manager that leaves none behind.
+
+    Sockets are in a folder of their own that only this user can enter; two launches never meet.
+
+    Args:
+        launch: From ``load_launch``.
+        notifier: Receives the state of the launch, beside the status topic.
+    """
+
+    def __init__(self, launch: Launch, notifier: Notifier | None = None) -> None:
+        self._launch = launch
+        self._notifier = notifier or Notifier("")
+        self._processes: list[ManagedProcess] = []
+        self._reported_ready = False
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        sweep()
+        folder = OwnFolder()
+        self._stack.callback(folder.close)  # last of all
+        try:
+            self._start(folder.path)
+        except BaseException:
+            self._clean_up()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._clean_up()
+
+    def run(self, stop: StopRequest) -> None:
+        """Watch until all nodes have ended, one has failed for good, or a stop is requested; then end all in order.
+
+        Raises:
+            NodeError: a node failed, hung, had to be killed, or says at its end what it has lost; names it and its
+                last words.
+        """
+        while not stop and not self._failures() and self._sources_run():
+            self._look_after_all()
+            self._report("running" if self._reported_ready else "starting")
+            time.sleep(POLL_S)
+        self._look_after_all(last=True)  # a camera that has failed since the last look
+        if stop:
+            _log.info("stopping", by=stop.name)
+        for kind in PROCESS_TABLE:
+            self._end(kind, stop)
+        self._status.report(self._processes, "ended", now=True)
+        if failures := self._failures() + [p.loss for p in self._processes if p.loss and not p.failure]:
+            raise NodeError("; then ".join(failures))
+
+    def _start(self, folder: Path) -> None:
+        _log.info("launching", nodes=len(self._launch.nodes), sockets=str(folder))
+        leave_launch_note(self._launch, folder)
+        endpoints = {name: f"ipc://{folder}/{name}" for name in self._launch.sockets()}
+        names = [n.name for n in self._launch.nodes]
+        status = LaunchStatus(endpoints, names, self._launch.publish, self._launch.keys)
+        self._status = self._stack.enter_context(status)
+        server = ForkServer(node_environment())
+        self._stack.callback(server.close)
+        for node in self._launch.nodes:
+            self._processes.append(ManagedProcess(node, self._launch, endpoints, str(folder), server))
+
+    def _failures(self) -> list[str]:
+        """Of nodes that are not started any more: the first one may explain the others."""
+        return [p.failure for p in sorted(self._processes, key=lambda p: p.failed_at) if p.failure]
+
+    def _sources_run(self) -> bool:
+        """Whether a camera still runs: when none does, the others have the end of the stream and end by themselves."""
+        return any(p.runs for p in self._processes if p.kind == "camera")
+
+    def _look_after_all(self, *, last: bool = False) -> None:
+        for process in self._processes:
+            process.look_after(last=last)
+
+    def _report(self, state: NodeState) -> None:
+        """Publish the state of all nodes, and notify systemd."""
+        self._status.report(self._processes, state)
+        self._notifier.alive()
+        states = {p.name: p.state for p in self._processes}
+        begun = set(states.values()) <= {"running", "stopping", "ended"}
+        if not self._reported_ready and begun and not self._failures():
+            self._reported_ready = True
+            self._notifier.ready("all nodes are ready")
+            _log.info("all_ready")
+        restarts = sum(p.restarts for p in self._processes)
+        nodes = ", ".join(f"{name} {state}" for name, state in states.items())
+        self._notifier.status(f"{nodes}; {restarts} restarts")
+
+    def _end(self, kind: str, stop: StopRequest) -> None:
+        """Wait for all nodes of a kind; request a stop once there is a reason not to wait for the end of the stream.
+
+        Only one that makes no more progress is killed: on a starved machine, results take their time.
+        """
+        limit_s = PROCESS_TABLE[kind].stop_s
+        processes = [p for p in self._processes if p.kind == kind]
+        began = time.monotonic()
+        while True:
+            if kind == "mapper":  # its map was saved, the results that people look at were not
+                for process in processes:
+                    process.start_to_finish()
+            progress = [p.makes_progress(limit_s) for p in processes]  # of all: limits begin now
+            if not any(progress):
+                break
+            self._notifier.stopping(sum(PROCESS_TABLE[k].stop_s for k in {p.kind for p in self._processes}))
+            late = time.monotonic() - began > END_HEARD_S and any(p.restarts for p in self._processes)
+            hears_no_end = bool(stop or self._failures()) or not PROCESS_TABLE[kind].ends_with_stream
+            for process in processes:
+                if hears_no_end or (late and process.state != "stopping"):
+                    process.request_stop()
+            self._look_after_all(last=True)
+            self._report("stopping")
+            time.sleep(POLL_S)
+        for process in processes:
+            process.kill_overdue(limit_s)
+        self._look_after_all(last=True)
+
+    def _clean_up(self) -> None:
+        for process in self._processes:
+            process.close()
+        self._processes.clear()
+        self._stack.close()
+
+
+class LaunchStatus:
+    """Publishes a ``Status`` of each node, and one of the launch itself. A context manager.
+
+    Counters and ages of a node's own status are passed on (a player of logs has none: its launcher counts ``published``
+    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``, ``fds`` and ``threads``, and the ages ``start``
+    (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
+
+    Args:
+        endpoints: Of the nodes and, under ``STATUS_SOCKET``, of this topic.
+        nodes: Names of those that may publish a status.
+        public, keys: A second endpoint for it, see ``PublicPublisher``.
+
+    Raises:
+        TransportError: the endpoint cannot be bound.
+    """
+
+    def __init__(self, endpoints: Mapping[str, str], nodes: Sequence[str], public: str = "", keys: str = "") -> None:
+        self._began = time.monotonic()
+        self._reported_at = 0.0
+        self._own: dict[str, Status] = {}
+        self._publisher = PublicPublisher(endpoints[STATUS_SOCKET], public, keys, linger_ms=200)
+        self._subscriber = NewestSubscriber([endpoints[name] for name in nodes], ("status",))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the sockets. Harmless when repeated."""
+        self._subscriber.close()
+        self._publisher.close()
+
+    def report(self, processes: Sequence[ManagedProcess], state: NodeState, *, now: bool = False) -> None:
+        """Publish, if it is time to."""
+        if not now and time.monotonic() - self._reported_at < STATUS_PERIOD_S:
+            return
+        self._reported_at = time.monotonic()
+        while (message := self._subscriber.receive(0.0)) is not None:
+            if isinstance(message, Status):
+                self._own[message.node] = message
+        statuses = [node_status(managed, self._own.get(managed.name)) for managed in processes]
+        for status in (*statuses, self._of_launch(processes, statuses, state)):
+            self._publish(status)
+
+    def _publish(self, status: Status) -> None:
+        """What cannot be published is no reason to end a launch."""
+        short = tuple(sentence[:MAX_SENTENCE] for sentence in status.degraded[:MAX_SENTENCES])
+        try:
+            self._publisher.publish(encode(replace(status, degraded=short)))
+        except (CodecError, TransportError) as error:
+            _log.warning("status_not_sent", node=status.node, reason=str(error))
+
+    def _of_launch(self, processes: Sequence[ManagedProcess], statuses: Sequence[Status], state: NodeState) -> Status:
+        degraded = tuple(f"node '{s.node}' is not well" for s in statuses if s.degraded)
+        counters = {"pid": os.getpid(), "nodes": len(processes), "restarts": sum(m.restarts for m in processes)}
+        return Status(
+            node=STATUS_SOCKET,
+            state="degraded" if degraded and state == "running" else state,
+            stamp_ns=time.monotonic_ns(),
+            counters=counters | process_stats(os.getpid()),
+            ages_s={"start": time.monotonic() - self._began},
+            degraded=degraded,
+        )
+
+
+def node_status(managed: ManagedProcess, own: Status | None) -> Status:
+    """What a node says of itself (unless the process that said it is gone) and what its launcher knows."""
+    now = time.monotonic_ns()
+    counters = {"restarts": managed.restarts}
+    ages: dict[str, float] = {}
+    degraded = managed.warnings
+    if managed.process is not None:
+        beat = managed.process.heartbeat
+        ages |= {"start": beat.age_s, "beat": beat.silent_s}
+        if beat.stalled_s is not None:
+            ages["turn"] = beat.stalled_s
+        counters |= {"pid": managed.process.pid} | process_stats(managed.process.pid)
+        if beat.frame_age_s is not None:
+            counters["published"], ages["frame"] = beat.frames, beat.frame_age_s
+        if own is not None and (now - own.stamp_ns) / 1e9 <= beat.age_s:
+            said_s = (now - own.stamp_ns) / 1e9
+            ages = {name: age + said_s for name, age in own.ages_s.items()} | ages | {"status": said_s}
+            counters = dict(own.counters) | counters
+            degraded += own.degraded
+    state: NodeState = "degraded" if degraded and managed.state == "running" else managed.state
+    return Status(managed.name, state, now, counters, ages, degraded)
+
+
+def process_stats(pid: int) -> dict[str, int]:
+    """``rss_kb``, ``cpu_ms`` (total), ``fds``, ``threads``; empty where the process has ended."""
+    try:
+        process = psutil.Process(pid)
+        with process.oneshot():
+            times = process.cpu_times()
+            return {
+                "rss_kb": process.memory_info().rss // 1024,
+                "cpu_ms": round(1000 * (times.user + times.system)),
+                "fds": process.num_fds(),
+                "threads": process.num_threads(),
+            }
+    except (psutil.Error, OSError):
+        return {}

@@ -1,0 +1,471 @@
+"""The processes of a launch: one table of their kinds, one process, and one node over all its restarts."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import msgspec
+import psutil
+import structlog
+
+from semantic_mapper.nodes.launcher.fork_server import ForkServer
+from semantic_mapper.nodes.launcher.launch_file import Launch, NodeEntry
+from semantic_mapper.nodes.launcher.liveness import (
+    BUSY_SILENCE_S,
+    HangDetector,
+    HeartbeatMonitor,
+    ProgressLimit,
+    cpu_seconds,
+)
+from semantic_mapper.nodes.launcher.systemd import SYSTEMD_VARIABLES
+from semantic_mapper.nodes.options import NodeJob
+from semantic_mapper.nodes.process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT, STOP_SIGNAL
+from semantic_mapper.plain_text import visible
+from semantic_mapper.redaction import without_secrets
+from semantic_mapper.transport.messages import NodeState
+
+# How long a node may make no progress when it is to end: one that makes progress, be it slowly, may take as long as it
+# needs. The long one is for those that write a map or weights.
+STOP_S, FINISH_S = 15.0, 300.0
+KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
+TAIL_LINES = 12
+ORPHAN_TIMEOUT_S = 120  # see ``NodeJob.orphan_timeout_s``
+# Of a process that somebody has requested to end, whether or not it was old enough to do so in order.
+TERMINATED = {code: s for s in (signal.SIGTERM, signal.SIGINT) for code in (128 + s, -s)}
+# Pauses before restarts: doubled with each failure in the window. They leave no room for so many restarts of a node
+# that was ever ready, which is thus restarted for as long as the launch runs.
+BACKOFF_S, BACKOFF_MAX_S = 0.1, 10.0
+MAX_RESTARTS, WINDOW_S = 20, 60.0
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessKind:
+    """How a kind of node is started and stopped.
+
+    Attributes:
+        preloaded: Forked from a process that has imported PyTorch and Open3D, which take seconds.
+        ends_with_stream: Ends by itself when the stream does; otherwise it is requested to.
+        stop_s: How long it may make no progress when it is to end.
+    """
+
+    preloaded: bool
+    ends_with_stream: bool
+    stop_s: float
+
+
+# In the order in which they are stopped: sources first, so that the others get the end of the stream.
+PROCESS_TABLE: dict[str, ProcessKind] = {
+    "camera": ProcessKind(preloaded=False, ends_with_stream=True, stop_s=STOP_S),
+    "finetuner": ProcessKind(preloaded=True, ends_with_stream=False, stop_s=FINISH_S),
+    "foxglove": ProcessKind(preloaded=True, ends_with_stream=True, stop_s=STOP_S),
+    "recorder": ProcessKind(preloaded=False, ends_with_stream=True, stop_s=STOP_S),
+    "mapper": ProcessKind(preloaded=True, ends_with_stream=True, stop_s=FINISH_S),
+}
+
+
+def node_environment() -> dict[str, str]:
+    """The launcher's, without what is meant for the launcher alone."""
+    return {name: value for name, value in os.environ.items() if name not in SYSTEMD_VARIABLES}
+
+
+class RestartBackoff:
+    """The failures of one node: how long to wait before the next start. Times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self._failures: deque[float] = deque()
+        self.count = 0
+
+    def delay_s(self, now: float) -> float | None:
+        """Note a failure: seconds to wait before the next start, None where the limit is reached."""
+        before = self.recent(now)
+        if before >= MAX_RESTARTS:
+            return None
+        self._failures.append(now)
+        self.count += 1
+        return min(BACKOFF_MAX_S, BACKOFF_S * 2.0**before)
+
+    def recent(self, now: float) -> int:
+        """Restarts within the window."""
+        while self._failures and self._failures[0] <= now - WINDOW_S:
+            self._failures.popleft()
+        return len(self._failures)
+
+
+class NodeProcess:
+    """A running node. Its stderr is passed on line by line, marked with its name.
+
+    Args:
+        kind: A row of the process table.
+        job: What it is to do (``heartbeat_fd`` is filled in here).
+        server: Forks it, where its kind is preloaded; None = a new interpreter.
+
+    Raises:
+        OSError: no process, thread, file or memory is to be had; nothing is left behind.
+    """
+
+    def __init__(self, kind: str, job: NodeJob, server: ForkServer | None = None) -> None:
+        self.name = job.name
+        self.kind = kind
+        self.tail: deque[str] = deque(maxlen=TAIL_LINES)
+        self.stop_requested = False
+        with ExitStack() as ours, ExitStack() as theirs:
+            self._beats, beats = _pipe(ours, theirs)
+            self._output, output = _pipe(ours, theirs)
+            given = _in_memory(msgspec.json.encode(msgspec.structs.replace(job, heartbeat_fd=beats)))
+            theirs.callback(os.close, given)
+            if server is not None and PROCESS_TABLE[kind].preloaded:
+                self._process = server.fork(f"semantic_mapper.nodes.{kind}.node", given, beats, output)
+            else:
+                self._process = _start_interpreter(kind, given, beats, output)
+            ours.callback(self._end)
+            self.heartbeat = HeartbeatMonitor(self._beats)
+            self._reader = threading.Thread(target=self._pass_on, name=f"stderr of {self.name}", daemon=True)
+            try:
+                self._reader.start()
+            except RuntimeError as error:
+                raise OSError(errno.EAGAIN, f"no thread that reads what '{self.name}' says: {error}") from error
+            ours.pop_all()
+
+    @property
+    def pid(self) -> int:
+        """Process number."""
+        return self._process.pid
+
+    def exit_code(self) -> int | None:
+        """None while it runs; negative: the signal that ended it."""
+        try:
+            code = self._process.wait(0)
+        except (subprocess.TimeoutExpired, psutil.TimeoutExpired):
+            return None
+        return None if code is None else int(code)
+
+    def has_failed(self) -> bool:
+        """Ended otherwise than well; our request may hit a process that is too young to handle it."""
+        code = self.exit_code()
+        if code in (None, 0, EXIT_LOSS):
+            return False
+        return not self.stop_requested or (code != -STOP_SIGNAL and not self.was_terminated)
+
+    @property
+    def has_lost(self) -> bool:
+        """Whether it ended in order, but says that a part of what it was to keep is lost."""
+        return self.exit_code() == EXIT_LOSS
+
+    @property
+    def was_terminated(self) -> bool:
+        """Whether SIGTERM or SIGINT ended it, which the launcher never sends."""
+        return self.exit_code() in TERMINATED
+
+    def request_stop(self) -> None:
+        """``STOP_SIGNAL``, once; no matter if it has ended already."""
+        if not self.stop_requested:
+            self.stop_requested = True
+            self._signal(STOP_SIGNAL)
+
+    def kill(self) -> None:
+        """SIGKILL; no matter if it has ended already."""
+        self._signal(signal.SIGKILL)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it ends within the time."""
+        try:
+            self._process.wait(timeout_s)
+        except (subprocess.TimeoutExpired, psutil.TimeoutExpired):
+            return False
+        return True
+
+    def close(self) -> None:
+        """Kill it if it still runs, and free what belongs to it."""
+        self._end()
+        if self._reader.is_alive():
+            self._reader.join(timeout=2.0)  # a grandchild could keep the pipe open
+        os.close(self._beats)
+
+    def describe_exit(self) -> str:
+        """Exit code or signal."""
+        code = self.exit_code()
+        if code in TERMINATED:
+            return f"sent away by {TERMINATED[code].name} from outside the launch"
+        return f"exit code {code}" if code is None or code >= 0 else f"killed by {signal.Signals(-code).name}"
+
+    def describe_end(self) -> str:
+        """How it ended, with its last words."""
+        self._reader.join(timeout=2.0)
+        lines = [line for line in self.tail if line.strip()]
+        # A node that knows why it fails says so in one line; of any other end, all the last lines may tell.
+        known = [line for line in lines if FAILURE_EVENT in line or LOSS_EVENT in line]
+        words = " | ".join(known or lines)
+        end = f"node '{self.name}' ({self.kind}) ended: {self.describe_exit()}"
+        return end + (f"; its last words: {words}" if words else "")
+
+    def _signal(self, signum: signal.Signals) -> None:
+        if self.exit_code() is None:
+            self._process.send_signal(signum)
+
+    def _end(self) -> None:
+        self.kill()
+        if not self.wait(KILL_S):  # in the kernel, for a device or a disk that does not answer
+            _log.error("node_does_not_die", node=self.name, pid=self.pid)
+
+    def _pass_on(self) -> None:
+        with os.fdopen(self._output, "rb") as stream:
+            for raw in stream:
+                line = visible(without_secrets(raw.decode(errors="replace").rstrip("\n")))
+                self.tail.append(line)
+                try:
+                    sys.stderr.write(f"[{self.name}] {line}\n")
+                    sys.stderr.flush()
+                except (OSError, ValueError):  # nobody reads our stderr any more; the tail is still kept
+                    continue
+
+
+class ManagedProcess:
+    """Starts a node at once, and again where it fails and its launch file says so.
+
+    Args:
+        entry: Of the launch file.
+        launch: For its options and limits.
+        endpoints: Of all nodes.
+        folder: Of the launch.
+        server: Forks the processes of preloaded kinds; None = each is a new interpreter.
+    """
+
+    def __init__(
+        self,
+        entry: NodeEntry,
+        launch: Launch,
+        endpoints: dict[str, str],
+        folder: str,
+        server: ForkServer | None = None,
+    ) -> None:
+        self.name = entry.name
+        self.kind = entry.kind
+        self.process: NodeProcess | None = None
+        self.failure = ""  # why it is not started any more
+        self.failed_at = 0.0
+        self._entry = entry
+        self._launch = launch
+        self._server = server
+        self._job = NodeJob(
+            name=entry.name,
+            options=msgspec.to_builtins(launch.options[entry.name]),
+            endpoints=endpoints,
+            subscribers=launch.listeners(entry.name),
+            folder=folder,
+            restartable=entry.restart != "never",
+            # The kernel ends what is silent for so long; before, it is the launcher's turn.
+            orphan_timeout_s=math.ceil(max(ORPHAN_TIMEOUT_S, 2 * launch.heartbeat_s, 2 * BUSY_SILENCE_S)),
+        )
+        self._backoff = RestartBackoff()
+        self._due = 0.0  # of the next start, while there is no process
+        self._last_end = self._last_reason = ""
+        self._finishing = self._hopeless = False
+        self._start()
+
+    @property
+    def restarts(self) -> int:
+        """How often it was restarted."""
+        return self._backoff.count
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has a process, or is about to have one."""
+        if self.process is None or self.process.has_failed():  # not given up before ``look_after`` says so
+            return not self.failure
+        return self.process.exit_code() is None
+
+    @property
+    def state(self) -> NodeState:
+        """Where it is in its life, as far as its launcher can tell."""
+        if self.process is None:
+            return "ended" if self.failure else "starting"
+        if self.process.exit_code() is not None:
+            return "ended"
+        if self.process.stop_requested or self.process.heartbeat.ending:
+            return "stopping"
+        return "running" if self.process.heartbeat.ready else "starting"
+
+    @property
+    def loss(self) -> str:
+        """What a node that has ended in order has lost, with its last words; empty = nothing that it knows of."""
+        return self.process.describe_end() if self.process is not None and self.process.has_lost else ""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What happened to it recent."""
+        if self.failure or self.loss:
+            return (self.failure or self.loss,)
+        recent = self._backoff.recent(time.monotonic())
+        if not recent:
+            return ()
+        times = "once" if recent == 1 else f"{recent} times"
+        return (f"restarted {times} in the last {WINDOW_S:g} s; the last time: {self._last_reason}",)
+
+    def look_after(self, *, last: bool) -> None:
+        """Start it if it is time to; find out whether it has failed or hangs.
+
+        Args:
+            last: The launch ends: what fails now is not started any more.
+        """
+        if self.process is None:
+            if last and not self.failure:
+                self._give_up(f"{self._last_end}; it had not been restarted yet when the launch ended")
+            elif not self.failure and time.monotonic() >= self._due:
+                self._start()
+        elif self.process.exit_code() is None:
+            hang = self._detector.find_hang(stopping=self.process.stop_requested)
+            if hang:
+                self.process.kill()
+                self.process.wait(KILL_S)
+                self._on_failure(self.process, hang, last=last)
+        elif last and self.process.was_terminated:
+            self.process.request_stop()  # the process that ends us may have sent the signal to all of us
+        elif self.process.has_failed() and not self.failure:
+            self._on_failure(self.process, "", last=last)
+
+    def makes_progress(self, limit_s: float) -> bool:
+        """Whether it comes nearer to its end; to be called often while that is awaited.
+
+        Args:
+            limit_s: Seconds without progress. Once it writes its results, turns are progress, too.
+        """
+        if self.process is None:
+            return self.runs
+        if self._end_limit is None:
+            pid = self.process.pid
+            self._end_limit = ProgressLimit(limit_s, lambda: cpu_seconds(pid))
+        beat = self.process.heartbeat
+        return self.runs and not self._end_limit.exceeded(beat.turns if beat.ending else -1)
+
+    def kill_overdue(self, limit_s: float) -> None:
+        """End a process that has not ended when it should have; that is a failure."""
+        if self.process is None or self.process.exit_code() is not None:
+            return
+        self.process.request_stop()
+        if not self.process.wait(KILL_S):
+            self.process.kill()
+            self.process.wait(KILL_S)
+        self._on_failure(self.process, f"it did not end, and made no progress for {limit_s:g} s", last=True)
+
+    def request_stop(self) -> None:
+        """Of its process, if there is one."""
+        if self.process is None or (self._finishing and not self.process.heartbeat.ready):  # it would end at once
+            return
+        self.process.request_stop()
+
+    def start_to_finish(self) -> None:
+        """Start a node that is given up once more, to be stopped: it writes results of what it saved."""
+        if not self.failure or self._finishing or self._hopeless or self._entry.restart == "never":
+            return
+        self._finishing = True
+        before = self.process
+        try:
+            self._start_process(self.restarts + 1)  # it goes on from what this launch saved
+        except OSError as error:
+            _log.error("results_not_written", node=self.name, reason=str(error))
+            return
+        if before is not None:
+            before.close()
+        _log.info("node_finishes", node=self.name, pid=self.process.pid if self.process else 0)
+
+    def close(self) -> None:
+        """Leave no process behind."""
+        if self.process is not None:
+            self.process.close()
+            self.process = None
+
+    def _start(self) -> None:
+        count = self.restarts
+        try:
+            process = self._start_process(count)
+        except OSError as error:  # no process, memory or file is to be had: that may pass
+            _log.error("node_not_started", node=self.name, reason=str(error))
+            text = f"node '{self.name}' ({self.kind}) could not be started: {error}"
+            if self._entry.restart == "never":
+                self._give_up(text)
+            else:
+                self._restart_later(text, f"could not be started: {error}")
+            return
+        _log.info("node_started", node=self.name, kind=self.kind, pid=process.pid, restarts=count)
+
+    def _start_process(self, restarts: int) -> NodeProcess:
+        # A restarted node waits for no subscribers: the others are there, and frames do not wait.
+        subscribers = 0 if restarts else self._job.subscribers
+        job = msgspec.structs.replace(self._job, restarts=restarts, subscribers=subscribers)
+        self.process = process = NodeProcess(self.kind, job, self._server)
+        self._end_limit: ProgressLimit | None = None  # of this process, once its end is awaited
+        self._detector = HangDetector(process.pid, process.heartbeat, self._launch.heartbeat_s)
+        return process
+
+    def _on_failure(self, process: NodeProcess, why: str, *, last: bool) -> None:
+        text = process.describe_end() + (f" ({why})" if why else "")
+        code = process.exit_code()
+        _log.error("node_ended", node=self.name, why=why or "exit code", code=code)
+        process.heartbeat.poll()
+        failed_itself = code is not None and code > 0 and not process.was_terminated
+        hopeless = failed_itself and not process.heartbeat.ready and not self.restarts
+        self._hopeless |= hopeless
+        if last or hopeless or self._entry.restart == "never":
+            self._give_up(text)
+        elif self._restart_later(text, why or process.describe_exit()):
+            self.close()
+
+    def _restart_later(self, text: str, reason: str) -> bool:
+        """Note a failure; False where that was one too many."""
+        delay = self._backoff.delay_s(time.monotonic())
+        if delay is None:
+            self._give_up(f"{text}; it was restarted {MAX_RESTARTS} times within {WINDOW_S:g} s, and is not any more")
+            return False
+        self._last_end, self._last_reason = text, reason
+        self._due = time.monotonic() + delay
+        _log.warning("node_restarts", node=self.name, in_s=delay, restarts=self.restarts)
+        return True
+
+    def _give_up(self, why: str) -> None:
+        self.failure = why
+        self.failed_at = time.monotonic()
+
+
+def _pipe(ours: ExitStack, theirs: ExitStack) -> tuple[int, int]:
+    read, write = os.pipe()
+    ours.callback(os.close, read)
+    theirs.callback(os.close, write)
+    return read, write
+
+
+def _start_interpreter(kind: str, job: int, heartbeat: int, output: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        # -I: a sourced workspace on PYTHONPATH, or a file in the current folder, cannot shadow our modules.
+        [sys.executable, "-I", "-m", f"semantic_mapper.nodes.{kind}", f"{JOB_PREFIX}{job}"],
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        pass_fds=(heartbeat, job),
+        env=node_environment(),
+        process_group=0,  # Ctrl-C in the terminal reaches the launcher only, which then stops all in order
+    )
+
+
+def _in_memory(job: bytes) -> int:
+    """An open file with a job. Arguments are seen by all users (``ps``), and a camera's address may hold a password."""
+    fd = os.memfd_create("job")
+    try:
+        with open(fd, "wb", closefd=False) as file:
+            file.write(job)
+        os.lseek(fd, 0, os.SEEK_SET)
+    except OSError:
+        os.close(fd)
+        raise
+    return fd

@@ -1,0 +1,281 @@
+"""Launch files: those of the package, what is accepted, what is refused, and how the refusal helps."""
+
+from __future__ import annotations
+
+import os
+from datetime import datetime, tzinfo
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+import semantic_mapper.drivers.poses.config
+import semantic_mapper.drivers.registry
+from semantic_mapper.config import convert_config
+from semantic_mapper.drivers.calibration import save_calibration
+from semantic_mapper.drivers.poses.sources import read_pose_config
+from semantic_mapper.drivers.registry import load_driver
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.nodes.camera.live import make_source
+from semantic_mapper.nodes.launcher import launch_file
+from semantic_mapper.nodes.launcher.launch_file import find_launch, launch_files, load_launch
+from semantic_mapper.nodes.options import CAMERA_KINDS, POSE_KINDS
+from semantic_mapper.types import CameraIntrinsics
+from tests.nodes.support import write_log
+from tests.small import tiny_frames
+
+SMALL = """
+[[node]]
+name = "eye"
+kind = "camera"
+[node.options]
+log = ""
+mode = "realtime"
+[[node]]
+name = "brain"
+kind = "mapper"
+[node.options]
+input = "eye"
+out = "{out}/map"
+"""
+
+
+def file_of(folder: Path, text: str) -> Path:
+    path = folder / "launch.toml"
+    path.write_text(text)
+    return path
+
+
+def options_of(name: str, *settings: str) -> dict[str, dict[str, Any]]:
+    """Options of the nodes of a launch file of the package, as plain data."""
+    launch = load_launch(find_launch(Path(name)), settings, Path("there"))
+    return {node: msgspec.to_builtins(options) for node, options in launch.options.items()}
+
+
+def test_a_log_goes_through_in_lockstep_and_in_a_live_launch_in_its_own_time() -> None:
+    nodes = options_of("replay", "camera.log=room.mcap")
+    assert nodes.keys() == {"mapper", "camera"} and nodes["mapper"]["out"] == "there"
+    assert (nodes["camera"]["mode"], nodes["mapper"]["delivery"]) == ("lockstep", "all")
+    launch = load_launch(find_launch(Path("replay.toml")), ["camera.log=room.mcap", "recorder.enabled=true"])
+    assert {node.restart for node in launch.nodes} == {"never"} and launch.listeners("camera") == 2
+    for name in ("camera", "learning"):
+        nodes = options_of(name, "camera.log=room.mcap")
+        assert (nodes["camera"]["camera"], nodes["camera"]["mode"]) == (None, "realtime")
+    launch = load_launch(find_launch(Path("camera")), ["camera.log=room.mcap", "mapper.restart=never"])
+    assert {node.name: node.restart for node in launch.nodes} == {"mapper": "never", "camera": "on-failure"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "config", "poses"),
+    [
+        ("oak", ["device=1844301078", "fps=15"], {"device": "1844301078", "fps": 15, "odometry": True}, "device"),
+        ("realsense", ["device=0123", "fps=15"], {"device": "0123", "fps": 15}, "rgbd"),
+        ("stereo", ["device=/dev/video1", "calibration=pair.toml"], {"calibration": "pair.toml"}, "rgbd"),
+        ("v4l2", ["device=/dev/video3", "exposure_ms=8"], {"device": "/dev/video3", "exposure_ms": 8.0}, "topic"),
+        ("opencv", ["source=film.mp4", "pace=fast"], {"source": "film.mp4", "pace": "fast"}, "visual"),
+    ],
+)
+def test_settings_of_a_camera_fit_its_driver_and_poses(
+    kind: str, settings: list[str], config: dict[str, object], poses: str
+) -> None:
+    given = [f"camera.config.{text}" for text in settings]
+    if poses in ("topic", "visual"):  # the others are those that this kind of camera has without being given any
+        given += [f"camera.poses.kind={poses}"]
+        given += ["camera.poses.endpoint=tcp://127.0.0.1:5560"] if poses == "topic" else []
+    nodes = options_of("camera", *given, f"camera.kind={kind}", "mapper.weights=007")
+    live = nodes["camera"]["camera"]
+    made = convert_config(live["config"], load_driver(kind).Config, "test")
+    assert live["kind"] == kind and {key: getattr(made, key) for key in config} == config
+    assert read_pose_config(live["poses"]).kind == poses and nodes["mapper"]["weights"] == "007"
+    closes_loops = poses == "rgbd"
+    assert nodes["mapper"]["history_frames"] == 3000 * closes_loops
+    assert nodes["camera"]["corrections"] == "query" * closes_loops
+
+
+def test_values_are_read_as_their_setting_wants_them(tmp_path: Path) -> None:
+    given = ["eye.log=/data/a = b.mcap", "eye.rate=2.5", "brain.save_every_s=3", 'brain.weights="a b"']
+    launch = load_launch(file_of(tmp_path, SMALL), [*given, 'brain.input=["eye"]', "heartbeat_s=2"])
+    eye, brain = (msgspec.to_builtins(launch.options[name]) for name in ("eye", "brain"))
+    assert (eye["log"], eye["rate"], brain["save_every_s"], brain["weights"]) == ("/data/a = b.mcap", 2.5, 3.0, "a b")
+    assert brain["input"] == ("eye",) and launch.heartbeat_s == 2
+    for text in ("1844301078", "123E45", "true"):
+        assert load_launch(file_of(tmp_path, SMALL), [f"eye.log={text}"]).options["eye"].log == text  # type: ignore[union-attr]
+
+
+def test_keys_of_the_launch_are_those_of_its_nodes() -> None:
+    nodes = options_of("onboard", "keys=k", "publish=tcp://127.0.0.1:7")
+    assert nodes["mapper"]["keys"] == "k" and nodes["mapper"]["query"].startswith("tcp://127.0.0.1:")
+    launch = load_launch(find_launch(Path("onboard")), ["keys=k", "mapper.keys=own", "publish=tcp://127.0.0.1:7"])
+    assert (launch.publish, launch.keys, launch.options["mapper"].keys) == ("tcp://127.0.0.1:7", "k", "own")  # type: ignore[union-attr]
+    assert launch.sockets() == ("launch", "mapper", "camera", "recorder")
+    assert {node.restart for node in launch.nodes} == {"on-failure"} and launch.heartbeat_s == 1.5
+
+
+def test_several_cameras_fit_drivers_poses_and_calibrations(tmp_path: Path) -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.12
+    given: list[str] = []
+    for name in ("left", "right"):
+        save_calibration(tmp_path / f"{name}.toml", CameraIntrinsics(500.0, 500.0, 319.5, 239.5, 640, 480), T, {})
+        given += [f"{name}.config.device=/dev/{name}", f"{name}.config.calibration={tmp_path}/{name}.toml"]
+    launch = load_launch(find_launch(Path("multi-camera")), given)
+    assert launch.options["mapper"].inputs() == ("left", "right")
+    assert launch.listeners("left") == launch.listeners("right") == 2
+    for name in ("left", "right"):
+        camera: Any = launch.options[name]
+        assert camera.camera.id == name
+        make_source(camera.camera)  # not open yet; would refuse what does not fit
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (('id = "right"', 'id = "left"'), "two cameras of node 'mapper', 'left' and 'right', have the id 'left'; give"),
+        (('input = ["left", "right"]', 'input = ["left", "rihgt"]'), "did you mean 'right'?"),
+        (('input = ["left", "right"]', 'input = ["left", "recorder"]'), "'recorder', which is no camera"),
+        (("streams = 2", "streams = 4"), "there are 3 sources"),
+        (("streams = 2", "streams = 3"), "'mapper', which is no camera"),
+    ],
+)
+def test_mistakes_with_several_cameras_are_named(tmp_path: Path, change: tuple[str, str], says: str) -> None:
+    text = launch_files()["multi-camera"].read_text(encoding="utf-8")
+    assert change[0] in text
+    with pytest.raises(ConfigError) as caught:
+        load_launch(file_of(tmp_path, text.replace(*change)))
+    assert says in str(caught.value)
+
+
+def test_two_logs_of_one_camera_are_refused_with_the_ways_out(tmp_path: Path) -> None:
+    frames = tiny_frames(2)
+    one, other = write_log(tmp_path / "one.mcap", frames), write_log(tmp_path / "other.mcap", frames)
+    second = SMALL[: SMALL.index('[[node]]\nname = "brain"')].replace("eye", "second")
+    path = file_of(tmp_path, second + SMALL.replace('input = "eye"', 'input = ["eye", "second"]'))
+    with pytest.raises(ConfigError, match=r"'eye' and 'second', have the id 'rooms'; frames of a log keep.*own"):
+        load_launch(path, [f"eye.log={one}", f"second.log={other}"])
+    live = [f"eye.log={one}", "second.kind=v4l2", "second.poses.kind=fixed", "second.id=other"]
+    assert load_launch(path, live).options["second"].camera.kind == "v4l2"  # type: ignore[union-attr]
+
+
+def test_a_bridge_is_one_more_listener_and_queries_the_mapper() -> None:
+    given = ["camera.kind=v4l2", "camera.config=webcam.toml", "camera.poses=poses.toml", "foxglove.enabled=true"]
+    launch = load_launch(find_launch(Path("camera")), given)
+    assert launch.options["foxglove"].inputs() == ("camera", "mapper") and launch.listeners("camera") == 2
+    for change, says in (
+        ("foxglove.mapper=camera", "node 'foxglove' shows the map of 'camera', which is no mapper"),
+        ("foxglove.query=ask", "has query = 'ask', but mapper 'mapper' 'query'; give both the same"),
+        ("foxglove.keys=k", "has keys = 'k', but mapper 'mapper' ''; give both the same"),
+        ("foxglove.mapper=maper", "did you mean 'mapper'?"),
+        ("foxglove.refresh_s=0", "refresh_s"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            load_launch(find_launch(Path("camera")), [*given, change])
+
+
+def test_each_start_has_a_folder_of_its_own_even_where_the_clock_is_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:
+            return datetime(2026, 11, 23, 2, 47, tzinfo=tz)
+
+    monkeypatch.setattr(launch_file, "datetime", Clock)
+    for name in ("20261123T024700Z", "20261123T024700Z-1", "20261123T024700Z-2"):
+        launch = load_launch(file_of(tmp_path, SMALL), ["eye.log=x", f"out={tmp_path}/{{now}}"])
+        assert launch.options["brain"].out == f"{tmp_path}/{name}/map"  # type: ignore[union-attr]
+        (tmp_path / name).mkdir()
+
+
+@pytest.mark.parametrize(
+    ("settings", "change", "says"),
+    [
+        (["eye.log="], ("", ""), "give it with --set eye.log="),
+        (["eye.lok=x"], ("", ""), "node 'eye' has no option 'lok'; did you mean 'log'?"),
+        (["eyes.log=x"], ("", ""), "no node is called 'eyes'; did you mean 'eye'?"),
+        (["eye"], ("", ""), "write NODE.OPTION=VALUE"),
+        (["eye=x"], ("", ""), "no node is called 'eye'"),
+        (["eye.rate=-1"], ("", ""), "rate"),
+        (["eye.rate=fast"], ("", ""), "`rate`: must be a number, not a text"),
+        (["eye.kind=v4l2", "eye.config=a.toml", "eye.config.fps=3"], ("", ""), "the file 'a.toml'; set 'fps' there"),
+        (["restart=on-failure", "eye.mode=fast"], ("", ""), "'eye' is to be restarted, but camera 'eye' waits"),
+        (["restart=always"], ("", ""), "'always' is not valid"),
+        (["eye.enabled=false"], ("", ""), "which is no node"),
+        ([], ('input = "eye"', 'input = "eyes"'), "did you mean 'eye'?"),
+        ([], ('input = "eye"', 'imput = "eye"'), "did you mean `input`?"),
+        ([], ('kind = "mapper"', 'kind = "maper"'), "`node[1].kind`: 'maper' is not valid; did you mean `mapper`?"),
+        ([], ('mode = "realtime"', 'mode = "real"'), "node 'eye': `mode`: 'real' is not valid; did you mean"),
+        ([], ('mode = "realtime"', 'max_frames = "3"'), "`max_frames`: must be a whole number, not a text"),
+        ([], ("[node.options]", "[node.option]"), "`node[0]`: unknown key `option`; did you mean `options`?"),
+        ([], ('out = "{out}/map"', ""), "node 'brain': the key `out` is missing"),
+        ([], ('name = "brain"', 'name = "eye"'), "unique"),
+        ([], ('name = "brain"', 'name = "../brain"'), "letters"),
+        ([], ('name = "brain"', 'name = "launch"'), "the launcher's own"),
+        ([], ("[[node]]", "heartbeat_s = 0.2\n[[node]]"), "heartbeat_s"),
+        ([], ("[[node]]", "heartbeat_s = inf\n[[node]]"), "heartbeat_s = inf"),
+        ([], ("[[node]]", "heartbeat_s = " + "9" * 5000 + "\n[[node]]"), "not valid TOML"),
+        ([], ("[[node]]", "x = " + "[" * 20000 + "\n[[node]]"), "not valid TOML"),
+        ([], ('mode = "realtime"', "subscriber_timeout_s = nan"), "options.subscriber_timeout_s = nan"),
+        (["eye.rate=1e-300"], ("", ""), "rate"),
+        (["eye.rate=" + "9" * 4094], ("", ""), "rate = a number of"),
+        (["eye.rate=" + "[" * 4000], ("", ""), "rate"),
+        (["eye.log=" + "x" * 5000], ("", ""), "longer than 4096 letters"),
+        (["eye.log=a\udcff"], ("", ""), "log is not UTF-8"),
+        ([], ('out = "{out}/map"', 'out = "a\\u0000"'), "out holds a NUL character"),
+        ([], ("[[node]]", '[[node]]\nname = "n"\nkind = "camera"\n' * 64 + "[[node]]"), "length <= 64"),
+    ],
+)
+def test_mistakes_and_hostile_values_are_named_with_the_fix(
+    tmp_path: Path, settings: list[str], change: tuple[str, str], says: str
+) -> None:
+    path = file_of(tmp_path, SMALL.replace(*change, 1) if change[0] else SMALL)
+    with pytest.raises(ConfigError) as caught:
+        load_launch(path, ["eye.log=x", *settings])
+    assert says in str(caught.value) and len(str(caught.value)) < 1500
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        ('kind = ""', "which kind of camera? Give --set eye.kind=KIND; there are v4l2"),
+        ('kind = "opencv"', "Give --set eye.poses.kind=KIND"),
+        ('kind = "opencw", poses = { kind = "fixed" }', "`camera.kind`: no kind of camera is called 'opencw'; did you"),
+        ('kind = "opencv", poses = { kind = "fixt" }', "'fixt' is no source of poses; did you mean 'fixed'?"),
+        ('kind = "opencv", poses = { kind = "device" }', "do not track themselves, and no frame would have a pose"),
+        ('kind = "opencv", poses = "fixed"', 'poses = { kind = "fixed" }'),
+        ('kind = "opencv", poses = {}', "`camera.poses` is empty"),
+        ('kind = "v4l2", poses = { T_world_camera = [] }', "there are device, fixed, topic, board, rgbd"),
+    ],
+)
+def test_mistakes_in_a_camera_and_its_poses_are_found_before_anything_starts(
+    tmp_path: Path, camera: str, says: str
+) -> None:
+    text = SMALL.replace('log = ""\nmode = "realtime"', f"camera = {{ {camera} }}")
+    with pytest.raises(ConfigError) as caught:
+        load_launch(file_of(tmp_path, text))
+    assert says in str(caught.value) and "launch.toml: node 'eye'" in str(caught.value)
+
+
+def test_kinds_of_cameras_and_poses_are_those_of_the_drivers() -> None:
+    assert semantic_mapper.drivers.registry.KINDS == CAMERA_KINDS
+    assert tuple(semantic_mapper.drivers.poses.config.KINDS) == POSE_KINDS
+
+
+def test_files_without_a_camera_or_an_end_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no node of kind 'camera'"):
+        load_launch(file_of(tmp_path, "node = []"))
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(ConfigError, match="is no regular file"):
+        load_launch(tmp_path / "fifo")
+
+
+def test_files_that_are_there_come_before_those_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "replay").mkdir()  # a folder of that name is no launch file
+    assert find_launch(Path("replay")) == find_launch(Path("replay.toml")) == launch_files()["replay"]
+    (tmp_path / "replay.toml").touch()
+    assert find_launch(Path("replay.toml")) == Path("replay.toml")
+    for name in ("replai", "elsewhere/replay", "../replay"):
+        with pytest.raises(ConfigError, match=r"no such file; launch files that come with the package: .*replay"):
+            find_launch(Path(name))

@@ -1,0 +1,99 @@
+"""Notifications over a real datagram socket, and the unit file."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import structlog.testing
+
+from semantic_mapper.nodes.launcher.systemd import Notifier
+from tests.nodes.support import REPLAY_LAUNCH
+
+UNIT = REPLAY_LAUNCH.parent / "systemd" / "semantic-mapper.service"
+
+
+class Manager:
+    """What systemd would hear."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(address)
+        self.socket.settimeout(5)
+
+    def hear(self) -> list[str]:
+        return self.socket.recv(4096).decode().split("\n")
+
+
+def test_what_is_told_is_what_systemd_expects(tmp_path: Path) -> None:
+    manager = Manager(str(tmp_path / "notify"))
+    notifier = Notifier.from_environment({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+    notifier.ready("all\nwell")
+    assert manager.hear() == ["READY=1", "STATUS=all well"]
+    notifier.status("one")
+    notifier.status("one")
+    notifier.stopping(2.5)
+    assert manager.hear() == ["STATUS=one"]  # once
+    assert manager.hear() == ["STOPPING=1", "EXTEND_TIMEOUT_USEC=2500000"]
+
+
+def test_abstract_socket() -> None:
+    name = f"semantic-mapper-test-{os.getpid()}"
+    manager = Manager("\0" + name)
+    Notifier.from_environment({"NOTIFY_SOCKET": f"@{name}"}).ready("well")
+    assert manager.hear()[0] == "READY=1"
+
+
+def test_watchdog_is_fed_three_times_a_period_and_only_for_this_process(tmp_path: Path) -> None:
+    manager = Manager(str(tmp_path / "notify"))
+    given = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
+    Notifier.from_environment({**given, "WATCHDOG_PID": str(os.getpid() + 1)}).alive()
+    Notifier.from_environment({"NOTIFY_SOCKET": given["NOTIFY_SOCKET"]}).alive()
+    notifier = Notifier.from_environment({**given, "WATCHDOG_PID": str(os.getpid())})
+    began = time.monotonic()
+    for _ in range(2):
+        assert manager_hears_after(notifier, manager) == ["WATCHDOG=1"]
+    assert time.monotonic() - began >= 0.1  # the second one not before its time
+    manager.socket.setblocking(False)
+    with pytest.raises(BlockingIOError):  # nothing came of the other two
+        manager.hear()
+
+
+def manager_hears_after(notifier: Notifier, manager: Manager) -> list[str]:
+    manager.socket.settimeout(0.01)
+    while True:
+        notifier.alive()
+        try:
+            return manager.hear()
+        except TimeoutError:
+            continue
+
+
+def test_without_systemd_nothing_is_sent_and_a_socket_that_is_gone_is_told_once(tmp_path: Path) -> None:
+    Notifier.from_environment({}).ready("well")
+    with structlog.testing.capture_logs() as logs:
+        notifier = Notifier.from_environment({"NOTIFY_SOCKET": str(tmp_path / "gone")})
+        notifier.ready("well")
+        notifier.stopping(1.0)
+        Notifier.from_environment({"NOTIFY_SOCKET": "tcp://somewhere"}).ready("well")
+    assert [entry["event"] for entry in logs] == ["systemd_not_reached"] * 2
+
+
+def test_unit_file_is_one_that_systemd_takes(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze on this machine")
+    unit = tmp_path / UNIT.name
+    unit.write_text(UNIT.read_text(encoding="utf-8"), encoding="utf-8")
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", str(unit)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    told = [line for line in (done.stdout + done.stderr).splitlines() if UNIT.name in line]
+    assert (done.returncode, told) == (0, []), done.stderr
