@@ -18,7 +18,7 @@ Height = Annotated[int, msgspec.Meta(ge=48, multiple_of=2)]
 class Config(semantic_mapper.config.Config, frozen=True):
     """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is requested."""
 
-    # Its id (MXID), its IP address (PoE), or its USB path, as ``semantic-mapper cameras`` shows them. Empty = the only
+    # Its id (MXID), its IP address (PoE), or its USB path, as ``doctor --cameras`` shows them. Empty = the only
     # one that is connected.
     device: str = ""
     rgb: Socket = "CAM_A"  # the camera that gives the images; depth and intrinsics are its

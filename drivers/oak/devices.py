@@ -105,7 +105,7 @@ def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> s
     if boards:
         return (
             f"{what}, though there is one on USB ({', '.join(map(str, boards))}): plug it in again, with its own "
-            "cable, into a USB 3 port; `semantic-mapper cameras` shows the names of those that answer"
+            "cable, into a USB 3 port; `semantic-mapper doctor --cameras` shows the names of those that answer"
         )
     return (
         f"{what}: check its cable and power (USB: a USB 3 port, and `lsusb | grep {USB_VENDOR}` shows it; PoE: "

@@ -38,7 +38,7 @@ class StereoCamera:
     def __init__(self, config: Config, camera_id: str) -> None:
         if not config.device:
             raise CameraError(
-                f"camera '{camera_id}': no device is named; `semantic-mapper cameras --kind stereo` lists what may be "
+                f"camera '{camera_id}': no device is named; `doctor --cameras --kind stereo` lists what may be "
                 'one; give its address as device = "/dev/v4l/by-id/..."'
             )
         if not config.calibration:

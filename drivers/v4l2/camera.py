@@ -33,7 +33,7 @@ def open_camera(config: Config, camera_id: str = "camera") -> LiveCamera:
     """
     if not config.device:
         raise CameraError(
-            f"camera '{camera_id}': no device is named; `semantic-mapper cameras` lists what is connected; give its "
+            f"camera '{camera_id}': no device is named; `doctor --cameras` lists what is connected; give its "
             'address as device = "/dev/v4l/by-id/..."'
         )
     measured = require_calibration(config.calibration, config.uncalibrated, f"V4L2 camera at {config.device}")

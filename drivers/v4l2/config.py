@@ -16,7 +16,7 @@ _MAX_EXPOSURE_MS = HIGHEST // 10  # the control counts tenths of a millisecond
 class Config(config.Config, frozen=True):
     """One camera. The size of its images is that of its calibration."""
 
-    device: str = ""  # /dev/v4l/by-id/..., as `semantic-mapper cameras` lists it; has to be given
+    device: str = ""  # /dev/v4l/by-id/..., as `semantic-mapper doctor --cameras` lists it; has to be given
     calibration: str = ""  # file; see drivers/calibration.py
     uncalibrated: bool = False  # images as the lens gives them, for calibrating only
     width: NotNegative = 0  # uncalibrated: of the requested images; 0 = as the device has it

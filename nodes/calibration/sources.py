@@ -71,7 +71,7 @@ def check_places(texts: Sequence[str]) -> None:
         if not (colon and kind in _ADDRESSES) and not Path(place).is_file() and not Path(place).is_dir():
             raise ConfigError(
                 f"{place}: neither a folder of pictures, a log (.mcap) or video that is there, nor a camera as "
-                f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper cameras` lists them)"
+                f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper doctor --cameras` lists them)"
             )
 
 

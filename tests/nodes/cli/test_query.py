@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.query import Asked, Question, ask_file, ask_mapper
+from semantic_mapper.nodes.cli.query import Question, Request, ask_file, ask_mapper
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import eventually, run, run_here
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
@@ -42,11 +42,11 @@ def test_info(map_file: Path) -> None:
 
 
 def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
-    info = Asked(Question.INFO)
+    info = Request(Question.INFO)
     assert ask_file(str(map_file.parent), info) == ask_file(str(map_file), info)
     code, said = run_here("info", map_file.parent)
     assert code == 0 and "blocks" in said
-    code, said = run_here("correct", map_file.parent, map_file)
+    code, said = run_here("query", map_file.parent, "correct", map_file)
     assert code == 1 and "a saved map keeps no frames to correct" in said
     code, said = run_here("eval", map_file)
     assert code == 1 and "is a map alone; give the folder" in said
@@ -113,14 +113,14 @@ def test_instances_of_a_saved_map_stand_as_its_floor_says(tmp_path: Path) -> Non
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # z becomes x
     VoxelMap(plain.config, plain.label_set).merged(plain, T).save(tmp_path / "map.npz")
-    found = ask_file(str(tmp_path), Asked(Question.INSTANCES))
+    found = ask_file(str(tmp_path), Request(Question.INSTANCES))
     np.testing.assert_allclose(found["up"], (1, 0, 0), atol=0.02)
     assert {thing["class"] for thing in found["instances"] if thing["voxels"] > 200} == {"table", "cup"}
 
 
 def answers(endpoint: str) -> bool:
     try:
-        ask_mapper(endpoint, Asked(Question.INFO, "", ()))
+        ask_mapper(endpoint, Request(Question.INFO, "", ()))
     except TransportError:
         return False
     return True
@@ -136,7 +136,7 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
             (Question.NEAREST, "lamp", (0.0, 0.0, 1.0)),
             (Question.INSTANCES, "", ()),
         ):
-            asked = Asked(question, name, point)
+            asked = Request(question, name, point)
             assert ask_mapper(service.endpoint, asked) == ask_file(str(map_file), asked)
         done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--out", folder / "live.json")
         assert done.returncode == 0 and "cup" in done.stdout, done.stderr
