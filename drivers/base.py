@@ -171,7 +171,7 @@ class PoseSource:
         raise NotImplementedError
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
-        """New poses of past images where a loop was closed, once after each change; to be asked after each ``pose``.
+        """New poses of past images where a loop was closed, once after each change; to be called after each ``pose``.
 
         Args:
             final: No more images will come: finish what is under way.

@@ -213,7 +213,7 @@ def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraInt
 
     Args:
         path: Of the file; empty = none.
-        uncalibrated: Whether the user has asked for images without one.
+        uncalibrated: Whether the user wants images without one.
         camera: For the message.
 
     Raises:
@@ -352,7 +352,7 @@ def _load_yaml(path: Path) -> CameraIntrinsics:
         if "k" in lowered:
             message = msgspec.convert(lowered, _CameraInfoMessage)
             if message.binning_x > 1 or message.binning_y > 1 or any(message.roi.values()):
-                raise ConfigError("tells of binning or a region of interest, which is not read: calibrate it whole")
+                raise ConfigError("has binning or a region of interest, which is not read: calibrate it whole")
             return _from_matrix(message.k, message.distortion_model, message.d, (message.width, message.height))
         return _kalibr(plain)
     except (msgspec.ValidationError, ConfigError, FrameError) as error:

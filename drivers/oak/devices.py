@@ -85,7 +85,7 @@ def find_device(address: str, search_s: float) -> Any:
 
 
 def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> str:
-    """Why no OAK can be found, as far as this machine can tell, and how to fix it.
+    """Why no OAK can be found, as far as this machine knows, and how to fix it.
 
     Args:
         address: What was looked for; empty = any.
@@ -154,7 +154,7 @@ def _describe(info: Any) -> FoundCamera:
         notes.append("another process has it")
     if "PERMISSION" in info.status.name:
         notes.append(f"no permission: {UDEV_RULE}")
-    name = info.getDeviceId() or info.name  # not every state tells the id
+    name = info.getDeviceId() or info.name  # not every state gives the id
     return FoundCamera(kind="oak", name=name, address=name, note=", ".join(notes))
 
 

@@ -170,7 +170,7 @@ class ImageMaker:
             None for one that is not later than the one before, that claims to be of the future, or that is damaged.
 
         Raises:
-            CameraError: it is not what was asked of the device, or one of many in a row that are damaged.
+            CameraError: it is not what was requested of the device, or one of many in a row that are damaged.
         """
         stamp_ns = capture_ns(rgb, self._clock_ns)
         if stamp_ns > time.monotonic_ns() + FUTURE_NS or (self._last is not None and stamp_ns <= self._last[1]):

@@ -54,7 +54,7 @@ class Sources:
         calibration: ``dai.CalibrationHandler`` of the device.
         name: What people call it; ``address``: by which it is found again.
         metadata: For the stream's information.
-        notes: What does not work as it should, as far as one can tell at once.
+        notes: What does not work as it should, as far as one knows at once.
         odometry: None without.
     """
 

@@ -87,7 +87,7 @@ class PoseTrack:
         if stamp_ns - last.stamp_ns > self._max_ahead_ns:
             return "stale"
         if len(self._samples) < 2 or last.stamp_ns - self._samples[-2].stamp_ns > self._max_gap_ns:
-            return "stale"  # one pose alone tells no motion
+            return "stale"  # one pose alone shows no motion
         # From poses that are not close together: of two that are, the noise would be taken for motion.
         earlier = [s for s in self._samples if last.stamp_ns - s.stamp_ns <= self._max_gap_ns][:-1]
         before = next((s for s in reversed(earlier) if last.stamp_ns - s.stamp_ns >= _BASELINE_NS), earlier[0])

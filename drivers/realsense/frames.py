@@ -27,7 +27,7 @@ _SLOW_USB = ("1.", "2.")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Frames of one moment, of the SDK: ``depth`` is in the pixels of ``color``; None where none was asked for.
+    """Frames of one moment, of the SDK: ``depth`` is in the pixels of ``color``; None where none was requested.
 
     ``arrived_ns`` is when they were read, on the monotonic clock.
     """
@@ -46,7 +46,7 @@ class Stream:
 
     Attributes:
         name: Of the device, for people; ``serial``: by which it is found again.
-        notes: What does not work as it should, as far as one can tell at once.
+        notes: What does not work as it should, as far as one knows at once.
 
     Raises:
         CameraError: it does not offer what the config asks for, or cannot be opened.
@@ -159,32 +159,34 @@ class Stream:
             sensor.set_option(option.visual_preset, float(int(getattr(self._rs.rs400_visual_preset, preset))))
 
 
-def read_intrinsics(told: Any) -> CameraIntrinsics:
-    """Intrinsics that the device tells, with OpenCV's coefficients for whatever lens model it has.
+def read_intrinsics(reported: Any) -> CameraIntrinsics:
+    """Intrinsics that the device reports, with OpenCV's coefficients for whatever lens model it has.
 
     Args:
-        told: The SDK's ``intrinsics``. Its models are fitted by their own rays, since one of them is the inverse of
+        reported: The SDK's ``intrinsics``. Its models are fitted by their own rays, since one of them is the inverse of
             OpenCV's.
 
     Raises:
         CameraError: they are impossible, or no five coefficients fit.
     """
     lens: tuple[float, ...] = ()
-    if any(told.coeffs) and told.model != load_realsense().distortion.none:
-        lens = _fit_lens(told)
+    if any(reported.coeffs) and reported.model != load_realsense().distortion.none:
+        lens = _fit_lens(reported)
     try:
-        return CameraIntrinsics(told.fx, told.fy, told.ppx, told.ppy, told.width, told.height, lens)
+        return CameraIntrinsics(
+            reported.fx, reported.fy, reported.ppx, reported.ppy, reported.width, reported.height, lens
+        )
     except FrameError as error:
         raise CameraError(f"the RealSense's calibration cannot be used: {error}; calibrate the device") from error
 
 
-def _fit_lens(told: Any) -> tuple[float, ...]:
+def _fit_lens(reported: Any) -> tuple[float, ...]:
     """k1 k2 p1 p2 k3, in which OpenCV's model is linear."""
     deproject = load_realsense().rs2_deproject_pixel_to_point
-    u, v = np.meshgrid(np.linspace(0, told.width - 1, GRID), np.linspace(0, told.height - 1, GRID))
+    u, v = np.meshgrid(np.linspace(0, reported.width - 1, GRID), np.linspace(0, reported.height - 1, GRID))
     pixels = np.stack((u.ravel(), v.ravel()), axis=1)
-    rays: Float64 = np.array([deproject(told, pixel.tolist(), 1.0)[:2] for pixel in pixels])
-    seen = (pixels - (told.ppx, told.ppy)) / (told.fx, told.fy)
+    rays: Float64 = np.array([deproject(reported, pixel.tolist(), 1.0)[:2] for pixel in pixels])
+    seen = (pixels - (reported.ppx, reported.ppy)) / (reported.fx, reported.fy)
     x, y = rays.T
     r2 = x * x + y * y
     columns_x = (x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3)
@@ -192,10 +194,10 @@ def _fit_lens(told: Any) -> tuple[float, ...]:
     A = np.concatenate((np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)))
     b = (seen - rays).T.ravel()
     lens = np.linalg.lstsq(A, b, rcond=None)[0]
-    misfit_px = float(np.abs(A @ lens - b).max()) * max(told.fx, told.fy)
+    misfit_px = float(np.abs(A @ lens - b).max()) * max(reported.fx, reported.fy)
     if misfit_px > MISFIT_PX:
         raise CameraError(
-            f"the RealSense's lens model ({told.model}, {list(told.coeffs)}) cannot be undone: OpenCV's is "
+            f"the RealSense's lens model ({reported.model}, {list(reported.coeffs)}) cannot be undone: OpenCV's is "
             f"{misfit_px:.1f} px off; choose another colour size"
         )
     return tuple(float(value) for value in lens)
@@ -206,30 +208,30 @@ class ImageMaker:
 
     Args:
         camera_id: Name in the images.
-        told: The SDK's ``intrinsics`` of the colour images.
+        reported: The SDK's ``intrinsics`` of the colour images.
 
     Attributes:
         passed_over: Images that could not be used: out of order, or stamped in the future.
         reason: Why the last of them could not.
     """
 
-    def __init__(self, camera_id: str, told: Any) -> None:
+    def __init__(self, camera_id: str, reported: Any) -> None:
         self.passed_over = 0
         self.reason = ""
         self._camera_id = camera_id
         self._last: tuple[int, int] | None = None  # number and stamp of the last image
         self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
-        self.connected(told)
+        self.connected(reported)
 
     @property
     def intrinsics(self) -> CameraIntrinsics:
         """Of its images."""
         return self._rectify.intrinsics
 
-    def connected(self, told: Any) -> None:
+    def connected(self, reported: Any) -> None:
         """The device counts again from here, and its clock may have started again."""
-        self._rectify = Rectifier(read_intrinsics(told))
-        self._lens = any(told.coeffs)
+        self._rectify = Rectifier(read_intrinsics(reported))
+        self._lens = any(reported.coeffs)
         self._shift = None
         self._clock = StreamClock()
 
@@ -258,15 +260,15 @@ class ImageMaker:
         return CameraImage(stamp_ns, number, self._camera_id, rgb, depth_m, self.intrinsics)
 
     def _stamp_ns(self, frames: FrameSet) -> int:
-        """When it was captured, on the monotonic clock; the SDK tells milliseconds of the wall clock or its own."""
-        told_ns = round(1e6 * frames.color.get_timestamp())
+        """When it was captured, on the monotonic clock; the SDK gives milliseconds of the wall clock or its own."""
+        sent_ns = round(1e6 * frames.color.get_timestamp())
         if frames.color.get_frame_timestamp_domain() == load_realsense().timestamp_domain.hardware_clock:
-            return self._clock.stamp_ns(told_ns, frames.arrived_ns)
-        return told_ns - time.time_ns() + time.monotonic_ns()
+            return self._clock.stamp_ns(sent_ns, frames.arrived_ns)
+        return sent_ns - time.time_ns() + time.monotonic_ns()
 
     def _number(self, counted: int) -> int:
         """From 0, with gaps where images were lost."""
         last = -1 if self._last is None else self._last[0]
         if self._shift is None or counted + self._shift <= last:
-            self._shift = last + (1 if self._last is None else 2) - counted  # a gap tells that it was away
+            self._shift = last + (1 if self._last is None else 2) - counted  # a gap shows that it was away
         return counted + self._shift

@@ -37,12 +37,12 @@ def open_camera(config: Config, camera_id: str = "camera") -> LiveCamera:
             'address as device = "/dev/v4l/by-id/..."'
         )
     measured = require_calibration(config.calibration, config.uncalibrated, f"V4L2 camera at {config.device}")
-    asked = (config.width, config.height) if config.width else None
-    size = asked if measured is None else (measured.width, measured.height)
-    if asked is not None and asked != size:
+    requested = (config.width, config.height) if config.width else None
+    size = requested if measured is None else (measured.width, measured.height)
+    if requested is not None and requested != size:
         raise CameraError(
-            f"{config.calibration}: is for another size than the {asked[0]}x{asked[1]} that the camera is asked "
-            "for; leave width and height out, or calibrate for that size"
+            f"{config.calibration}: is for another size than the {requested[0]}x{requested[1]} that is requested "
+            "of it; leave width and height out, or calibrate for that size"
         )
     named = Path(config.device)
     known = stable_path(named)
@@ -128,11 +128,11 @@ class V4l2Device:
             self._warnings += (f"requested pixels as {config.fourcc}, it gives {given}{offer}",)
         if abs(self.frame_hz - config.fps) > RATE_TOLERANCE * config.fps:
             self._warnings += (
-                f"asked for {config.fps:g} images/s, it gives {self.frame_hz:g} at this size and format",
+                f"requested {config.fps:g} images/s, it gives {self.frame_hz:g} at this size and format",
             )
 
     def _stamp_ns(self, arrived_ns: int) -> int:
-        """When the buffer was filled, as the kernel says; else when it arrived here, which ``warnings`` tells."""
+        """When the buffer was filled, as the kernel says; else when it arrived here, which ``warnings`` says."""
         stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         if -AHEAD_S * 1e9 < arrived_ns - stamp_ns < OLDEST_STAMP_S * 1e9:
             self._clock_warning = ""
@@ -231,4 +231,4 @@ def _set(fd: int, control: Control | None, wish: _Wish) -> str:
         given = ioctls.get_control(fd, control.id)
     except OSError as error:
         return f"{wish.setting}: it refuses {control.name} = {value} ({error.strerror or error}); {span}"
-    return "" if given == value else f"{wish.setting}: asked for {control.name} = {value}, it has {given}; {span}"
+    return "" if given == value else f"{wish.setting}: requested {control.name} = {value}, it has {given}; {span}"

@@ -21,11 +21,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from semantic_mapper.errors import DependencyError, FleetError
-from semantic_mapper.log_events import get_logger
 
 LOCAL = "local"
 _CONNECT_TIMEOUT_S = 5.0
-_START_TRIES = 4
 _OBJECT_STORE_BYTES = 256 << 20  # tasks read and write files, and pass small values
 _LONGEST_TEMPORARY = 30  # letters: below it Ray puts sockets, whose paths may be 107 bytes long
 _COMMON = {
@@ -34,9 +32,7 @@ _COMMON = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "1",  # tasks that declare no GPU see none
 }
 # By default a node gives up after 30 s, and after 15 s without its agent: too soon on a machine that has other work.
-_PATIENT = {"RAY_raylet_start_wait_time_s": "90", "RAY_agent_register_timeout_ms": "60000"}
-
-_log = get_logger(__name__)
+_PATIENT = {"RAY_raylet_start_wait_time_s": "240", "RAY_agent_register_timeout_ms": "120000"}
 
 
 @contextlib.contextmanager
@@ -96,16 +92,8 @@ def _start(ray: Any, address: str, arguments: Mapping[str, Any]) -> None:
     is_main = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        for left in reversed(range(_START_TRIES)):
-            try:
-                ray.init(logging_level=logging.ERROR, **arguments)
-                return
-            except Exception as error:  # Ray raises this very class for a node that is late
-                ray.shutdown()
-                if "timed out during startup" not in str(error) or not left:
-                    raise
-                _log.warning("ray_slow_to_start")
-    except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        ray.init(logging_level=logging.ERROR, **arguments)
+    except Exception as error:  # Ray raises this very class for a node that is late
         reason = " ".join(str(error).split())[:400] or type(error).__name__
         raise FleetError(f"the Ray cluster at '{address}' cannot be used: {reason}") from error
     finally:

@@ -13,7 +13,7 @@ from semantic_mapper.errors import ConfigError, DependencyError, FleetError, Sto
 from semantic_mapper.redaction import CHAIN, HIDDEN, NAMING_SCHEMES, user_length, without_secrets
 
 _SCHEME = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*)://(.*)", re.DOTALL)
-# What packages raise for failed requests beside ``OSError``.
+# What packages raise for failed requests, besides ``OSError``.
 _OTHER_ERRORS = (
     ("botocore.exceptions", "BotoCoreError"),
     ("botocore.exceptions", "ClientError"),

@@ -151,7 +151,7 @@ class PoseRefiner:
     @property
     def scale_spread(self) -> float:
         """One sigma of the scale of refined poses and of what is computed from them, a fraction: the error of given
-        poses against the extent of the path that they tell it from. Infinite before the camera has moved."""
+        poses against the extent of the path that it comes from. Infinite before the camera has moved."""
         _, given = self._keyframe_poses()
         if not len(given):
             return np.inf
@@ -218,13 +218,13 @@ class PoseRefiner:
         """Bundle now, or in the worker where that is free."""
         if self._pending is not None:
             return
-        asked = points.problem()
-        if asked is None:
+        problem = points.problem()
+        if problem is None:
             return
         if self._worker is None:
-            self._apply(*asked, adjust_bundle(asked[0], _ITERATIONS))
+            self._apply(*problem, adjust_bundle(problem[0], _ITERATIONS))
         else:
-            self._pending = (*asked, self._worker.submit(adjust_bundle, asked[0], _ITERATIONS))
+            self._pending = (*problem, self._worker.submit(adjust_bundle, problem[0], _ITERATIONS))
 
     def _collect(self, wait: bool) -> None:
         if self._pending is not None and (wait or self._pending[3].done()):
@@ -261,7 +261,7 @@ def align_poses(moved: Float64, to: Float64) -> tuple[Float64, float]:
     their places p, ``scale * T[:3, :3] @ p + T[:3, 3]``.
 
     Unlike a fit of places alone it is sure of the rotation where the camera has moved little, or straight on. The scale
-    is near 1 where the places do not tell it: where what is left of their distances is large beside the path.
+    is near 1 where the places do not show it: where what is left of their distances is large against the path.
     """
     T = np.eye(4)
     T[:3, :3] = np.einsum("kij,klj->il", to[:, :3, :3], moved[:, :3, :3])

@@ -12,7 +12,7 @@ from semantic_mapper.types import Float64
 _STEP_M = 0.2  # ways are compared over at least so much, so that a reference's jitter does not add to them
 _FIRST_M = 0.6  # of way, for a first scale
 _WINDOW_M = 4.0  # of way that the scale is taken over
-_MAX_RATIO = 3.0  # a way that differs so much from the others tells of a slip or a jump
+_MAX_RATIO = 3.0  # a way that differs so much from the others means a slip or a jump
 
 _BINS = 60
 _STRONG = 0.2  # of the strongest layer below the camera: the lowest layer that is as strong is the floor
@@ -22,7 +22,7 @@ _MOST_BELOW, _MARGIN = 0.03, 0.1  # fraction of the points further below it than
 
 @dataclass(slots=True)
 class _Way:
-    """The same way in both worlds."""
+    """The same way in the map and in the reference."""
 
     metres: float
     units: float

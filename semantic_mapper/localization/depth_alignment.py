@@ -21,11 +21,11 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 ITERATIONS = (20, 15, 10)  # at most, from the coarsest level, each half as wide as the next
 OUTLIER_M = 0.07  # points further than this from the surface do not count
 NOISE_M = 0.009  # of depth at 1 m, growing with its square; beyond this a distance counts less
-POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
+POINTS_A_VOTE = 50  # neighbouring points have the same error: that many count as one
 FALSE = 0.01  # of the information about the best known direction: noise of normals gives so much about every direction
 _FLAT_TURN = 0.015  # the same for turns
 _STILL_M, _STILL_RAD = 2e-5, 2e-5  # smaller steps end a level
-_DAMPING = 1e-4  # of the normal matrix's mean diagonal: directions that no point tells of stay as they are
+_DAMPING = 1e-4  # of the normal matrix's mean diagonal: directions of which no point says anything stay as they are
 _LEAST_POINTS = 30
 _COARSER = 2.0  # noise at each level, by that of the next finer one
 _SMOOTH_PX = 7  # width of the filter that takes the sensor's noise off points and normals
@@ -178,9 +178,9 @@ def align(levels: Sequence[Level], targets: Sequence[Target], T_world_camera: Fl
 
 
 def flat_directions(normal_matrices: Sequence[Float64]) -> tuple[Float64, Float64] | None:
-    """Projections (3, 3) on the turns and on the shifts of the camera, in its own axes, that points tell nothing of.
+    """Projections (3, 3) on the turns and on the shifts of the camera, in its own axes, of which points say nothing.
 
-    None where they tell of all: the usual case. A wall that fills the picture leaves a turn and two shifts open.
+    None where they say something of all, as usual. A wall that fills the picture leaves a turn and two shifts open.
 
     Args:
         normal_matrices: (6, 6) each, of ``fit``.

@@ -47,7 +47,7 @@ _FAR_M = 10.0  # from the place that it is about, no pose is believed
 _REACH_M = 1.5  # places whose views are this near may show what the frame shows; a radian counts like a metre
 _DEPTH_M, _DEPTH = 0.06, 0.04  # by which the depths of a feature may differ
 _ALIKE = 0.75 * 512.0  # distance of descriptors
-_APART_M, _FLAT = 0.3, 0.8  # features that tell sizes are so far apart, most of it across the view
+_APART_M, _FLAT = 0.3, 0.8  # features that sizes are measured by are so far apart, most of it across the view
 _PAIRS = 30  # of such features, at least
 _SAME_M, _SAME_RAD = 0.3, np.deg2rad(10.0)  # poses further apart are two
 
@@ -241,7 +241,7 @@ class Relocalizer:
         return Landmarks(points[best[alike]], features.pixels[alike])
 
     def _guesses(self, features: Features, intrinsics: CameraIntrinsics) -> list[_Guess]:
-        """Poses that features tell of, those with the most of them first."""
+        """Poses that features lead to, those with the most of them first."""
         ranked = [key for key, _ in self._index.candidates(features, _CANDIDATES)]
         pairs = {key: match_features(features.descriptors, self._places[key].descriptors) for key in ranked}
         limit_px = _REPROJECTION * intrinsics.fx
@@ -271,7 +271,7 @@ class Relocalizer:
 
 
 def _relative_size(landmarks: Landmarks, depth_m: Float32, intrinsics: CameraIntrinsics) -> float:
-    """Median of distances between features, as the frame has them against those in the map; NaN where too few tell."""
+    """Median of distances between features, in the frame against those in the map; NaN where there are too few."""
     u, v = np.rint(landmarks.pixels).astype(np.intp).T
     z = depth_m[v.clip(0, intrinsics.height - 1), u.clip(0, intrinsics.width - 1)].astype(np.float64)
     x, y = ((landmarks.pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy) * z[:, None]).T

@@ -10,8 +10,14 @@ import pytest
 from semantic_mapper.drivers.calibrating import camera
 from semantic_mapper.drivers.calibrating.camera import calibrate_camera, compare_camera, draw_calibration, ideal_pixels
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.views import REGIONS, BoardView, ViewGatherer, area_counts, missing_regions
-from semantic_mapper.drivers.poses.board import BoardFinder
+from semantic_mapper.drivers.calibrating.views import (
+    MIN_CORNERS,
+    REGIONS,
+    BoardView,
+    ViewGatherer,
+    area_counts,
+    missing_regions,
+)
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import camera_matrix, project
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -40,7 +46,7 @@ def made_up(poses: list[Float64], noise_px: float = 0.1, seed: int = 0) -> list[
         inside = ((pixels > 2) & (pixels < np.array(SIZE) - 3)).all(axis=1)
         seen = pixels[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))
         found.append(BoardView(str(number), number, points[inside], seen))
-    return [v for v in found if len(v.points) >= CONFIG.min_corners]
+    return [v for v in found if len(v.points) >= MIN_CORNERS]
 
 
 def rays(intrinsics: CameraIntrinsics) -> Float64:
@@ -69,24 +75,6 @@ def test_a_known_camera_is_found_from_pictures(gathered: ViewGatherer) -> None:
     assert picture.dtype == np.uint8 and picture.shape[2] == 3
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50  # corners, lines and bars, not an empty panel
     assert not misplaced_texts(figure_of(draw_calibration, "cam", found))
-
-
-def test_corners_are_found_where_the_lens_shows_them() -> None:
-    T, picture = shown()[0]
-    points, pixels = BoardFinder(BOARD).find(picture.rgb)
-    known = {tuple(np.round(p, 6)): q for p, q in zip(*corners_of(T, LENS), strict=True)}
-    off = [np.linalg.norm(q - known[tuple(np.round(p, 6))]) for p, q in zip(points, pixels, strict=True)]
-    assert len(off) > 20 and np.median(off) < 0.15
-
-
-def test_the_uncertainty_is_that_of_many_calibrations() -> None:
-    """Of 8 calibrations with other noise, the spread of the focal length is what each of them says."""
-    poses = views(16)
-    found = [calibrate_camera("cam", made_up(poses, 0.3, seed), SIZE, CONFIG) for seed in range(8)]
-    spread = float(np.std([f.intrinsics.fx for f in found], ddof=1))
-    said = float(np.mean([f.sigmas["fx"] for f in found]))
-    assert 0.5 < spread / said < 2.0
-    assert np.mean([f.rms_px for f in found]) == pytest.approx(0.3 * np.sqrt(2), rel=0.1)
 
 
 @pytest.mark.parametrize("coefficients", [4, 5, 8])

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from semantic_mapper.drivers.calibrating import rig
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.rig import calibrate_rig, solve
-from semantic_mapper.drivers.calibrating.views import MAX_VIEWS, BoardView, ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibrating.views import MAX_VIEWS, MIN_CORNERS, BoardView, ViewGatherer, simultaneous
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import Float64
@@ -31,7 +31,7 @@ RIG = {
 def seen(T_camera_board: Float64, stamp: int, noise_px: float, rng: np.random.Generator) -> BoardView | None:
     points, pixels = corners_of(T_camera_board, LENS)
     inside = ((pixels > 2) & (pixels < (LENS.width - 3, LENS.height - 3))).all(axis=1)
-    if inside.sum() < CONFIG.min_corners:
+    if inside.sum() < MIN_CORNERS:
         return None
     return BoardView(
         str(stamp), stamp, points[inside], pixels[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))

@@ -81,14 +81,6 @@ def test_padded_rows_are_left_out(calibration: Path) -> None:
     assert np.abs(image.rgb.astype(int) - host.rgb_image(5))[:, [0, 10, -10, -1]].max() < 4
 
 
-def test_a_grey_camera_gives_grey_images(calibration: Path) -> None:
-    frame = dai.ImgFrame()
-    frame.setCvFrame(np.full((HEIGHT, WIDTH), 77, np.uint8), dai.ImgFrame.Type.GRAY8)
-    with host.camera(lambda: host.played(calibration, [host.stamped(frame, 0, long_ago(1))], None)) as camera:
-        (image,) = take(camera, 1)
-    assert image.rgb.shape == (HEIGHT, WIDTH, 3) and (image.rgb == 77).all()
-
-
 def test_intrinsics_that_the_images_carry_count_more_than_the_calibration(calibration: Path) -> None:
     rgb, depth = messages(3)
     cropped = dai.ImgTransformation(WIDTH, HEIGHT, [[70.0, 0, 30], [0, 71, 20], [0, 0, 1]])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from semantic_mapper.drivers.poses.board import BoardPoseSource
-from semantic_mapper.drivers.poses.config import IDENTITY, KINDS
+from semantic_mapper.drivers.poses.config import IDENTITY
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.drivers.poses.sources import DevicePoseSource, FixedPoseSource, open_poses, read_pose_config
 from semantic_mapper.drivers.poses.topic import TopicPoseSource
@@ -30,12 +30,6 @@ def test_a_section_of_a_launch_file_becomes_a_pose_source(text: str, kind: type)
     source = open_poses(tomllib.loads(text))
     assert isinstance(source, kind)
     assert source.warnings == () and not source.counters
-
-
-def test_every_kind_has_its_name() -> None:
-    assert set(KINDS) == {"device", "fixed", "topic", "board", "rgbd", "visual"}
-    for name, kind in KINDS.items():
-        assert name in str(kind.__annotations__["kind"])
 
 
 @pytest.mark.parametrize(

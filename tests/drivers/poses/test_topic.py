@@ -135,14 +135,6 @@ def test_other_clocks_are_refused_with_the_difference_and_fixed_by_the_offset(en
     assert found is not None and found.T_world_camera[0, 3] == pytest.approx(5.01)
 
 
-def test_a_clock_ahead_by_less_than_is_kept_is_refused_too(endpoint: str, robot: Robot) -> None:
-    with listening(endpoint, robot) as source:
-        for ms in range(1000, 5001, 20):  # 1010 is in here, but of a time 4 s ago
-            robot.send(ms)
-        eventually(lambda: source.counters["messages"] == 201)
-        assert source.pose(image(1010 * MS)) is None and source.counters["clock"] == 1
-
-
 def test_a_publisher_that_restarts_with_an_earlier_clock_is_followed(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot) as source:
         robot.send(4000)
@@ -179,7 +171,7 @@ def test_a_second_publisher_on_a_clock_that_is_behind_disturbs_nothing(endpoint:
 
 
 @pytest.mark.usefixtures("stopped_clock")
-@pytest.mark.parametrize("ahead_ms", [300, 900, 3_600_000])
+@pytest.mark.parametrize("ahead_ms", [300, 3_600_000])
 def test_messages_of_moments_that_have_not_come_disturb_nothing(endpoint: str, robot: Robot, ahead_ms: int) -> None:
     with listening(endpoint, robot) as source:
         for ms in range(9800, 10_000, 20):

@@ -114,15 +114,6 @@ def test_swapped_halves_are_put_right(film: Film, tmp_path: Path) -> None:
     assert swapped.depth_m is not None and (swapped.depth_m > 0).mean() > 0.85
 
 
-def test_narrower_images_have_their_own_intrinsics_and_the_same_depth(film: Film, tmp_path: Path) -> None:
-    file = pairs.write_pair(tmp_path / "pair.toml")
-    (large, *_), (small, *_) = images_of(film, file), images_of(film, file, width=240)
-    assert small.rgb.shape == (180, 240, 3) and small.intrinsics.fx == pytest.approx(large.intrinsics.fx / 2, rel=0.02)
-    assert small.depth_m is not None and large.depth_m is not None
-    a, b = (float(np.median(image[image > 0])) for image in (small.depth_m, large.depth_m))
-    assert a == pytest.approx(b, rel=0.05)
-
-
 def test_a_file_of_a_pair_reads_back_to_the_same_numbers(tmp_path: Path) -> None:
     lens = dataclasses.replace(pairs.LEFT, distortion=(-0.1, 0.02, 1e-4, -2e-4, 0.003))
     pair = dataclasses.replace(pairs.pair(swapped=True), left=lens)
