@@ -21,6 +21,7 @@ import pytest
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
 from semantic_mapper.drivers.mounts import Mount
+from semantic_mapper.drivers.poses import sources
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
 from semantic_mapper.nodes.camera import live as live_camera
 from semantic_mapper.nodes.camera.node import run_camera
@@ -308,7 +309,8 @@ def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
         writer.write(np.full((48, 64, 3), 90, np.uint8))
     writer.release()
     config = {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")}
-    poses = {"kind": "device", "patience_s": 0.1}  # a video tells no pose of its own
+    poses = {"kind": "device"}  # a video gives no pose of its own
+    monkeypatch.setattr(sources, "PATIENCE_S", 0.1)
     monkeypatch.setattr(live_camera, "check_world", lambda *_: None)
     with running({"camera": {"kind": "opencv", "config": config, "poses": poses}}, restartable=restartable) as node:
         node.until(lambda m: isinstance(m, EndOfStream) or (isinstance(m, Status) and m.state == "ended"))
