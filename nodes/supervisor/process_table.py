@@ -31,5 +31,5 @@ PROCESS_TABLE: dict[str, ProcessKind] = {
     "foxglove": ProcessKind(f"{_NODES}.foxglove.node", preloaded=True, ends_with_stream=True, stop_limit="stop_s"),
     "zenoh": ProcessKind(f"{_NODES}.zenoh.node", preloaded=True, ends_with_stream=True, stop_limit="stop_s"),
     "recorder": ProcessKind(f"{_NODES}.recorder.node", preloaded=False, ends_with_stream=True, stop_limit="stop_s"),
-    "mapper": ProcessKind(f"{_NODES}.mapper.node", preloaded=True, ends_with_stream=True, stop_limit="finish_s"),
+    "mapper": ProcessKind(f"{_NODES}.mapper.__main__", preloaded=True, ends_with_stream=True, stop_limit="finish_s"),
 }
