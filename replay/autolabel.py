@@ -14,13 +14,17 @@ from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, LabelError, LogError, WeightsError
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.panoptic import Panoptic
+from semantic_mapper.fields.render import render_image
+from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
@@ -29,8 +33,7 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, AutolabelNote
 from semantic_mapper.replay.instance_images import InstanceImages
 from semantic_mapper.replay.job_monitor import JobMonitor
-from semantic_mapper.replay.log.atomic_log import atomic_log
-from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.replay.log.format import LogWriter, atomic_log
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.log.sequence import (
     PART_ATTACHMENT,
@@ -42,7 +45,7 @@ from semantic_mapper.replay.log.sequence import (
     parts_on_disk,
     read_part,
 )
-from semantic_mapper.replay.rendered_depth import rendered_depth
+from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.transport.codec import Envelope, decode_as, encode, with_computed_depth, with_label
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float32, MapUpdate, PosedFrame, UInt8
@@ -491,3 +494,28 @@ def _rounded(metres: Float32, how: Callable[[Float32], Float32]) -> Float32:
     steps = how(metres * np.float32(DEPTH_STEPS_PER_M))
     held = np.where(np.isfinite(steps) & (steps >= 0) & (steps <= np.iinfo(np.uint16).max), steps, 0)
     return held.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
+
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
+
+
+OPAQUE = 0.5  # opacity from which on a ray has met a surface
+
+
+def rendered_depth(field: LearnedField, frame: PosedFrame, width: int) -> Float32:
+    """z (H, W) in metres at the size of the frame, 0 where a ray meets nothing.
+
+    Args:
+        field: Holds the scene.
+        frame: Pose and camera.
+        width: Of the rendering, in pixels; each pixel of the frame has the nearest one.
+    """
+    k = working_intrinsics(frame.intrinsics, width)
+    sources = field.encode(stack_sources([view_from_frame(frame, field.label_set, k.width)]))
+    nothing = np.zeros((k.height, k.width), np.float32)
+    scene = (field, sources, k, frame.T_world_camera, nothing, field.sampling, 0)
+    found = render_image(*scene, stamp_ns=frame.stamp_ns)
+    depth = (found.depth_m * (found.opacity > OPAQUE)).view(k.height, k.width).numpy()
+    size = (frame.intrinsics.width, frame.intrinsics.height)
+    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)

@@ -11,45 +11,99 @@ from __future__ import annotations
 
 import codecs
 import json
-from collections.abc import Callable, Collection
-from dataclasses import replace
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
+from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
+from semantic_mapper.config import Config, convert_config
 from semantic_mapper.errors import ConfigError, PoseError
-from semantic_mapper.fields.primitives import SHAPES, Primitive
+from semantic_mapper.fields.primitives import Primitive, ShapeName, centred
 from semantic_mapper.files import read_regular, write_bytes
-from semantic_mapper.labels import LabelSet
+from semantic_mapper.geometry import MAX_TRANSLATION_M, check_pose
+from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.replay.box_values import (
-    BadBox,
-    BoxFile,
-    box_of,
-    class_of,
-    each_once,
-    is_thing,
-    metres,
-    numbers,
-    outline,
-    pose_of,
-    poses_by,
-    whole_faces,
-    whole_id,
-)
-from semantic_mapper.replay.kitti360_boxes import MERGE, read_kitti360
+from semantic_mapper.replay.importers.kitti360 import LABELS as KITTI360_LABELS
+from semantic_mapper.replay.importers.kitti360 import SOURCE as KITTI360_SOURCE
+from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.types import Float64
 
 MAX_FILE_BYTES = 1 << 28  # 50,000 boxes of KITTI-360 take 0.1 GB
+MAX_ID = 65535  # what an instance image of 16 bits holds; 0 is none
+MIN_SIZE_M = 0.001
 QUERY_MARGIN_M = 0.05  # boxes of `query` end in the middle of surface voxels; this far beyond is theirs, too
 MAX_NAMED = 10  # boxes that cannot be used, in an error
-_TIMES = {"stamps": "nanoseconds", "frames": "frames"}
-_FILE_KEYS = {"boxes", "merge"}
-_KEYS = {"id", "class", "shape", "T_world_box", "size", "thing", "polygon", "vertices", "faces", "stamps", "frames"}
+# A box is one thing unless its class is one of these. As KITTI-360 has it, a building is a thing, too.
+BOX_STUFF = STUFF_NAMES - {"building"} | {"rail track", "guard rail", "tunnel", "gate", "polegroup"}
+# What labels without these classes take them for: those that KITTI-360's paper (Sec. 4) and training ids merge.
+MERGE = {
+    "sidewalk": ("parking",),
+    "building": ("garage",),
+    "fence": ("gate",),
+    "pole": ("polegroup", "smallpole"),
+    "car": ("caravan", "trailer"),
+}
+# The XML of KITTI-360 writes labels without spaces, and some under other names.
+_XML_NAMES = {name.replace(" ", ""): name for name in KITTI360_LABELS.names}
+_XML_NAMES |= {"driveway": "parking", "ground": "terrain", "bigpole": "pole", "pedestrian": "person"}
 
 _log = get_logger(__name__)
+
+Row = tuple[float, float, float, float]
+Pose = tuple[Row, Row, Row, Row]
+Place = tuple[float, float, float]
+WholeNumber = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+
+
+@dataclass(frozen=True, slots=True)
+class BoxFile:
+    """What a file of boxes says.
+
+    Args:
+        primitives: In the order of the file, those that move among them.
+        merge: By class of the pseudo labels: classes that they cannot tell from it.
+        left_out: How many boxes of the file are of no class at all (KITTI-360's "unknown").
+        bad: Boxes of XML that cannot be used: number in the file, id and what is wrong.
+        is_xml: Whether it is one of KITTI-360.
+    """
+
+    primitives: tuple[Primitive, ...]
+    merge: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    left_out: int = 0
+    bad: tuple[str, ...] = ()
+    is_xml: bool = False
+
+
+class _File(Config, frozen=True):
+    boxes: list[Any]
+    merge: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
+
+
+class _Box(Config, frozen=True, rename={"class_name": "class"}):
+    id: Annotated[int, Meta(ge=1, le=MAX_ID)]
+    class_name: Annotated[str, Meta(pattern=r"\S")]
+    T_world_box: Pose
+    shape: ShapeName = "box"
+    size: Place | None = None
+    thing: bool | None = None
+    polygon: list[tuple[float, float]] | None = None
+    vertices: list[Place] | None = None
+    faces: list[tuple[WholeNumber, WholeNumber, WholeNumber]] | None = None
+    stamps: list[tuple[WholeNumber, Pose]] | None = None
+    frames: list[tuple[WholeNumber, Pose]] | None = None
+
+
+class _QueryBox(Config, frozen=True):
+    center: Place
+    size: Place
+    R_world_box: tuple[Place, Place, Place]
 
 
 def load_boxes(path: Path) -> BoxFile:
@@ -57,54 +111,19 @@ def load_boxes(path: Path) -> BoxFile:
 
     Raises:
         ConfigError: no such file, neither format, or boxes that cannot be used, each with its number in the file. Of
-            XML these are left out, and counted in a warning.
-    """
-    return usable(path, read_boxes(path))
-
-
-def read_boxes(path: Path) -> BoxFile:
-    """As ``load_boxes``; boxes that cannot be used are in ``BoxFile.bad``.
-
-    Raises:
-        ConfigError: no such file, or neither format.
+            XML these are left out, and counted in a warning, unless all are.
     """
     text = _read(path)
-    if text.lstrip().startswith(b"<"):
-        return read_kitti360(text, path)
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        reason = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
-        raise ConfigError(f"{path} is neither JSON nor XML: {reason}") from error
-    listed, read, merge = _listed(data, path)
-    good: list[tuple[int, Primitive]] = []
-    bad: list[BadBox] = []
-    for number, entry in enumerate(listed, 1):
-        try:
-            good.append((number, read(entry)))
-        except (ConfigError, PoseError) as error:
-            box_id: Any = cast("dict[str, Any]", entry).get("id") if isinstance(entry, dict) else None
-            known = isinstance(box_id, int) and not isinstance(box_id, bool)
-            bad.append(BadBox(number, box_id if known else None, str(error)))
-    primitives, every_bad = each_once(good, bad)
-    return BoxFile(primitives, _read_merge(merge, path), bad=every_bad)
-
-
-def usable(path: Path, found: BoxFile) -> BoxFile:
-    """The file, if its boxes can be used.
-
-    Raises:
-        ConfigError: some cannot, or, of XML, none.
-    """
+    found = _read_xml(text, path) if text.lstrip().startswith(b"<") else _read_json(text, path)
     if not found.bad:
         return found
-    named = "; ".join(map(str, found.bad[:MAX_NAMED]))
+    named = "; ".join(found.bad[:MAX_NAMED])
     if len(found.bad) > MAX_NAMED:
         named += f"; and {len(found.bad) - MAX_NAMED} others"
-    if found.is_xml and found.primitives:
-        _log.warning("boxes_left_out", file=str(path), count=len(found.bad), reason=named)
-        return found
-    raise ConfigError(f"{path}, {named}")
+    if not found.primitives or not found.is_xml:
+        raise ConfigError(f"{path}, {named}")
+    _log.warning("boxes_left_out", file=str(path), count=len(found.bad), reason=named)
+    return found
 
 
 def save_boxes(path: Path, boxes: BoxFile) -> None:
@@ -115,21 +134,12 @@ def save_boxes(path: Path, boxes: BoxFile) -> None:
     write_bytes(path, text.encode())
 
 
-def check_box(box: Primitive) -> None:
-    """Refuse a box that could not be read again.
-
-    Raises:
-        ConfigError, PoseError: with what is wrong.
-    """
-    _from_json(_to_json(box))
-
-
 def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFile, LabelSet]:
     """Boxes that a field can be fitted with, and the label set of the field.
 
     That is the one of the pseudo labels, and those classes of boxes that it lacks, but that a class of it may stand for
-    as ``merge`` says, or else ``kitti360_boxes.MERGE``. Boxes of XML of KITTI-360 of any other class that it lacks are
-    left out, with a warning.
+    as ``merge`` says, or else ``MERGE``. Boxes of XML of KITTI-360 of any other class that it lacks are left out, with
+    a warning.
 
     Args:
         boxes: Of a file.
@@ -155,6 +165,106 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
             hint = f"; did you mean '{near[0]}'?" if near else f"; it has {', '.join(among.names)}"
             raise ConfigError(f"{path}, {where}: label set '{label_set.name}' has no class '{name}'{hint}")
     return boxes, known
+
+
+def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]]:
+    """Boxes with poses by frame of a drive of KITTI-360, with the times of these frames in a log of it instead.
+
+    Poses at frames that the log lacks are dropped, and boxes without any other.
+
+    Args:
+        boxes: Of a file.
+        path: Of the file, for errors.
+        log: Imported from KITTI-360.
+
+    Returns:
+        The boxes, and the ids of those that were dropped.
+
+    Raises:
+        ConfigError: the log is of something else, or has none of the frames at which any box is.
+    """
+    if all(box.frames is None for box in boxes.primitives):
+        return boxes, []
+    if not log.info.source.startswith(KITTI360_SOURCE):
+        raise ConfigError(
+            f"{path}: boxes have poses by frame of a drive of KITTI-360, and {log.path} is of '{log.info.source}'; "
+            "give the log that `import` made of the drive, or delete these boxes"
+        )
+    times: dict[int, int] = {}
+    for envelope, _ in log.frame_parts():
+        times.setdefault(envelope.seq, envelope.stamp_ns)
+    kept: list[Primitive] = []
+    dropped: list[int] = []
+    for box in boxes.primitives:
+        stamps = tuple(sorted({times[n]: pose for n, pose in box.frames or () if n in times}.items()))
+        if box.frames is None:
+            kept.append(box)
+        elif stamps:
+            kept.append(replace(box, frames=None, stamps=stamps, T_world_box=stamps[0][1]))
+        else:
+            dropped.append(box.id)
+    if not kept:
+        raise ConfigError(
+            f"{path}: all boxes move, and {log.path} has none of the frames of the drive at which they are"
+        )
+    return replace(boxes, primitives=tuple(kept)), dropped
+
+
+def _is_thing(class_name: str) -> bool:
+    """Whether boxes of a class are things where nothing says so."""
+    return class_name not in BOX_STUFF
+
+
+def _metres(value: Any, name: str) -> Float64:
+    """Lengths or places as an array.
+
+    Raises:
+        ConfigError: one is not within the 100 km that a map may cover.
+    """
+    array = np.array(value, np.float64)
+    if not (np.abs(array) <= MAX_TRANSLATION_M).all():
+        raise ConfigError(f"{name} must be metres within {MAX_TRANSLATION_M / 1000:g} km")
+    return array
+
+
+def _box_of(box: Primitive) -> Primitive:
+    """A primitive whose outline or mesh is one, with the origin of its axes in its middle.
+
+    Raises:
+        ConfigError: it is thin, open, or crosses itself, or its id cannot be one.
+        PoseError: a pose is none.
+    """
+    if not 1 <= box.id <= MAX_ID:
+        raise ConfigError(f"id must be a whole number from 1 to {MAX_ID}, got {box.id}")
+    if not (box.size >= MIN_SIZE_M).all():
+        raise ConfigError(f"size must be at least {MIN_SIZE_M} m along all axes, got {box.size.tolist()}")
+    for name, known in (("stamps", box.stamps), ("frames", box.frames)):
+        for when, pose in known or ():
+            check_pose(pose, f"{name}, pose at {when}", "box")
+    check_pose(box.T_world_box, "T_world_box", "box")
+    box = centred(box)
+    box.mesh()
+    return box
+
+
+def _each_once(
+    good: Iterable[tuple[int, Primitive]], bad: Iterable[tuple[int, int | None, str]]
+) -> tuple[tuple[Primitive, ...], tuple[str, ...]]:
+    """Boxes, each with its number in the file, and bad ones (number, id, problem), as sentences in order; those with
+    the id of an earlier one are bad, too."""
+    seen: dict[int, int] = {}
+    kept: list[Primitive] = []
+    more = list(bad)
+    for number, box in good:
+        first = seen.setdefault(box.id, number)
+        if first == number:
+            kept.append(box)
+        else:
+            more.append((number, box.id, f"id {box.id} is that of box {first}; give it another"))
+    told = [
+        f"box {n}{'' if i is None else f' (id {i})'}: {problem}" for n, i, problem in sorted(more, key=lambda b: b[0])
+    ]
+    return tuple(kept), tuple(told)
 
 
 def _merged(boxes: BoxFile, label_set: LabelSet) -> BoxFile:
@@ -196,85 +306,86 @@ def _read(path: Path) -> bytes:
         raise ConfigError(f"cannot read boxes from {path}: {error}") from error
 
 
-def _listed(data: Any, path: Path) -> tuple[list[Any], Callable[[Any], Primitive], Any]:
-    """Entries of a file, what reads one, and what it says about merging."""
+def _read_json(text: bytes, path: Path) -> BoxFile:
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
+        raise ConfigError(f"{path} is neither JSON nor XML: {reason}") from error
     table = cast("dict[str, Any]", data) if isinstance(data, dict) else {}
-    if table.get("question") == "instances":
-        listed, read = table.get("instances"), _from_query
-    else:
-        if "boxes" not in table and not get_close_matches("boxes", table, n=1):
-            raise ConfigError(
-                f"{path} holds no boxes; give a boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360"
-            )
-        _refuse_unknown(table, _FILE_KEYS, f"{path}: ")
-        listed, read = table["boxes"], _from_json
-    if not isinstance(listed, list):
-        raise ConfigError(f"{path}: the boxes must be a list, not a {type(listed).__name__}")
-    return cast("list[Any]", listed), read, table.get("merge", {})
-
-
-def _refuse_unknown(given: dict[str, Any], keys: Collection[str], where: str = "") -> None:
-    unknown = sorted(set(given) - set(keys))
-    if unknown:
-        near = get_close_matches(unknown[0], keys, n=1, cutoff=0.5)
-        hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(sorted(keys))}"
-        raise ConfigError(f"{where}unknown key '{unknown[0]:.40}'{hint}")
-
-
-def _read_merge(value: Any, path: Path) -> dict[str, tuple[str, ...]]:
-    fits = isinstance(value, dict) and all(
-        isinstance(rest, list) and all(isinstance(name, str) for name in cast("list[Any]", rest))
-        for rest in cast("dict[str, Any]", value).values()
-    )
-    if not fits:
-        raise ConfigError(f'{path}: merge must be like {{"car": ["trailer", "caravan"]}}')
-    return {name: tuple(rest) for name, rest in cast("dict[str, list[str]]", value).items()}
-
-
-# ---- boxes.json
+    of_query = table.get("question") == "instances"
+    if of_query:
+        table = {"boxes": table.get("instances"), "merge": table.get("merge", {})}
+    elif not get_close_matches("boxes", table, n=1):
+        raise ConfigError(
+            f"{path} holds no boxes; give a boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360"
+        )
+    listed = table.get("boxes")
+    table["boxes"] = [] if isinstance(listed, list) else listed  # each is checked by itself
+    file = convert_config(table, _File, str(path))
+    good: list[tuple[int, Primitive]] = []
+    bad: list[tuple[int, int | None, str]] = []
+    for number, entry in enumerate(cast("list[Any]", listed), 1):
+        try:
+            good.append((number, (_from_query if of_query else _from_json)(entry)))
+        except (ConfigError, PoseError) as error:
+            box_id: Any = cast("dict[str, Any]", entry).get("id") if isinstance(entry, dict) else None
+            bad.append((number, box_id if type(box_id) is int else None, str(error)))
+    primitives, sentences = _each_once(good, bad)
+    return BoxFile(primitives, file.merge, bad=sentences)
 
 
 def _from_json(entry: Any) -> Primitive:
-    if not isinstance(entry, dict):
-        raise ConfigError(f"must be a table of {', '.join(sorted(_KEYS))}")
-    given = cast("dict[str, Any]", entry)
-    _refuse_unknown(given, _KEYS)
-    shape = given.get("shape", "box")
-    if shape not in SHAPES:
-        raise ConfigError(f"shape must be one of {', '.join(SHAPES)}, got {shape!r:.40}")
-    name = class_of(given.get("class"))
-    thing = given.get("thing", is_thing(name))
-    if not isinstance(thing, bool):
-        raise ConfigError(f"thing must be true or false, got {thing!r:.40}")
-    polygon = outline(given.get("polygon")) if shape == "prism" else None
-    vertices = metres(given.get("vertices"), "vertices", (None, 3)) if shape == "mesh" else None
-    stamps, frames = (poses_by(given[k], k, unit) if given.get(k) is not None else None for k, unit in _TIMES.items())
-    if stamps and frames:
+    box = convert_config(entry, _Box, "its values")
+    if box.stamps and box.frames:
         raise ConfigError("has stamps and frames; give one of them")
-    pose = pose_of(given.get("T_world_box"))
-    return box_of(
-        _extent(given.get("size"), polygon, vertices),
-        id=whole_id(given.get("id")),
-        class_name=name,
-        shape=shape,
-        T_world_box=(stamps or frames or ((0, pose),))[0][1],
-        thing=thing,
-        polygon=polygon,
-        vertices=vertices,
-        faces=whole_faces(given.get("faces")) if shape == "mesh" else None,
-        stamps=stamps,
-        frames=frames,
+    polygon, vertices, faces = None, None, None
+    size = None if box.size is None else _metres(box.size, "size")
+    if box.shape == "mesh":
+        if not box.vertices or not box.faces:
+            raise ConfigError("a mesh needs vertices and faces")
+        vertices, faces = _metres(box.vertices, "vertices"), np.array(box.faces, np.int64)
+        size = np.ptp(vertices, axis=0)
+    if size is None:
+        raise ConfigError("size, three metres, is missing")
+    if box.shape == "prism":
+        polygon = _outline(box.polygon or [])
+        size = np.array([*np.ptp(polygon, axis=0), size[2]])
+    stamps, frames = _poses(box.stamps, "stamps"), _poses(box.frames, "frames")
+    return _box_of(
+        Primitive(
+            id=box.id,
+            class_name=box.class_name,
+            shape=box.shape,
+            T_world_box=(stamps or frames or ((0, np.array(box.T_world_box, np.float64)),))[0][1],
+            size=size,
+            thing=_is_thing(box.class_name) if box.thing is None else box.thing,
+            polygon=polygon,
+            vertices=vertices,
+            faces=faces,
+            stamps=stamps,
+            frames=frames,
+        )
     )
 
 
-def _extent(size: Any, polygon: Float64 | None, vertices: Float64 | None) -> Float64:
-    """Size (3,) that is given; outlines and meshes have their own."""
-    if vertices is not None:
-        if not len(vertices):
-            raise ConfigError("vertices must be N x 3 numbers, got none")
-        return np.ptp(vertices, axis=0)
-    extent = metres(size, "size", (3,))
-    return extent if polygon is None else np.array([*np.ptp(polygon, axis=0), extent[2]])
+def _outline(corners: list[tuple[float, float]]) -> Float64:
+    """Corners (N, 2) of a polygon, without those that repeat the one before, as the last of a closed ring does."""
+    polygon = _metres(corners, "polygon").reshape(-1, 2)
+    polygon = polygon[(polygon != np.roll(polygon, 1, axis=0)).any(axis=1)]
+    if len(polygon) < 3:
+        raise ConfigError(f"polygon must have at least 3 different corners, got {len(polygon)}")
+    return polygon
+
+
+def _poses(known: list[tuple[int, Pose]] | None, name: str) -> tuple[tuple[int, Float64], ...] | None:
+    """Poses of one that moves, by ascending time or number of the frame."""
+    if known is None:
+        return None
+    poses = {when: np.array(pose, np.float64) for when, pose in known}
+    if not poses or len(poses) < len(known):
+        raise ConfigError(f"{name} must be [[whole number, 4x4 pose], ...], each number once")
+    return tuple(sorted(poses.items()))
 
 
 def _to_json(primitive: Primitive) -> dict[str, Any]:
@@ -296,26 +407,133 @@ def _to_json(primitive: Primitive) -> dict[str, Any]:
     return entry
 
 
-# ---- query MAP instances
-
-
 def _from_query(entry: Any) -> Primitive:
-    box = cast("dict[str, Any]", entry).get("box") if isinstance(entry, dict) else None
-    if not isinstance(box, dict):
+    """One instance of `query MAP instances`."""
+    given = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
+    box_id, name, box = given.get("id"), given.get("class"), given.get("box")
+    if type(box_id) is not int or not isinstance(name, str) or not isinstance(box, dict):
         raise ConfigError("an instance must have an id, a class and a box, as `query MAP instances` writes them")
-    given, box = cast("dict[str, Any]", entry), cast("dict[str, Any]", box)
-    size = metres(box.get("size"), "size", (3,))
+    found = convert_config({k: v for k, v in box.items() if k in _QueryBox.__struct_fields__}, _QueryBox, "its box")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.array(found.R_world_box), _metres(found.center, "center")
+    size = _metres(found.size, "size")
     if (size < 0).any():
         raise ConfigError(f"size must not be below 0 m, got {size.tolist()}")
+    return _box_of(Primitive(box_id, name, "box", pose, size + 2 * QUERY_MARGIN_M, _is_thing(name)))
+
+
+def _read_xml(text: bytes, path: Path) -> BoxFile:
+    """Objects of ``data_3d_bboxes``, as the devkit of KITTI-360 (``helpers/annotation.py``) reads them, in their order.
+
+    Each has ``label``, ``index``, ``transform`` (4x4, may scale), ``vertices``, ``faces``, ``instanceId`` and
+    ``timestamp``. One that moves is there many times, each with the number of a frame of the drive as its timestamp,
+    and becomes one box with its poses by frame; -1 says that it stands still.
+
+    Raises:
+        ConfigError: no XML, or no objects in it.
+    """
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ConfigError(f"{path} is no XML: {error}") from error
+    except (ValueError, LookupError) as error:  # of another character set
+        raise ConfigError(f"{path}: cannot be read: {error}; save it as UTF-8") from error
+    nodes = [node for node in root if node.find("transform") is not None]
+    if not nodes:
+        raise ConfigError(f"{path} holds no boxes; give XML of KITTI-360's data_3d_bboxes")
+    known = [(n, node) for n, node in enumerate(nodes, 1) if not _text(node, "label").lower().startswith("unknown")]
+    good: list[tuple[int, Primitive]] = []
+    bad: list[tuple[int, int | None, str]] = []
+    place: dict[tuple[str, str], int] = {}  # in ``good``, of those that move
+    for number, node in known:
+        try:
+            box, frame = _from_node(node)
+            if frame < 0:
+                good.append((number, box))
+                continue
+            box = replace(box, frames=((frame, box.T_world_box),))
+            at = place.setdefault(_object_of(node), len(good))
+            if at == len(good):
+                good.append((number, box))
+            else:
+                good[at] = good[at][0], _also(good[at][1], box, frame)
+        except (ConfigError, PoseError) as error:
+            index = _text(node, "index")
+            bad.append((number, int(index) + 1 if index.isdecimal() else None, str(error)))
+    primitives, sentences = _each_once(good, bad)
+    return BoxFile(primitives, left_out=len(nodes) - len(known), bad=sentences, is_xml=True)
+
+
+def _from_node(node: ElementTree.Element) -> tuple[Primitive, int]:
+    """One object in axes of its own, and the frame at which it is there; -1 = it does not move."""
+    transform, local, faces = (_matrix(node, name) for name in ("transform", "vertices", "faces"))
+    if transform.shape != (4, 4) or local.shape[1] != 3 or faces.shape[1] not in (3, 4):
+        raise ConfigError(
+            f"transform must be 4 x 4, vertices N x 3 and faces N x 3 or N x 4, got {transform.shape}, {local.shape} "
+            f"and {faces.shape}"
+        )
+    if (faces != np.round(faces)).any() or (faces < 0).any() or (faces > 1e9).any():
+        raise ConfigError("faces must be whole numbers: those of the vertices of each, from 0")
+    u, _, v = np.linalg.svd(_metres(transform, "transform")[:3, :3])  # the nearest rotation to a matrix that may scale
     pose = np.eye(4)
-    pose[:3, :3] = numbers(box.get("R_world_box"), "R_world_box", (3, 3))
-    pose[:3, 3] = numbers(box.get("center"), "center", (3,))
-    name = class_of(given.get("class"))
-    return box_of(
-        size + 2 * QUERY_MARGIN_M,
-        id=whole_id(given.get("id")),
+    pose[:3, :3] = u @ np.diag((1, 1, -1 if np.linalg.det(u @ v) < 0 else 1)) @ v
+    pose[:3, 3] = transform[:3, 3]
+    vertices = _metres(local, "vertices") @ (pose[:3, :3].T @ transform[:3, :3]).T
+    label = _text(node, "label")
+    if not label:
+        raise ConfigError("<label> is missing")
+    name = _XML_NAMES.get(re.sub(r"\s", "", label).lower(), label)
+    corners = faces.astype(np.int64)
+    box = Primitive(
+        id=_whole(node, "index") + 1,
         class_name=name,
-        shape="box",
-        T_world_box=pose_of(pose),
-        thing=is_thing(name),
+        shape="mesh",
+        T_world_box=pose,
+        size=np.ptp(vertices, axis=0),
+        thing=_is_thing(name),
+        vertices=vertices,
+        faces=corners if corners.shape[1] == 3 else np.concatenate((corners[:, :3], corners[:, (0, 2, 3)])),
     )
+    return _box_of(box), _whole(node, "timestamp") if _text(node, "timestamp") else -1
+
+
+def _object_of(node: ElementTree.Element) -> tuple[str, str]:
+    """What nodes of one object have in common; without a number of the instance, the index."""
+    instance = _text(node, "instanceId")
+    return _text(node, "label"), instance if instance.strip("0") else f"index {_text(node, 'index')}"
+
+
+def _also(box: Primitive, later: Primitive, frame: int) -> Primitive:
+    """A box that is also there at another frame, in the shape that it had at first."""
+    frames = dict(box.frames or ())
+    if frame in frames:
+        raise ConfigError(f"the same object is there already at frame {frame}")
+    known = tuple(sorted({**frames, frame: later.T_world_box}.items()))
+    return replace(box, frames=known, T_world_box=known[0][1])
+
+
+def _text(node: ElementTree.Element, name: str) -> str:
+    return (node.findtext(name) or "").strip()
+
+
+def _whole(node: ElementTree.Element, name: str) -> int:
+    text = _text(node, name)
+    if not re.fullmatch(r"-?\d{1,18}", text):
+        raise ConfigError(f"<{name}> must be a whole number, got '{text:.40}'")
+    return int(text)
+
+
+def _matrix(node: ElementTree.Element, name: str) -> Float64:
+    found = node.find(name)
+    if found is None:
+        raise ConfigError(f"<{name}> is missing")
+    try:
+        values = np.array(_text(found, "data").split(), np.float64)
+    except ValueError as error:
+        raise ConfigError(f"{name} must be numbers: {error}") from error
+    rows, columns = _whole(found, "rows"), _whole(found, "cols")
+    if rows < 1 or columns < 1 or rows * columns != len(values):
+        raise ConfigError(f"<{name}> says {rows} x {columns} numbers and holds {len(values)}")
+    if not np.isfinite(values).all():
+        raise ConfigError(f"{name} holds NaN or infinity")
+    return values.reshape(rows, columns)

@@ -32,8 +32,7 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.box_times import with_times
-from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_classes
+from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_classes, with_times
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log

@@ -40,7 +40,7 @@ from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.run_folder import hold_folder, prepare_file
 from semantic_mapper.replay.session import MapSession, open_recording
-from semantic_mapper.replay.sfm.film_note import read_left_out
+from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.scale import fit_to_scene
 from semantic_mapper.types import PosedFrame
 

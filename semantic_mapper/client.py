@@ -18,9 +18,8 @@ from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.lookup import PointAnswers
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import NearestSurface
+from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.questions import (
     NAMES,
@@ -59,7 +58,7 @@ from semantic_mapper.types import Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
 MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
-GRACE_S = 0.5  # in which a question that timed out is asked again, and keeps its turn
+GRACE_S = 0.5  # in which a question that timed out is sent again, and keeps its turn
 
 
 class MapClient:
@@ -105,7 +104,7 @@ class MapClient:
         return self._ask(InfoRequest())
 
     def at(self, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
-        """What is at points (N, 3), world metres; see ``queries.lookup.at``."""
+        """What is at points (N, 3), world metres; see ``queries.nearest.at``."""
         return self._ask(AtRequest(points=as_numbers(points, "points"), radius_m=radius_m))
 
     def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
@@ -125,7 +124,7 @@ class MapClient:
         )
 
     def points_in_box(self, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
-        """Surface points in a box; see ``queries.boxes.points_in_box``."""
+        """Surface points in a box; see ``queries.surface.points_in_box``."""
         return self._ask(BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper")))
 
     def instances(self, up: ArrayLike = UP, *, gone: bool = False) -> tuple[Instance, ...]:
@@ -191,7 +190,7 @@ class MapClient:
         return self._ask(PoseRequest())
 
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None, within_ns: int = 0) -> Correction:
-        """Begin to move the map with corrected poses, as a loop closure gives them; the mapper goes on meanwhile.
+        """Begin to move the map with corrected poses, as a loop closure gives them; mapping continues meanwhile.
 
         The mapper begins it once, also where an answer is lost and the request is sent again.
 

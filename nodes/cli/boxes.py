@@ -68,7 +68,7 @@ def _same_file(a: Path, b: Path) -> bool:
 def _draw(found: BoxFile, log_path: Path, file: Path, out: Path) -> str:
     from semantic_mapper.plots import write_picture
     from semantic_mapper.replay.box_picture import draw_boxes
-    from semantic_mapper.replay.box_times import with_times
+    from semantic_mapper.replay.boxes import with_times
     from semantic_mapper.replay.log.sequence import open_log
 
     if _same_file(out, file):
@@ -101,8 +101,7 @@ def describe_boxes(found: BoxFile) -> dict[str, Any]:
         for box in found.primitives
     ]
     merge = {name: list(rest) for name, rest in found.merge.items()}
-    bad = [{"number": b.number, "id": b.id, "problem": b.problem} for b in found.bad]
-    return {"boxes": listed, "merge": merge, "left_out": found.left_out, "bad": bad}
+    return {"boxes": listed, "merge": merge, "left_out": found.left_out, "bad": list(found.bad)}
 
 
 def box_table(title: str, found: BoxFile) -> Table:

@@ -218,7 +218,7 @@ def recover(
     Example: semantic-mapper recover cut-off.mcap clean.mcap
     """
     output = Output.guarded()
-    from semantic_mapper.replay.log.recover import recover as recover_log
+    from semantic_mapper.replay.log.format import recover as recover_log
 
     report = recover_log(source, log)
     output.print(

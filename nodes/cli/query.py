@@ -141,9 +141,8 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     from semantic_mapper.nodes import map_answers
     from semantic_mapper.queries.graph import GraphTracker
     from semantic_mapper.queries.instances import InstanceTracker
-    from semantic_mapper.queries.lookup import at
     from semantic_mapper.queries.mirror import MapMirror
-    from semantic_mapper.queries.nearest import nearest
+    from semantic_mapper.queries.nearest import at, nearest
     from semantic_mapper.replay.run_folder import map_path
 
     snapshot = MapMirror.load(map_path(Path(source))).snapshot()

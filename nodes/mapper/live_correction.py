@@ -22,7 +22,7 @@ from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import Float64
 
 HISTORY_A_STEP = 2  # frames of the history for each step where no time is to spare: more than come, so that it ends
-STOPPED_S = 30.0  # how long a mapper that was asked to stop goes on with a correction
+STOPPED_S = 30.0  # how long a mapper that is to stop continues a correction
 _REMEMBERED = 64  # requests whose answer may have been lost
 
 _log = structlog.get_logger(__name__)
@@ -101,12 +101,12 @@ class LiveCorrection:
     def finish(self, session: MapSession, stopped: Callable[[], bool], on_wait: Callable[[], None]) -> None:
         """End a correction that is under way, before the results are written; refuse those that come later.
 
-        Once somebody has asked to stop, it goes on for ``STOPPED_S`` at most; what is left then is reported in the
+        Once a stop was requested, it continues for ``STOPPED_S`` at most; what is left then is reported in the
         log and in ``session.unfinished_correction``.
 
         Args:
             session: As for ``advance``.
-            stopped: Whether somebody has asked to stop.
+            stopped: Whether a stop was requested.
             on_wait: Called now and then.
         """
         with self._lock:
@@ -181,7 +181,7 @@ class LiveCorrection:
     def _advance(self, frames: int) -> None:
         try:
             self._pipeline.advance_correction(frames)
-        except MapError as error:  # given up and kept as ``failure``; mapping goes on
+        except MapError as error:  # given up and kept as ``failure``; mapping continues
             _log.warning("map_stays_uncorrected", reason=str(error))
 
     def _follow(self, session: MapSession | None) -> None:

@@ -167,7 +167,7 @@ class MapperNode:
         self._ended_by = self._context.stop.name
 
     def _between_frames(self, *, mapped: bool) -> None:
-        """Let everything that goes on next to mapping do a little."""
+        """Let every part that works next to mapping do a little."""
         self._note_correction()
         self._correction.advance(self._session, mapped=mapped)
         if self._weights is not None:

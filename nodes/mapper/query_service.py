@@ -29,15 +29,14 @@ from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.status import PartStatus
 from semantic_mapper.queries import questions
-from semantic_mapper.queries.boxes import points_in_box
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.lookup import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.questions import NAMES, InstanceArrays, MapInfo, Point, decode_question
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import points_in_box
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.query_messages import (
     MapState,
@@ -100,8 +99,8 @@ class _Tracked(NamedTuple):
 class QueryService:
     """Answers questions about a map that another thread changes. A context manager.
 
-    Answers are about the map as it was a moment ago, and say about which version. While nobody asks, no snapshots are
-    made.
+    Answers are about the map as it was a moment ago, and say about which version. Without questions there are no
+    snapshots.
 
     Args:
         endpoint: Where to listen.
@@ -134,13 +133,13 @@ class QueryService:
         self._whereabouts = whereabouts or Whereabouts()
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        self._tracked: dict[Point, _Tracked] = {}  # by direction; the last one asked stands last
+        self._tracked: dict[Point, _Tracked] = {}  # by direction; the last one used stands last
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
         self._copy_again_at = 0.0
         self._copied_at = 0.0
-        self.asked = False  # whether anybody has ever asked about the map
+        self.used = False  # whether there ever was a question about the map
         self._listened_until = 0.0  # monotonic seconds
         self._awaited_version = 0  # that questions after a pause wait for
 
@@ -181,8 +180,8 @@ class QueryService:
             self._copy_again_at = now + PERIOD_S
 
     def hand_over(self) -> None:
-        """Copy all that has changed, if anybody has ever asked; for before the map's thread does something long."""
-        if self.asked and self.alive and self._copied_version != self._map.version:
+        """Copy all that has changed, if there ever was a question; for before the map's thread does something long."""
+        if self.used and self.alive and self._copied_version != self._map.version:
             self._copy(0)
 
     def close(self) -> None:
@@ -235,7 +234,7 @@ class QueryService:
                 self._copies.popleft()
                 self._copied_at = time.monotonic()
                 self._map_is_busy = False
-        except Exception:  # noqa: BLE001 -- whatever it is, the mapper goes on
+        except Exception:  # noqa: BLE001 -- whatever it is, the mapper continues
             self._broken = True
             _log.exception("snapshot_failed", version=self._copies[0].version)
 
@@ -268,7 +267,7 @@ class QueryService:
         now = time.monotonic()
         if now > self._listened_until:
             self._awaited_version, self._copied_at = self._map.version, now
-        self.asked = True
+        self.used = True
         self._listened_until = now + LISTENED_S
 
     def _snapshot_lags(self) -> bool:

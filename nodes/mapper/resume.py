@@ -35,7 +35,7 @@ _log = structlog.get_logger(__name__)
 def resume_map(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
     """In a restarted mapper, make ``voxel_map`` the one that its forerunner has saved in the course of this launch.
 
-    Frames come with poses in the same world as before, so a saved map goes on as if the frames after it had never come.
+    Poses are of the same session as before, so a saved map continues as if the frames after it had not come.
     A saved map that cannot be gone on with is put aside, so that nothing is written over it.
 
     Args:
@@ -111,7 +111,7 @@ def stored_settings(config: MapperConfig, path: Path | None, voxel_size_m: float
 
 
 def note_worlds(context: NodeContext, known: Mapping[int, Float64]) -> None:
-    """Leave word of where worlds lie in the map, for a mapper that takes it up."""
+    """Note where sessions lie in the map, for a mapper that resumes it."""
     plain = {str(world): T.ravel().tolist() for world, T in known.items()}
     context.try_to_leave_note(_WORLDS, json.dumps(plain), "a mapper that replaces it has to look for the camera again")
 
@@ -124,7 +124,7 @@ def noted_worlds(context: NodeContext) -> dict[int, Float64]:
 
 def forbid(context: NodeContext, why: str) -> bool:
     """From now on a saved map is not to be gone on with; False where that cannot be noted."""
-    return context.try_to_leave_note(_UNSOUND, why, "a mapper that replaces it goes on from a map that it should not")
+    return context.try_to_leave_note(_UNSOUND, why, "a mapper that replaces it resumes a map that it should not")
 
 
 def keep_earlier(context: NodeContext, path: Path) -> None:

@@ -1,4 +1,8 @@
-"""How Rerun lays out what ``RerunLog`` writes, and what its colours mean."""
+"""How Rerun lays out what ``RerunLog`` writes, and what its colours mean. Its SDK is an extra: import it from here.
+
+Raises:
+    DependencyError: on import, where the extra is not installed.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +17,20 @@ from semantic_mapper.evaluation.splat import seen_from
 from semantic_mapper.evaluation.upright import upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plots import DIM_TEXT, class_rows, new_figure, place, put_legend, put_picture, put_text, rendered
-from semantic_mapper.replay.exporters.rerun_sdk import rr, rrb
 from semantic_mapper.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+from semantic_mapper.errors import DependencyError
+
+try:
+    import rerun as rr
+    import rerun.blueprint as rrb
+except ModuleNotFoundError as error:
+    raise DependencyError(
+        "the viewer and Rerun files need the package rerun-sdk: pip install 'semantic-mapper[viewer]'"
+    ) from error
+
 
 COLOURINGS = ("class", "colour", "confidence", "measured", "age")
 MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orange, which the colour-blind can tell apart

@@ -13,8 +13,7 @@ import numpy as np
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import PICTURES, ImportOptions, inside
-from semantic_mapper.replay.importers.placed import has_picture, place_model
-from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
+from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, has_picture, place_model
 from semantic_mapper.replay.sfm.colmap_model import ColmapImage, ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
 

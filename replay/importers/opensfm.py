@@ -31,8 +31,7 @@ from semantic_mapper.replay.importers.base import (
     unknown_keys,
     unknown_notice,
 )
-from semantic_mapper.replay.importers.placed import PlacedModel, has_picture, place_model
-from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
+from semantic_mapper.replay.importers.posed import PlacedModel, PosedPicture, PosedPictures, has_picture, place_model
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth, scene_depth
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64

@@ -35,8 +35,7 @@ from semantic_mapper.replay.importers.rosbag import RosbagRecording
 from semantic_mapper.replay.importers.scannet import ScanNetRecording
 from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import TumRecording
-from semantic_mapper.replay.log.atomic_log import atomic_log
-from semantic_mapper.replay.log.format import LogReader, LogWriter
+from semantic_mapper.replay.log.format import LogReader, LogWriter, atomic_log
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.replay.sfm.colmap_model import find_models

@@ -8,8 +8,12 @@ attachment, and as the first message.
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, cast
@@ -20,7 +24,7 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import CompressionType, Writer
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.replay.log.atomic_file import AtomicFile
+from semantic_mapper.files import atomic_path, open_unlinked
 from semantic_mapper.replay.log.mcap_scan import MAGIC
 from semantic_mapper.replay.log.reader import INFO_ATTACHMENT, LogAttachment, LogReader
 from semantic_mapper.transport.codec import EncodedImage, encode, encode_frame, header_type, pack_parts, read_envelope
@@ -28,7 +32,81 @@ from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import Parts, StreamInfo
 from semantic_mapper.types import PosedFrame
 
-__all__ = ["LogAttachment", "LogReader", "LogWriter"]
+
+class AtomicFile:
+    """A new file, open for writing. ``write`` collects in memory, ``commit`` brings all of it to the file or nothing.
+
+    Args:
+        path: Of the file.
+        overwrite: Whether an existing one may be replaced.
+
+    Attributes:
+        size: Of what was committed, bytes.
+
+    Raises:
+        OSError: it exists, or cannot be made.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        if overwrite and path.is_symlink():
+            path.unlink()  # replaced, never written through
+        self._fd = open_unlinked(path, os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL))
+        self._pending: list[bytes] = []
+        self._pending_bytes = 0
+        self.size = 0
+        self.closed = False
+
+    def write(self, data: bytes) -> int:
+        """Collect; never fails."""
+        self._pending.append(bytes(data))
+        self._pending_bytes += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Where the next byte will be once all is committed."""
+        return self.size + self._pending_bytes
+
+    def flush(self) -> None:
+        """Do nothing: ``commit`` decides what is in the file."""
+
+    def commit(self) -> None:
+        """Bring what was collected to the file.
+
+        Raises:
+            OSError: not all of it could be written; the file is as it was, and what was collected is dropped.
+        """
+        data = memoryview(b"".join(self._pending))
+        self.drop()
+        written = 0
+        try:
+            while written < len(data):
+                written += os.write(self._fd, data[written:])
+        except OSError:
+            with contextlib.suppress(OSError):  # a device; else a cut record at the end, which readers pass over
+                os.ftruncate(self._fd, self.size)
+                os.lseek(self._fd, self.size, os.SEEK_SET)
+            raise
+        self.size += written
+
+    def drop(self) -> None:
+        """Forget what was collected since the last commit."""
+        self._pending.clear()
+        self._pending_bytes = 0
+
+    def sync(self) -> None:
+        """Wait until the disk has it.
+
+        Raises:
+            OSError: it cannot.
+        """
+        os.fsync(self._fd)
+
+    def close(self) -> None:
+        """Close it as it is. Harmless when repeated."""
+        if not self.closed:
+            self.closed = True
+            os.close(self._fd)
+
 
 PROFILE = "semantic-mapper"
 _DEFAULTS = CodecOptions()
@@ -232,3 +310,80 @@ def _for_people(info: StreamInfo) -> dict[str, str]:
     cameras = ", ".join(f"{name} {i.width}x{i.height}" for name, i in info.cameras.items())
     labels = "none" if info.label_set is None else f"{info.label_set.name} ({len(info.label_set)} classes)"
     return {"source": info.source, "cameras": cameras, "labels": labels, **info.metadata}
+
+
+@contextmanager
+def atomic_log(
+    path: Path,
+    info: StreamInfo,
+    *,
+    options: CodecOptions = _DEFAULTS,
+    attachments: Sequence[LogAttachment] = (),
+    overwrite: bool = False,
+) -> Iterator[LogWriter]:
+    """A writer of the log ``path``, which gets its name as the last thing; after an error there is none.
+
+    Args:
+        path, info, options, attachments: See ``LogWriter``.
+        overwrite: Whether a log that is there may be replaced; it stays until then.
+
+    Raises:
+        LogError: ``path`` is there already, or cannot be written.
+    """
+    if path.exists() and not overwrite:
+        raise LogError(f"{path}: exists already; remove it or choose another name")
+    writer: LogWriter | None = None
+    try:
+        with atomic_path(path) as unfinished:
+            writer = LogWriter(unfinished, info, options=options, attachments=attachments, overwrite=True)
+            with writer:
+                yield writer
+    except OSError as error:
+        raise _nothing_left(path, error) from error
+    except LogError as error:
+        reason = error.__cause__ if writer is None else writer.trouble
+        if not isinstance(reason, OSError):  # of a log that is read meanwhile
+            raise
+        raise _nothing_left(path, reason) from error
+
+
+def _nothing_left(path: Path, error: OSError) -> LogError:
+    return LogError(
+        f"{path}: cannot be written ({error.strerror or error}), and nothing of it was left; make room, "
+        "or choose another place"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class RecoverReport:
+    """What ``recover`` saved and what it could not.
+
+    Args:
+        frames, messages: In the new log.
+        lost: Why each of the others could not be saved.
+        finished: Whether the old log had been closed by its writer.
+    """
+
+    frames: int
+    messages: int
+    lost: tuple[LogError, ...]
+    finished: bool
+
+
+def recover(src: Path, dst: Path) -> RecoverReport:
+    """Write every intact message of ``src`` to the new log ``dst``; ``src`` is not touched.
+
+    Raises:
+        LogError: ``src`` gives no frame at all, or ``dst`` exists or cannot be written; then there is no ``dst``.
+    """
+    with (
+        LogReader(src) as reader,
+        atomic_log(dst, reader.info, attachments=tuple(reader.attachments().values())) as writer,
+    ):
+        for envelope, parts in reader.messages():
+            if envelope.topic != "info":  # the writer has put it there already
+                writer.write_parts(parts)
+        frames, messages = writer.frames, writer.messages
+        if frames == 0:
+            raise LogError(f"{src}: none of its {len(reader)} frames can be read: {reader.errors[0]}")
+        return RecoverReport(frames, messages, tuple(reader.errors), reader.finished)

@@ -13,21 +13,12 @@ import msgspec
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import open_regular
-from semantic_mapper.replay.log.mcap_scan import (
-    Damage,
-    ReadLimits,
-    Scan,
-    payload_heads,
-    read_attachment,
-    read_payloads,
-    scan,
-)
+from semantic_mapper.replay.log.mcap_scan import Scan, payload_heads, read_attachment, read_payloads, scan
 from semantic_mapper.transport.codec import Envelope, decode_as, read_envelope, unpack_parts
 from semantic_mapper.transport.messages import StreamInfo, parse_topic
 from semantic_mapper.types import PosedFrame
 
 INFO_ATTACHMENT = "stream_info"
-DAMAGED_COST = 8  # messages: what it costs to report one that cannot be read
 MAX_INFOS = 1024  # messages that describe a stream; a recording has one a camera and restart
 
 
@@ -178,17 +169,10 @@ class LogReader:
 
     def _make_index(self, found: Scan) -> list[_Entry]:
         entries: list[_Entry] = []
-        limits = ReadLimits.of_file(found.size)
-        for number, (offset, length) in enumerate(found.chunks):
-            heads = payload_heads(self._file.fileno(), offset, length, limits)
-            topics = [_topic_name(head) for head in heads]
+        for offset, length in found.chunks:
+            topics = [_topic_name(head) for head in payload_heads(self._file.fileno(), offset, length)]
             if not any(topics):
                 topics = [""]  # nothing of ours in it: reported once
-            limits.messages -= len(topics) + DAMAGED_COST * topics.count("")
-            if limits.messages < 0 or limits.records <= 0:
-                reason = "the file holds more messages than a recording of its size; the rest is not read"
-                found.damages.append(Damage(offset, found.size, number, reason))
-                break
             entries += [
                 _Entry(len(entries) + position, offset, length, position, topic)
                 for position, topic in enumerate(topics)

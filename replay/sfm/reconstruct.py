@@ -22,13 +22,21 @@ from semantic_mapper.geometry import camera_matrix, scale_intrinsics
 from semantic_mapper.image_rotation import rotate_intrinsics
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.log.atomic_log import atomic_log
+from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.sfm import colmap_process as colmap
 from semantic_mapper.replay.sfm.between import Anchor, follow_pose
 from semantic_mapper.replay.sfm.colmap_model import ColmapModel, read_model
 from semantic_mapper.replay.sfm.features import FeatureFinder
-from semantic_mapper.replay.sfm.film import Film, FilmFrame
-from semantic_mapper.replay.sfm.film_note import FilmNote
+from semantic_mapper.replay.sfm.film import (
+    LEAST_MOTION,
+    STEP,
+    Film,
+    FilmFrame,
+    FilmLook,
+    FilmNote,
+    look_through,
+    pick_frames,
+)
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsFit, place_by_gps
 from semantic_mapper.replay.sfm.refusals import (
     LEAST_ANGLE_DEG,
@@ -46,15 +54,15 @@ from semantic_mapper.replay.sfm.scale import (
     Mark,
     PlacedFrame,
     ScaleHint,
+    find_edges,
     floor_under,
     marked_place,
     median_depth,
     nearest_frame,
     scene_depth,
     upright,
+    vertical,
 )
-from semantic_mapper.replay.sfm.selection import LEAST_MOTION, STEP, FilmLook, look_through, pick_frames
-from semantic_mapper.replay.sfm.vertical import find_edges, vertical
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, FisheyeIntrinsics, Float64, Int64, PosedFrame, UInt8

@@ -16,7 +16,7 @@ from semantic_mapper.replay.sfm.colmap_process import (
     flat_fraction,
     turn_fraction,
 )
-from semantic_mapper.replay.sfm.selection import STEP, FilmLook
+from semantic_mapper.replay.sfm.film import STEP, FilmLook
 
 LEAST_PICKS = 8
 LEAST_WAY = LEAST_PICKS * STEP / 2  # of the image's width

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame
 
 BEHIND_M = 0.1  # a frame sees through a point where it measures at least this much more than its depth
@@ -82,3 +83,17 @@ def sees_through(frame: PosedFrame, xyz: Float64) -> NDArray[np.bool_]:
     inside = (p[:, 2] > 0.2) & (u >= 0) & (v >= 0) & (u < k.width) & (v < k.height)
     depth = frame.depth_m[np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)]
     return inside & (depth <= VoxelMapConfig().depth_max_m) & (depth > p[:, 2] + BEHIND_M)
+
+
+def map_frame(voxel_map: VoxelMap, frame: PosedFrame) -> None:
+    """Fuse a frame, with its labels as votes where it has any."""
+    assert frame.depth_m is not None
+    labels = voxel_map.label_set
+    if frame.label is None:
+        voxel_map.integrate(frame, frame.depth_m, None)
+        return
+    rows = labels.to_channels(frame.label, "label").astype(np.int32)
+    rows[(rows < 0) | (rows >= len(labels))] = -1
+    table = np.full((len(labels), len(labels)), 0.1 / (len(labels) - 1), np.float32)
+    np.fill_diagonal(table, 0.9)
+    voxel_map.integrate(frame, frame.depth_m, table, rows=rows)

@@ -23,7 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from research.experiments.ghosts import map_frame
+from research.experiments.put_things import map_frame
 from research.scenes import (
     TEST_SEEDS,
     TRAIN_SEEDS,

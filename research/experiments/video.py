@@ -35,7 +35,7 @@ from semantic_mapper.geometry import interpolate_pose, transform
 from semantic_mapper.plots import draw_paths, write_picture
 from semantic_mapper.replay.importers import ImportOptions
 from semantic_mapper.replay.importers.folder import FolderRecording
-from semantic_mapper.replay.log.atomic_log import atomic_log
+from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.reconstruct import PACKING, FilmOptions, import_film
 from semantic_mapper.transport.messages import SCALE_KEY

@@ -19,11 +19,9 @@ from semantic_mapper.mapping.correction.pose_correction import CorrectionStatus
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.worlds import CameraPose
-from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.lookup import PointAnswers
-from semantic_mapper.queries.nearest import NearestSurface
+from semantic_mapper.queries.instances import Instance, OrientedBox
+from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
-from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.transport.messages import Count, Finite, Parts, Stamp, Word
 from semantic_mapper.transport.query_messages import Request, decode_request, read_name
@@ -195,7 +193,7 @@ class InfoRequest(Request[MapInfo], frozen=True, kw_only=True):
 
 
 class AtRequest(Request[PointAnswers], frozen=True, kw_only=True):
-    """What is at points (N, 3); see ``lookup.at``."""
+    """What is at points (N, 3); see ``nearest.at``."""
 
     points: Float64
     radius_m: Finite | None = None
@@ -218,7 +216,7 @@ class RaysRequest(Request[RayHits], frozen=True, kw_only=True):
 
 
 class BoxRequest(Request[MapPoints], frozen=True, kw_only=True):
-    """Surface points in a box; see ``boxes.points_in_box``."""
+    """Surface points in a box; see ``surface.points_in_box``."""
 
     takes_long: ClassVar[bool] = True
     lower: Point

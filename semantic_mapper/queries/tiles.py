@@ -39,14 +39,18 @@ from semantic_mapper.mapping.storage.block_index import make_block_index, unpack
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.checks import as_numbers, check_direction, check_point, check_points
-from semantic_mapper.queries.class_surface import ClassSurface, class_surface
-from semantic_mapper.queries.components import find_components
-from semantic_mapper.queries.instances import MIN_VOXELS, Instance, describe_thing
-from semantic_mapper.queries.lookup import RADIUS_VOXELS, PointAnswers, at
+from semantic_mapper.queries.instances import MIN_VOXELS, Instance, describe_thing, find_components
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import NearestSurface, confidence_steps, nearer_surface
+from semantic_mapper.queries.nearest import (
+    RADIUS_VOXELS,
+    NearestSurface,
+    PointAnswers,
+    at,
+    confidence_steps,
+    nearer_surface,
+)
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.queries.surface import SurfaceVoxels, surface_points, surface_voxels
+from semantic_mapper.queries.surface import ClassSurface, SurfaceVoxels, class_surface, surface_points, surface_voxels
 from semantic_mapper.types import Bool, Float64, Int64
 
 CACHED_TILES = 8  # 20 MB each, of a furnished building
@@ -116,7 +120,7 @@ class TiledMap:
         return hit
 
     def at(self, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
-        """As ``queries.lookup.at``; loads the tiles within the radius of each point, one point after the other.
+        """As ``queries.nearest.at``; loads the tiles within the radius of each point, one point after the other.
 
         Raises:
             MapError: see there; or a tile is damaged.

@@ -96,7 +96,7 @@ class QueryServer:
 class QuerySocket:
     """Asks a ``QueryServer``. Any thread may ask; questions wait for each other.
 
-    Where no answer comes in time the socket is thrown away and the question asked again through a new one, so that a
+    Where no answer comes in time the socket is thrown away and the question sent again through a new one, so that a
     server that was restarted is found again. Questions change nothing, so to ask twice does no harm; a request that
     does carries an id, and a server that has seen it only answers.
 
@@ -176,7 +176,7 @@ class QuerySocket:
             return answer
         except zmq.Again:
             return None
-        finally:  # also after Ctrl-C: a REQ socket that has asked can only wait for that answer
+        finally:  # also after Ctrl-C: a REQ socket that has sent can only wait for that answer
             if not answered:
                 self._socket.close(linger=0)
                 self._socket = self._connect()

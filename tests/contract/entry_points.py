@@ -56,11 +56,9 @@ from semantic_mapper.nodes.options import (
 )
 from semantic_mapper.nodes.supervisor.launch_config import LaunchFile, NodeEntry, load_launch
 from semantic_mapper.queries import questions
-from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.lookup import PointAnswers
-from semantic_mapper.queries.nearest import NearestSurface
+from semantic_mapper.queries.instances import Instance, OrientedBox
+from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
-from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.queries.questions import Correction, InstanceArrays, MapInfo, Weights, WeightsEntry
 from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.replay.compare import Tolerances

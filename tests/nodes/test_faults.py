@@ -16,8 +16,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.replay.log.recover import recover
+from semantic_mapper.replay.log.format import LogReader, recover
 from tests.nodes.support import (
     REPLAY_LAUNCH,
     Running,

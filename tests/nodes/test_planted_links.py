@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from research.train.folder_lock import LOCK_FILE, sole_use_of
-from semantic_mapper.replay.log.atomic_file import AtomicFile
+from semantic_mapper.replay.log.format import AtomicFile
 from semantic_mapper.replay.run_folder import hold_folder
 from tests.nodes.support import run_here
 

@@ -15,9 +15,8 @@ from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import tiles as tiles_module
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.queries.tiles import TiledMap

@@ -106,3 +106,9 @@ def test_frames_that_have_left_cannot_be_corrected(tmp_path: Path) -> None:
     session = session_of(tmp_path, list(frames), history={"max_frames": 4})
     with pytest.raises(ImportSourceError, match=r"; 1 frames have left the history, raise history\.max_frames"):
         correct_session(session, read_corrections(write(tmp_path / "a.txt", frames[:1])))
+
+
+def test_a_second_pose_of_one_stamp_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("1.0 0 0 0 0 0 0 1\n1.0 1 0 0 0 0 0 1")
+    with pytest.raises(ImportSourceError, match="second pose of this stamp"):
+        read_corrections(tmp_path / "poses.txt")

@@ -11,7 +11,6 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
-from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
@@ -25,7 +24,6 @@ from semantic_mapper.replay.page import (
     Section,
     point_view,
     write_page,
-    write_suite_report,
 )
 from semantic_mapper.replay.session import MapSession
 from tests.nodes.support import write_weights
@@ -151,18 +149,6 @@ def test_replays_and_logs_are_compared_on_a_page(run: Path, tmp_path: Path) -> N
     assert len(pictures(page)) == 2 + 1 + 1, (
         "stages and classes of both, one overview that is there, classes of the log"
     )
-
-
-def test_a_benchmark_run_has_a_page_with_its_pictures(tmp_path: Path) -> None:
-    ramp = np.tile(np.arange(0, 250, 5, np.uint8)[None, :, None], (40, 1, 3))
-    cv2.imwrite(str(tmp_path / "sheet.png"), ramp)
-    table = Table("", "a")
-    table.add_row("mIoU", "50.0 %")
-    found = {"title": "ROOMS test", "weights": {}}
-    write_suite_report(tmp_path / "s.html", table, ["a minus b: 3"], [tmp_path / "sheet.png"], found)
-    page = read_page(tmp_path / "s.html")
-    assert cells(page)["mIoU"] == ["50.0 %"] and "a minus b: 3" in "".join(page.itertext())
-    assert pictures(page)[0].shape == ramp.shape
 
 
 def test_a_page_that_cannot_be_written_says_so_and_leaves_the_old_one(tmp_path: Path) -> None:

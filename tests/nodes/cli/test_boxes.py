@@ -85,4 +85,4 @@ def test_xml_of_kitti360_is_listed_with_what_is_left_out(tmp_path: Path) -> None
     assert "boxes_left_out" in listed.stderr and "box 3 (id 9): the surface is open" in listed.stderr
     found = json.loads(listed.stdout)
     assert [(b["frames"], b["stamps_ns"]) for b in found["boxes"]] == [([], []), ([3], [])]
-    assert found["bad"][0]["id"] == 9 and "1 frame: 3 to 3" in run("boxes", xml).stdout
+    assert "(id 9)" in found["bad"][0] and "1 frame: 3 to 3" in run("boxes", xml).stdout

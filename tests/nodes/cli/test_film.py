@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from semantic_mapper.nodes.cli.film import film_options, is_film, write_film_report
-from semantic_mapper.replay.sfm.film_note import FilmNote, read_left_out
+from semantic_mapper.replay.sfm.film import FilmNote, read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut, OtherModel
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from tests.nodes.support import run, run_process

@@ -155,3 +155,18 @@ def test_corrections_move_the_map_at_the_end_and_bad_ones_are_named_before_it_be
     file.write_text("no trajectory\n")
     done = run("replay", log, "--out", tmp_path / "out", "--weights", weights, "--corrections", file)
     assert done.returncode == 1 and "corrected.txt: holds no pose" in error_line(done.stderr)
+
+
+@pytest.mark.slow
+def test_a_map_that_cannot_be_trusted_has_an_exit_code_of_its_own(tmp_path: Path) -> None:
+    """Poses of a body with x forward, published as the camera's."""
+    T_body_camera = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    frames = [
+        dataclasses.replace(frame, T_world_camera=frame.T_world_camera @ np.linalg.inv(T_body_camera))
+        for frame in tiny_frames(30, seed=13)
+    ]
+    write_log(tmp_path / "log.mcap", frames)
+    command = ("replay", tmp_path / "log.mcap", "--out", tmp_path / "run", "--quality", "fast")
+    assert run(*command).returncode == 3
+    assert run(*command, "--accept-contradictions").returncode == 0
+    assert "x forward" in json.loads((tmp_path / "run" / "summary.json").read_text())["pose_check"]["warning"]

@@ -24,11 +24,9 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.mapping.worlds import CameraPose, Whereabouts
 from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.queries.boxes import points_in_box
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import State, distance_field, occupancy
 from semantic_mapper.queries.questions import (
     QUESTIONS,
@@ -45,6 +43,7 @@ from semantic_mapper.queries.questions import (
 )
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import points_in_box
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.query_messages import encode_request
 from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
@@ -588,10 +587,10 @@ def test_the_first_question_waits_for_all_of_a_large_map(endpoint: str, monkeypa
     with QueryService(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
         with pytest.raises(MapError, match="only answers questions"):  # not about the map: nothing is copied
             client.correction()
-        assert not service.asked
+        assert not service.used
         raw = RawClient(endpoint)
         raw.socket.send_multipart([b"", *good_questions()[0]])
-        assert eventually(lambda: service.asked, 20)
+        assert eventually(lambda: service.used, 20)
         with pytest.raises(MapError, match="only answers questions"):
             client.correct_poses({1: np.eye(4)})
         assert eventually(lambda: service.follow() or bool(raw.socket.poll(0)), 20)

@@ -8,9 +8,7 @@ import pytest
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.replay.importers import import_recording
-from semantic_mapper.replay.log.atomic_log import atomic_log
-from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.replay.log.recover import recover
+from semantic_mapper.replay.log.format import LogReader, atomic_log, recover
 from semantic_mapper.transport.messages import StreamInfo
 from tests.replay import recordings as rec
 from tests.replay.log.test_recording import Disk

@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.base import FrameSource
-from semantic_mapper.errors import CodecError, LogError
+from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
 from semantic_mapper.nodes.cli.log_info import describe_log
-from semantic_mapper.replay.log.format import LogReader, LogWriter
-from semantic_mapper.replay.log.recover import recover
+from semantic_mapper.replay.log.format import LogReader, LogWriter, recover
 from semantic_mapper.transport.codec import encode, encode_frame, pack_parts
 from semantic_mapper.transport.messages import StreamInfo
 from tests.replay.conftest import FRAMES
@@ -40,7 +39,7 @@ def chunk_starts(path: Path) -> list[tuple[int, int]]:
 
 def test_frames_come_back_bit_for_bit(small_log: Path) -> None:
     with LogReader(small_log) as reader:
-        assert len(reader) == FRAMES and reader.finished
+        assert isinstance(reader, FrameSource) and len(reader) == FRAMES and reader.finished
         assert reader.info == StreamInfo("test", {samples.CAMERA: samples.INTRINSICS}, NYU40)
         for seq, frame in enumerate(reader):
             expected = samples.make_frame(seq)
@@ -51,11 +50,6 @@ def test_frames_come_back_bit_for_bit(small_log: Path) -> None:
             assert frame.depth_m is not None and expected.depth_m is not None
             assert frame.depth_m.tobytes() == expected.depth_m.tobytes()
         assert not reader.errors and not reader.notices
-
-
-def test_a_log_is_a_frame_source(small_log: Path) -> None:
-    with LogReader(small_log) as reader:
-        assert isinstance(reader, FrameSource)
 
 
 def test_log_bytes_are_wire_bytes_and_open_to_other_readers(small_log: Path) -> None:
@@ -102,24 +96,6 @@ def test_a_log_may_hold_other_messages_beside_frames(tmp_path: Path) -> None:
     with LogReader(path) as reader:
         assert seqs(reader) == [0, 1, 2]
         assert [e.topic for e, _ in reader.messages()] == ["info"] + ["frame", "status"] * 3
-
-
-def test_what_is_no_message_is_not_written(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    with LogWriter(path, StreamInfo("test")) as writer:
-        writer.write_frame(samples.make_frame(0))
-        with pytest.raises(CodecError):
-            writer.write_parts([b"frame/front/", b"noise"])
-        writer.write_frame(samples.make_frame(1))
-    with LogReader(path) as reader:
-        assert seqs(reader) == [0, 1] and not reader.errors
-
-
-def test_an_existing_log_is_not_overwritten_by_accident(small_log: Path) -> None:
-    with pytest.raises(LogError, match="exists already"):
-        LogWriter(small_log, StreamInfo("test"))
-    with LogReader(small_log) as reader:
-        assert len(reader) == FRAMES
 
 
 def test_a_full_disk_is_a_clear_error() -> None:
@@ -359,5 +335,5 @@ def test_stream_information_whose_intrinsics_do_not_fit_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = hostile_log(tmp_path / "wild.mcap", monkeypatch, info=True)
-    with pytest.raises(LogError, match=r"stream information .* cannot be used: .*camera 'front'.*cy=1e\+19"):
+    with pytest.raises(LogError, match=r"stream information .* cannot be used: .*cy=1e\+19"):
         LogReader(path)

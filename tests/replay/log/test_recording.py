@@ -17,9 +17,8 @@ import pytest
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
-from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter
+from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter, recover
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
-from semantic_mapper.replay.log.recover import recover
 from semantic_mapper.replay.log.sequence import LogSequence, open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import StreamInfo
@@ -53,7 +52,7 @@ class Disk:
     def __init__(self, folder: Path, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.size = folder, size
         self._write = os.write
-        monkeypatch.setattr("semantic_mapper.replay.log.atomic_file.os.write", self.write)
+        monkeypatch.setattr("semantic_mapper.replay.log.format.os.write", self.write)
 
     def free(self, folder: Path) -> int:
         return self.size - sum(file.stat().st_size for file in self.folder.iterdir())

@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.sfm.film import MAX_SIDE_PX, Film
-from semantic_mapper.replay.sfm.selection import FilmLook, look_through, pick_frames
+from semantic_mapper.replay.sfm.film import MAX_SIDE_PX, Film, FilmLook, look_through, pick_frames
 from semantic_mapper.types import UInt8
 
 from . import films

@@ -19,7 +19,7 @@ from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import transform
 from semantic_mapper.replay.log.reader import LogReader
-from semantic_mapper.replay.sfm.film_note import read_left_out
+from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
 from semantic_mapper.replay.sfm.refusals import FilmError
 from semantic_mapper.replay.sfm.scale import Mark, MarkedDistance, ScaleHint

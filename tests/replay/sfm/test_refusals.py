@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair, Sigmas
+from semantic_mapper.replay.sfm.film import FilmLook
 from semantic_mapper.replay.sfm.refusals import (
     FilmError,
     doubt_baseline,
@@ -12,7 +13,6 @@ from semantic_mapper.replay.sfm.refusals import (
     refuse_look,
     refuse_outcome,
 )
-from semantic_mapper.replay.sfm.selection import FilmLook
 
 
 def look_of(motion: float, count: int = 60, dark: float = 0.0) -> FilmLook:

@@ -23,8 +23,8 @@ from semantic_mapper.replay.sfm.scale import (
     scene_depth,
     triangulate,
     upright,
+    vertical,
 )
-from semantic_mapper.replay.sfm.vertical import vertical
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 

@@ -1,6 +1,9 @@
+"""ROS bags of both versions, as robots record them: right values, and what cannot be true."""
+
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,20 +11,35 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.replay.importers import ImportOptions, ImportReport, detect_format, import_recording
+from semantic_mapper.replay.importers.ros_transforms import Track
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from tests.replay import bags
+from tests.replay.bags import CAMERA, COLOR, DEPTH, DEPTH_INFO, INFO, Event, Kind, Messages
 from tests.small import tiny_frames
 
-from . import bags
-from .bags import CAMERA, COLOR, DEPTH, INFO, Event, Kind, Messages
-
 KINDS: tuple[Kind, ...] = ("ros1", "sqlite3", "mcap")
+
+
 FRAMES = tiny_frames(6)
+
+
+LONG = [FRAMES[0]] * 8  # of a robot that stands still
+
+
+MS = 1_000_000
+
+
+Change = Callable[[Messages, list[Event]], list[Event]]
 
 
 def make(
@@ -63,15 +81,6 @@ def test_a_bag_of_either_version_gives_the_same_pictures_depth_and_poses(tmp_pat
         assert frame.depth_m is not None
         assert np.array_equal(frame.depth_m, bags.millimetres(truth).astype(np.float32) / np.float32(1000))
         assert np.abs(frame.T_world_camera - truth.T_world_camera).max() < 1e-6
-
-
-def test_a_storage_file_is_a_bag_too_and_a_folder_whose_metadata_is_missing(tmp_path: Path) -> None:
-    src = make(tmp_path, "mcap")
-    (file,) = src.glob("*.mcap")
-    assert detect_format(file) == "rosbag"
-    assert import_recording(file, tmp_path / "file.mcap").frames == 6
-    (src / "metadata.yaml").unlink()
-    assert imported(src)[0].frames == 6
 
 
 def test_poses_between_two_transforms_are_interpolated_and_beyond_them_there_are_none(tmp_path: Path) -> None:
@@ -146,10 +155,6 @@ def mosaic(order: str) -> np.ndarray:
     return np.tile(tile, (36, 48))
 
 
-def yuv(code: int) -> np.ndarray:
-    return np.asarray(cv2.cvtColor(FRAMES[0].rgb, code), np.uint8)
-
-
 @pytest.mark.parametrize(
     ("encoding", "pixels", "expected"),
     [
@@ -183,6 +188,10 @@ def test_yuv_becomes_rgb_again_but_for_the_halved_colour(tmp_path: Path, encodin
     _, frames = imported(make(tmp_path, "sqlite3", change))
     off = np.abs(frames[0].rgb.astype(int) - FRAMES[0].rgb)
     assert float(np.median(off)) <= 3 and float(off.mean()) < 8
+
+
+def yuv(code: int) -> np.ndarray:
+    return np.asarray(cv2.cvtColor(FRAMES[0].rgb, code), np.uint8)
 
 
 def test_compressed_images_stay_the_files_that_they_are(tmp_path: Path) -> None:
@@ -312,15 +321,6 @@ def test_of_two_cameras_one_has_to_be_named(tmp_path: Path) -> None:
         imported(src, topics={"rgb": COLOR})
 
 
-def test_colour_goes_before_the_grey_images_of_a_stereo_pair(tmp_path: Path) -> None:
-    def change(m: Messages, events: list[Event]) -> list[Event]:
-        grey = m.image(bags.START_NS, "infra", FRAMES[0].rgb[..., 0], "mono8")
-        return [*events, ("/cam/infra1/image_rect_raw", bags.START_NS, grey)]
-
-    report, _ = imported(make(tmp_path, "mcap", change))
-    assert report.frames == 6 and notice(report, "there are also /cam/infra1/image_rect_raw (mono8)")
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
@@ -338,32 +338,6 @@ def test_what_a_bag_lacks_is_named(
     tmp_path: Path, change: Callable[[Messages, list[Event]], list[Event]], complaint: str
 ) -> None:
     with pytest.raises(ImportSourceError, match=complaint):
-        imported(make(tmp_path, "mcap", change))
-
-
-def test_a_lens_that_is_not_opencvs_and_a_camera_without_calibration_are_refused(tmp_path: Path) -> None:
-    for name, model, lens, focal, complaint in (
-        ("fish", "thin_prism_fisheye", (0.1, 0, 0, 0), 66.0, "'thin_prism_fisheye' is not undone.*rectify the images"),
-        ("blank", "plumb_bob", (0,) * 5, 0.0, "is not calibrated .K is zero."),
-    ):
-
-        def change(
-            m: Messages, events: list[Event], model: str = model, lens: Any = lens, f: float = focal
-        ) -> list[Event]:
-            info = m.info(bags.START_NS, CAMERA, FRAMES[0].intrinsics, model, lens)
-            if not f:
-                (info.k if not m.ros1 else info.K)[:] = 0
-            return [(t, ns, info if t == INFO else message) for t, ns, message in events]
-
-        with pytest.raises(ImportSourceError, match=complaint):
-            imported(make(tmp_path / name, "ros1", change))
-
-
-def test_a_frame_on_two_others_is_refused(tmp_path: Path) -> None:
-    def change(m: Messages, events: list[Event]) -> list[Event]:
-        return [*events, ("/tf", bags.START_NS, m.tf(bags.START_NS, "map", "base_link", np.eye(4)))]
-
-    with pytest.raises(ImportSourceError, match=r"'base_link' sits on map and on odom"):
         imported(make(tmp_path, "mcap", change))
 
 
@@ -404,9 +378,302 @@ def test_an_image_that_does_not_fit_its_size_costs_that_frame_alone(tmp_path: Pa
     assert "96x73 with 288 bytes a row does not fit" in said[2] and "the image is 96x40" in said[4]
 
 
-def test_frames_may_be_asked_for_in_any_order(tmp_path: Path) -> None:
-    from semantic_mapper.replay.importers.rosbag import RosbagRecording
+def aside(T: np.ndarray, metres: float) -> np.ndarray:
+    T = T.copy()
+    T[1, 3] += metres
+    return T
 
-    recording = RosbagRecording(make(tmp_path, "mcap"), ImportOptions())
-    for n in (4, 1, 5, 0, 0, 3):
-        assert np.array_equal(recording.load(n).frame.rgb, FRAMES[n].rgb)
+
+def second_source(topic: str, metres: float, later_ns: int = 5 * MS) -> Change:
+    """The robot's odometry again, on a topic, from one who sees it elsewhere."""
+
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        told = list(events)
+        for n, T in enumerate(bags.bodies(LONG)):
+            ns = bags.stamp_of(n) + later_ns
+            told.append((topic, ns, m.tf(ns, "odom", "base_link", aside(T, metres))))
+        return told
+
+    return change
+
+
+def test_two_programs_that_publish_one_transform_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ImportSourceError, match=r"'base_link' on 'odom' jumps to and fro by 0\.5 m.*--topic pose=NAME"):
+        imported(make(tmp_path / "one", "mcap", second_source("/tf", 0.5), LONG))
+    assert imported(make(tmp_path / "two", "mcap", second_source("/tf", 0.0), LONG))[0].frames == 8
+
+    # Of ROS 1 the nodes are known, whatever their rates.
+    with pytest.raises(ImportSourceError, match=r"'base_link' on 'odom' is told by /tf and, otherwise, by /tf of /ekf"):
+        imported(make(tmp_path / "three", "ros1", second_source("/tf@/ekf", 0.1, 0), LONG))
+    src = make(tmp_path / "again", "ros1", second_source("/tf@/ekf", 0.1, bags.PERIOD_NS * 8), LONG)
+    assert imported(src)[0].frames == 8  # it was started after the first had ended
+
+
+def test_of_two_robots_with_equal_frames_the_one_of_the_images_counts(tmp_path: Path) -> None:
+    def robots(camera: str) -> Change:
+        def change(m: Messages, events: list[Event]) -> list[Event]:
+            own: list[Event] = []
+            for topic, ns, message in events:
+                topic = f"/r1{topic}" if topic.startswith("/tf") else topic.replace("/cam/", f"{camera}/")
+                own.append((topic, ns, message))
+            return second_source("/r2/tf", 5.0)(m, own)
+
+        return change
+
+    report, frames = imported(make(tmp_path / "own", "mcap", robots("/r1/cam"), LONG))
+    assert notice(report, "transforms of /r2/tf are left out: /r1/cam/color/image_raw is not in its namespace")
+    assert np.abs(frames[3].T_world_camera - LONG[3].T_world_camera).max() < 1e-6
+    with pytest.raises(ImportSourceError, match=r"is told by /r1/tf and, otherwise, by /r2/tf: record the true one"):
+        imported(make(tmp_path / "none", "mcap", robots("/cam"), LONG))
+
+
+@pytest.mark.parametrize(
+    ("topic", "complaint"),
+    [
+        ("/tf_static", r"/tf_static says first \(0\.200, 0\.050, 0\.900\) m.*then \(0\.200, 0\.550, .*: cut the bag"),
+        ("/tf", r"is told by /tf_static and, otherwise, by /tf: record the true one"),
+    ],
+)
+def test_two_places_of_the_camera_are_refused(tmp_path: Path, topic: str, complaint: str) -> None:
+    def told(metres: float) -> Change:
+        def change(m: Messages, events: list[Event]) -> list[Event]:
+            at = m.tf(bags.stamp_of(1), "base_link", CAMERA, aside(bags.camera_on_base(), metres))
+            return [*events, (topic, bags.stamp_of(1), at)]
+
+        return change
+
+    with pytest.raises(ImportSourceError, match=rf"'{CAMERA}' on 'base_link' .*{complaint}"):
+        imported(make(tmp_path / "two", "ros1", told(0.5)))
+    within = imported(make(tmp_path / "one", "ros1", told(0.0005)), match_s=1.0)
+    assert within[0].frames == 6
+
+
+def track(stamps: np.ndarray, places: np.ndarray, yaw: np.ndarray) -> Track:
+    """Of places (N, 2) in metres and headings in radians, at times in seconds."""
+    turned = Rotation.from_rotvec(np.outer(yaw, (0, 0, 1))).as_quat()
+    rows = np.hstack((places, np.zeros((len(places), 1)), turned))
+    return Track([round(t * 1e9) for t in stamps], [tuple(row) for row in rows.tolist()])
+
+
+def walk(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A robot that drives at 1 m/s on a circle of 2 m."""
+    return np.stack((2 * np.sin(t / 2), 2 - 2 * np.cos(t / 2)), 1), t / 2
+
+
+@pytest.mark.parametrize(("first_hz", "second_hz"), [(10, 10), (30, 50), (10, 30)])
+@pytest.mark.parametrize("aside_m", [0.1, 0.5])
+def test_two_sources_are_told_apart_at_any_rates(first_hz: int, second_hz: int, aside_m: float) -> None:
+    a, b = np.arange(0, 30, 1 / first_hz), np.arange(0.003, 30, 1 / second_hz)
+    t = np.sort(np.append(a, b))
+    places, yaw = walk(t)
+    places[:, 1] += aside_m * np.isin(t, b)
+    places += np.random.default_rng(0).normal(0, 0.001, places.shape)
+    assert aside_m / 2 < track(t, places, yaw).jump_m() < 1.5 * aside_m
+
+
+def test_one_source_is_never_taken_for_two() -> None:
+    rng = np.random.default_rng(1)
+    for count in (6, 12, 13, 40, 80, 3000):
+        t = np.arange(count) * 0.1
+        places, yaw = walk(t)
+        still, none = np.zeros((count, 2)), np.zeros(count)
+        cases = {
+            "still": (t, still, none),
+            "driving": (t, places, yaw),
+            "noise on a line": (t, still + rng.normal(0, 0.1, (count, 1)) * (1, 0), none),
+            "noise": (t, places + rng.normal(0, 0.1, (count, 2)), yaw + rng.normal(0, 0.05, count)),
+            "late stamps": (t + rng.uniform(0, 0.09, count), 3 * t[:, None] * (1, 0), none),
+            "steps of the encoder": (t, np.round(places, 2), yaw),
+            "loop closures": (t, places + 0.8 * (t // 1.7 % 2)[:, None], yaw),
+            "each pose twice": (t, np.repeat(places, 2, axis=0)[:count] * 3, np.repeat(yaw, 2)[:count]),
+            "each pose three times": (t, np.repeat(places, 3, axis=0)[:count] * 3, np.repeat(yaw, 3)[:count]),
+            "told again": (np.repeat(t, 2)[:count], np.repeat(places, 2, axis=0)[:count], np.repeat(yaw, 2)[:count]),
+            "a sway of 2 Hz": (t, places + 0.05 * np.sin(4 * np.pi * t)[:, None], yaw),
+        }
+        assert {name: track(*case).jump_m() for name, case in cases.items()} == dict.fromkeys(cases, 0.0), count
+
+
+@pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.15, 0.03, 0.001, -0.001, 0.0)])
+def test_each_image_has_the_calibration_of_its_time(tmp_path: Path, lens: tuple[float, ...]) -> None:
+    """An autofocus moves the centre by 0.08 px an image; what differs by less than 0.1 px is one calibration."""
+    true = [dataclasses.replace(FRAMES[0].intrinsics, cx=FRAMES[0].intrinsics.cx + 0.08 * n) for n in range(6)]
+
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        kept = [event for event in events if event[0] not in (INFO, bags.DEPTH_INFO)]
+        for n, k in enumerate(true):
+            ns = bags.stamp_of(n)
+            kept += [(topic, ns, m.info(ns, CAMERA, k, lens=lens)) for topic in (INFO, bags.DEPTH_INFO)]
+        return kept
+
+    report, frames = imported(make(tmp_path, "mcap", change))
+    assert notice(
+        report, "the calibration of /cam/color/image_raw changes a little: each image has the nearest in time"
+    )
+    for n, frame in enumerate(frames):
+        rectify = Rectifier(dataclasses.replace(true[n - n % 2], distortion=lens if any(lens) else ()))
+        assert frame.intrinsics == rectify.intrinsics
+        assert np.array_equal(frame.rgb, rectify(np.ascontiguousarray(FRAMES[n].rgb[..., ::-1])))
+        metres = (bags.millimetres(FRAMES[n]) / np.float32(1000)).astype(np.float32)
+        assert frame.depth_m is not None and np.array_equal(frame.depth_m, rectify.nearest(metres))
+
+
+def of(topic: str, events: list[Event]) -> list[Any]:
+    return [message for name, _, message in events if name == topic]
+
+
+def empty(message: Any) -> None:
+    message.encoding, message.height, message.width, message.step = "", 0, 0, 0
+    message.data = np.zeros(0, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("unnamed", "whose"), [(slice(0, 1), "a later image"), (slice(None), INFO)], ids=["first", "all"]
+)
+def test_images_without_a_frame_get_that_of_a_later_one_or_of_their_calibration(
+    tmp_path: Path, unnamed: slice, whose: str
+) -> None:
+    def change(_: Messages, events: list[Event]) -> list[Event]:
+        for topic in (COLOR, DEPTH):
+            for message in of(topic, events)[unnamed]:
+                message.header.frame_id = ""
+        return events
+
+    report, frames = imported(make(tmp_path, "ros1", change))
+    assert report.with_depth == 6 and notice(report, f"names no frame; '{CAMERA}' of {whose} is taken")
+    assert np.abs(frames[3].T_world_camera - FRAMES[3].T_world_camera).max() < 1e-6
+
+
+@pytest.mark.parametrize("topic", [COLOR, DEPTH])
+def test_a_first_message_without_data_costs_its_frame_alone(tmp_path: Path, topic: str) -> None:
+    def change(_: Messages, events: list[Event]) -> list[Event]:
+        empty(of(topic, events)[0])
+        return events
+
+    report, frames = imported(make(tmp_path, "sqlite3", change))
+    assert [frame.seq for frame in frames] == [1, 2, 3, 4, 5] and report.with_depth == 5
+    assert "encoding '' are not read" in report.skipped[0].reason
+
+
+@pytest.mark.parametrize("kind", ["tf", "odometry", "pose"])
+def test_poses_without_stamps_have_the_time_of_their_receipt(tmp_path: Path, kind: str) -> None:
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        if kind == "tf":
+            for message in of("/tf", events):
+                for stamped in message.transforms:
+                    stamped.header = m.header(0, stamped.header.frame_id)
+            return events
+        kept = [event for event in events if event[0] != "/tf"]
+        for n, T in enumerate(bags.bodies(FRAMES)):
+            message = m.odometry(0, T, "base_link") if kind == "odometry" else m.pose_stamped(0, T)
+            kept.append(("/pose", bags.stamp_of(n), message))
+        return kept
+
+    report, frames = imported(make(tmp_path, "ros1", change), body="" if kind != "pose" else "base_link")
+    named = "tf of 'base_link'" if kind == "tf" else "/pose"
+    assert notice(report, f"{named}: 6 poses without a stamp; the time of receipt stands for it")
+    T_world_odom = bags.odom_in_map() if kind == "tf" else np.eye(4)
+    for frame, T in zip(frames, bags.bodies(FRAMES), strict=True):
+        assert np.abs(frame.T_world_camera - T_world_odom @ T @ bags.camera_on_base()).max() < 1e-6
+
+
+def test_a_simulated_clock_begins_at_zero(tmp_path: Path) -> None:
+    """What was recorded by the computer's clock then has stamps from 0 on."""
+
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        made: list[Event] = [event for event in events if event[0] == "/tf_static"]
+        for n, (frame, T) in enumerate(zip(FRAMES, bags.bodies(FRAMES), strict=True)):
+            ns, received_ns = n * bags.PERIOD_NS, bags.stamp_of(n)
+            made += [
+                ("/tf", received_ns, m.tf(ns, "odom", "base_link", T)),
+                (INFO, received_ns, m.info(ns, CAMERA, frame.intrinsics)),
+                (COLOR, received_ns, m.image(ns, CAMERA, frame.rgb, "rgb8")),
+            ]
+        return made
+
+    report, frames = imported(make(tmp_path, "mcap", change))
+    assert not notice(report, "stamp") and [frame.stamp_ns for frame in frames] == [
+        n * bags.PERIOD_NS for n in range(6)
+    ]
+    for frame, T in zip(frames, bags.bodies(FRAMES), strict=True):
+        assert np.abs(frame.T_world_camera - T @ bags.camera_on_base()).max() < 1e-6
+
+
+def packed(src: Path, dst: Path) -> Path:
+    dst.write_bytes(zstandard.ZstdCompressor().compress(src.read_bytes()))
+    return dst
+
+
+def without_profile(src: Path, dst: Path) -> Path:
+    with src.open("rb") as source, dst.open("wb") as out:
+        writer = Writer(out)
+        writer.start(profile="")
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            assert schema is not None
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                of = schemas[schema.id]
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return dst
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "make_file"),
+    [
+        ("mcap", "merged.mcap", without_profile),
+        ("sqlite3", "day.db3.zstd", packed),
+        ("mcap", "day.zstd", packed),
+        ("ros1", "renamed.data", shutil.copy),
+        ("sqlite3", "renamed.db", shutil.copy),
+    ],
+)
+def test_bags_are_known_by_their_content(
+    tmp_path: Path, kind: bags.Kind, name: str, make_file: Callable[[Path, Path], Path]
+) -> None:
+    src = make(tmp_path, kind)
+    file = src if src.is_file() else next(f for f in src.iterdir() if f.suffix != ".yaml")
+    made = Path(make_file(file, tmp_path / name))
+    assert detect_format(made) == "rosbag"
+    report, frames = imported(made)
+    assert report.frames == 6 and np.array_equal(frames[3].rgb, FRAMES[3].rgb)
+
+
+def other_lens(topic: str) -> Callable[[Messages, list[Event]], list[Event]]:
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        k = FRAMES[0].intrinsics
+        other = type(k)(0.9 * k.fx, 0.9 * k.fy, k.cx, k.cy, k.width, k.height)
+        kept = [event for event in events if event[0] != topic]
+        return [*kept, (topic, bags.START_NS, m.info(bags.START_NS, CAMERA, other))]
+
+    return change
+
+
+def test_depth_of_one_frame_and_another_lens_is_asked_about(tmp_path: Path) -> None:
+    src = make(tmp_path, "mcap", other_lens(DEPTH_INFO))
+    with pytest.raises(ImportSourceError, match=rf"other intrinsics.*--topic depth_info={INFO}"):
+        imported(src)
+    _, frames = imported(src, topics={"depth_info": INFO})
+    assert frames[0].depth_m is not None
+    assert np.array_equal(frames[0].depth_m, bags.millimetres(FRAMES[0]).astype(np.float32) / np.float32(1000))
+    _, warped = imported(src, topics={"depth_info": DEPTH_INFO})
+    assert warped[0].depth_m is not None and not np.array_equal(warped[0].depth_m, frames[0].depth_m)
+
+
+def test_two_calibrations_of_one_camera_frame_are_asked_about(tmp_path: Path) -> None:
+    src = make(tmp_path, "mcap", other_lens("/camera/rgb/camera_info"))
+    with pytest.raises(ImportSourceError, match=rf"two calibrations.*--topic info={INFO}"):
+        imported(src)
+    assert imported(src, topics={"info": INFO})[1][0].intrinsics == FRAMES[0].intrinsics
+
+
+def test_clocks_that_differ_are_named_with_both_ranges(tmp_path: Path) -> None:
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        kept = [event for event in events if event[0] != "/tf"]
+        return [*kept, *(("/tf", bags.stamp_of(n), m.tf(10**9 * n, "odom", "base_link", np.eye(4))) for n in range(3))]
+
+    with pytest.raises(ImportSourceError, match=r"images of .* are from .*'odom' to 'base_link' from 0.000 to 2.000 s"):
+        imported(make(tmp_path, "mcap", change))

@@ -1,0 +1,393 @@
+"""Posed picture collections: transforms.json, COLMAP, Polycam, Record3D, OpenSfM."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.replay.importers.run import detect_format
+from semantic_mapper.replay.sfm.colmap_model import MODELS, intrinsics_of, read_model
+from semantic_mapper.replay.sfm.gps import (
+    ORIGIN_KEY,
+)
+from tests.replay.recordings import (
+    POINTS,
+    F,
+    H,
+    W,
+    add_depth,
+    flight,
+    imported,
+    make_colmap,
+    make_opensfm,
+    make_polycam,
+    make_record3d,
+    make_transforms,
+    poses,
+    said,
+)
+
+
+def test_poses_of_transforms_json_change_axes_and_keep_their_unit(tmp_path: Path) -> None:
+    report, frames = imported(make_transforms(tmp_path / "nerf"))
+    assert (report.format, report.frames, report.info.scale_known) == ("transforms", 3, False)
+    assert "stamps are made up at 2 frames a second" in report.notices[0] and "scale is unknown" in report.notices[1]
+    for frame, T in zip(frames, poses(), strict=True):
+        assert np.allclose(frame.T_world_camera, T, atol=1e-12)
+        assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (F, 31.5, 23.5)
+
+
+def test_numbers_in_names_order_the_frames(tmp_path: Path) -> None:
+    _, frames = imported(make_transforms(tmp_path / "nerf", "frame_{}.png", 11))
+    for frame, T in zip(frames, poses(11), strict=True):
+        assert np.allclose(frame.T_world_camera, T, atol=1e-12) and frame.stamp_ns == 500_000_000 * frame.seq
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.3])
+def test_depth_of_transforms_json_is_read_and_makes_its_poses_metric(tmp_path: Path, k1: float) -> None:
+    report, frames = imported(add_depth(make_transforms(tmp_path / "nerf", k1=k1)))
+    assert report.info.scale_known and report.with_depth == 3 and "stamps are made up" in report.notices[0]
+    depth = frames[1].depth_m
+    assert depth is not None and np.allclose(depth[H // 2 + 1 :], 1.501) and (depth[: H // 2 - 1] == 0).all()
+
+
+def test_depth_follows_its_picture_when_the_lens_is_undone(tmp_path: Path) -> None:
+    folder = add_depth(make_transforms(tmp_path / "nerf", k1=0.5))
+    picture, units = np.zeros((H, W, 3), np.uint8), np.full((H, W), 3000, np.uint16)
+    picture[8:20, 6:18], units[8:20, 6:18] = 255, 1000
+    cv2.imwrite(str(folder / "images" / "frame_00001.png"), picture)
+    cv2.imwrite(str(folder / "depths" / "0.png"), units)
+    frame = imported(folder)[1][0]
+    assert frame.depth_m is not None
+    white = frame.rgb[..., 0] > 127
+    assert (white != (picture[..., 0] > 127)).sum() > 40  # the square has moved
+    assert (white != (frame.depth_m < 2)).sum() < 30  # its depth with it, but for some of its edge
+
+
+def test_a_scale_makes_metres_of_poses_and_leaves_depth_alone(tmp_path: Path) -> None:
+    report, frames = imported(add_depth(make_transforms(tmp_path / "nerf")), scale=2.0)
+    assert frames[1].depth_m is not None and frames[1].depth_m.max() == pytest.approx(1.501)
+    assert np.allclose(frames[2].T_world_camera[:3, 3], 2 * poses()[2][:3, 3])
+    assert "depth images keep their own unit" in " ".join(report.notices)
+    with pytest.raises(ImportSourceError, match="in metres"):
+        imported(make_record3d(tmp_path / "phone"), scale=2.0)
+
+
+def test_a_field_of_view_names_without_suffix_and_a_lens_are_understood(tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "nerf", k1=-0.2)
+    found = json.loads((folder / "transforms.json").read_text())
+    for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        del found[name]
+    found["camera_angle_x"] = 2 * np.arctan(W / 2 / F)
+    for frame in found["frames"]:
+        frame["file_path"] = frame["file_path"].removesuffix(".png")
+    (folder / "transforms.json").write_text(json.dumps(found))
+    _, frames = imported(folder)
+    assert not frames[0].intrinsics.distortion and frames[0].intrinsics.fx != pytest.approx(F)  # rectified
+
+
+@pytest.mark.parametrize("kind", ["txt", "bin"])
+def test_a_colmap_model_is_imported_upright(tmp_path: Path, kind: str) -> None:
+    folder = make_colmap(tmp_path / "scan", kind)
+    report, frames = imported(folder, scale=2.0)
+    assert (report.format, report.frames, report.info.scale_known) == ("colmap", 3, True)
+    moved = [frame.T_world_camera for frame in frames]
+    for T, true in zip(moved, poses(), strict=True):
+        assert np.allclose(T[:3, 1], (0, 0, -1), atol=1e-9)  # image down is down
+        assert np.allclose(T[:3, 3] - moved[0][:3, 3], 2 * (true[:3, 3] - poses()[0][:3, 3]), atol=1e-9)
+    assert (frames[0].intrinsics.fx, frames[0].intrinsics.cx) == (F, 31.5)
+
+
+@pytest.mark.parametrize("kind", ["txt", "bin"])
+def test_both_forms_of_a_model_are_read_alike(tmp_path: Path, kind: str) -> None:
+    model = read_model(make_colmap(tmp_path / "scan", kind) / "sparse" / "0")
+    assert [image.name for image in model.images] == ["0.png", "1.png", "2.png"]
+    assert np.allclose(model.images[1].T_world_camera, poses()[1], atol=1e-9)
+    assert np.allclose(model.images[1].xy, [(10, 20), (11, 20), (12, 20)]) and len(model.images[0].xy) == 0
+    assert np.allclose(model.points[2], POINTS[1]) and model.errors_px[2] == 0.5
+
+
+def test_a_colmap_model_without_scale_says_so_and_is_made_of_room_size(tmp_path: Path) -> None:
+    report, frames = imported(make_colmap(tmp_path / "scan", "bin"))
+    assert not report.info.scale_known
+    depths = [(POINTS - T[:3, 3]) @ T[:3, 2] for T in poses()[1:]]
+    factor = 2.0 / np.median(depths)
+    step = np.linalg.norm(frames[1].T_world_camera[:3, 3] - frames[0].T_world_camera[:3, 3])
+    assert step == pytest.approx(0.2 * factor)
+
+
+def test_polycam_raw_data_come_with_poses_times_and_trusted_depth(tmp_path: Path) -> None:
+    report, frames = imported(make_polycam(tmp_path / "capture"))
+    assert (report.format, report.with_depth, report.info.scale_known) == ("polycam", 3, True)
+    for n, (frame, T) in enumerate(zip(frames, poses(), strict=True)):
+        assert np.allclose(frame.T_world_camera, T, atol=1e-9) and frame.stamp_ns == 250_000_000 * n
+        assert frame.depth_m is not None and frame.depth_m.shape == (H, W)
+        assert (frame.depth_m[:, :4] == 0).all() and np.allclose(frame.depth_m[:, 4:], 1.25)
+
+
+def test_a_record3d_export_comes_with_poses_and_times(tmp_path: Path) -> None:
+    report, frames = imported(make_record3d(tmp_path / "phone"))
+    assert (report.format, report.frames, report.info.scale_known) == ("record3d", 3, True)
+    for n, (frame, T) in enumerate(zip(frames, poses(), strict=True)):
+        assert np.allclose(frame.T_world_camera, T, atol=1e-9) and frame.stamp_ns == 250_000_000 * n
+        assert (frame.intrinsics.cx, frame.intrinsics.cy) == (31.5, 23.5)
+
+
+def test_collections_are_told_apart(tmp_path: Path) -> None:
+    assert detect_format(make_transforms(tmp_path / "a")) == "transforms"
+    assert detect_format(make_colmap(tmp_path / "b", "txt")) == "colmap"
+    assert detect_format(make_record3d(tmp_path / "c")) == "record3d"
+
+
+def test_both_focal_angles_are_used(tmp_path: Path) -> None:
+    angles = {"camera_angle_x": 2 * np.arctan(W / 2 / 50), "camera_angle_y": 2 * np.arctan(H / 2 / 60)}
+    _, frames = imported(make_transforms(tmp_path / "nerf", fl_x=None, fl_y=None, **angles))
+    assert (frames[0].intrinsics.fx, frames[0].intrinsics.fy) == pytest.approx((50, 60))
+
+
+@pytest.mark.parametrize("flag", [{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}])
+def test_a_fisheye_of_transforms_json_is_undone(tmp_path: Path, flag: dict[str, Any]) -> None:
+    _, frames = imported(make_transforms(tmp_path / "nerf", k1=0.1, k4=0.01, **flag))
+    assert frames[0].intrinsics.distortion == () and frames[0].intrinsics.fx != pytest.approx(50, rel=0.02)
+
+
+def test_each_picture_of_record3d_has_its_own_intrinsics_and_time(tmp_path: Path) -> None:
+    own = [[50.0 + n, 51.0 + n, 30.0 + n, 25.0 - n] for n in range(3)]
+    folder = make_record3d(tmp_path / "phone", perFrameIntrinsicCoeffs=own, frameTimestamps=[7.0, 7.5, 8.25])
+    for frame, (fx, fy, cx, cy) in zip(imported(folder)[1], own, strict=True):
+        k = frame.intrinsics
+        assert (k.fx, k.fy, k.cx, k.cy) == pytest.approx((fx, fy, cx - 0.5, cy - 0.5))
+    assert [frame.stamp_ns for frame in imported(folder)[1]] == [0, 500_000_000, 1_250_000_000]
+
+
+def test_depth_of_instant_ngp_is_in_the_unit_of_the_poses(tmp_path: Path) -> None:
+    folder = add_depth(make_transforms(tmp_path / "nerf"))
+    found = json.loads((folder / "transforms.json").read_text())
+    for frame in found["frames"]:
+        frame["depth_path"] = frame.pop("depth_file_path")
+    (folder / "transforms.json").write_text(json.dumps({**found, "integer_depth_scale": 1 / 500}))
+    report, frames = imported(folder, scale=2.0)
+    depth = frames[0].depth_m
+    assert report.info.scale_known and depth is not None and depth.max() == pytest.approx(1500 / 500 * 2, rel=1e-6)
+    (folder / "transforms.json").write_text(json.dumps(found))
+    with pytest.raises(ImportSourceError, match=r"depth_path needs integer_depth_scale.*--topic depth=none"):
+        imported(folder)
+    assert imported(folder, topics={"depth": "none"})[0].with_depth == 0
+
+
+def test_the_largest_colmap_model_is_imported_and_the_rest_is_counted(tmp_path: Path) -> None:
+    folder = make_colmap(tmp_path / "scan", "txt")
+    small = folder / "sparse" / "0"
+    shutil.copytree(small, folder / "sparse" / "1")
+    lines = (small / "images.txt").read_text().splitlines()
+    (small / "images.txt").write_text("\n".join(lines[:3]) + "\n")
+    shutil.copy(folder / "images" / "0.png", folder / "images" / "unposed.png")
+    (folder / "images" / "0.png").unlink()
+    report, frames = imported(folder)
+    assert len(frames) == 2 and len(report.skipped) == 1
+    assert "largest of 2 models is imported, 1 of 3 pictures; left out: 0 of 1" in said(report)
+    assert "1 picture in" in said(report) and "unposed.png" in said(report)
+
+
+def test_axes_that_are_told_are_used_and_nested_lenses_named(tmp_path: Path) -> None:
+    plain = imported(make_transforms(tmp_path / "gl"))[1][0]
+    folder = make_transforms(tmp_path / "cv", coordinate_system="opencv", camera={"k1": 0.1, "name": "front"})
+    report, frames = imported(folder)
+    turned_back = np.diag((1.0, -1.0, -1.0, 1.0))
+    assert np.allclose(frames[0].T_world_camera @ turned_back, plain.T_world_camera)
+    assert "'camera' is not read" in said(report)
+
+
+def test_record3d_falls_back_to_k_and_its_times_are_sorted(tmp_path: Path) -> None:
+    own = [[50.0, 51.0, 30.0, 25.0], None, [0.0, 0.0, 0.0, 0.0]]
+    folder = make_record3d(tmp_path / "phone", perFrameIntrinsicCoeffs=own, frameTimestamps=[7.5, 7.0, None])
+    report, frames = imported(folder)
+    assert len(frames) == 3 and sorted(frame.intrinsics.fy for frame in frames) == [50.0, 50.0, 51.0]
+    assert "times of the pictures go back" in said(report)
+
+
+@pytest.mark.parametrize(
+    ("times", "said_unit", "stamps_ms"),
+    [
+        ([1.7e9, 1.7e9 + 0.5, 1.7e9 + 1.5], "seconds, 1.33 frames", [1.7e12, 1.7e12 + 500, 1.7e12 + 1500]),
+        ([0, 33, 66], "milliseconds, 30.3 frames", [0, 33, 66]),
+        ([1_700_000_000_000_000, 1_700_000_000_500_000, 1_700_000_001_000_000], "microseconds, 2 frames", None),
+        ([5.0, 4.0, 4.0], "seconds", [4000, 4001, 5000]),
+    ],
+)
+def test_the_times_of_frames_are_used_and_their_unit_is_said(
+    tmp_path: Path, times: list[float], said_unit: str, stamps_ms: list[float] | None
+) -> None:
+    folder = make_transforms(tmp_path / "nerf")
+    found = json.loads((folder / "transforms.json").read_text())
+    for frame, time in zip(found["frames"], times, strict=True):
+        frame["timestamp"] = time
+    (folder / "transforms.json").write_text(json.dumps(found))
+    report, frames = imported(folder)
+    assert f"'timestamp' is read as {said_unit}" in said(report) and "made up" not in said(report)
+    got = [frame.stamp_ns / 1e6 for frame in frames]
+    assert got == (stamps_ms or [1.7e12, 1.7e12 + 500, 1.7e12 + 1000])
+    assert ("time of another one" in said(report)) == (times[2] == times[1])
+
+
+@pytest.mark.parametrize(
+    ("keys", "factor"),
+    [
+        ({"applied_scale": 0.5}, 2.0),
+        ({"applied_transform": [[0, 2, 0, 0], [-2, 0, 0, 0], [0, 0, 2, 0]]}, 0.5),
+        ({"units": "cm"}, 0.01),
+        ({"unit": "metres", "applied_transform": np.eye(4)[:3].tolist()}, 1.0),
+    ],
+)
+def test_positions_are_what_they_were_before_they_were_scaled(
+    tmp_path: Path, keys: dict[str, Any], factor: float
+) -> None:
+    folder = add_depth(make_transforms(tmp_path / "nerf", **keys))
+    report, frames = imported(folder)
+    assert np.allclose(frames[2].T_world_camera[:3, 3], factor * poses()[2][:3, 3])
+    assert ("positions are multiplied" in said(report)) == (factor != 1) and report.info.scale_known
+
+
+@pytest.mark.parametrize(
+    ("first", "gap", "unit_ns"),
+    [
+        (5e9, 33_333_333, 1),
+        (1.08e13, 33_333_333, 1),
+        (2e8, 33_333, 1000),
+        (172_800_000, 33, 1_000_000),
+        (1.7e9, 20, 10**9),
+        (0.0, 0.5, 10**9),
+    ],
+)
+def test_the_unit_of_times_is_one_in_which_frames_follow_each_other(
+    tmp_path: Path, first: float, gap: float, unit_ns: int
+) -> None:
+    folder = make_transforms(tmp_path / "nerf")
+    found = json.loads((folder / "transforms.json").read_text())
+    for n, frame in enumerate(found["frames"]):
+        frame["timestamp"] = str(first + gap * n)
+    (folder / "transforms.json").write_text(json.dumps(found))
+    stamps = [frame.stamp_ns for frame in imported(folder)[1]]
+    assert np.allclose(np.diff(stamps), gap * unit_ns, rtol=1e-6)
+
+
+def test_depth_in_the_unit_of_the_poses_is_scaled_with_them(tmp_path: Path) -> None:
+    folder = add_depth(make_transforms(tmp_path / "nerf", applied_scale=0.5, integer_depth_scale=0.001))
+    found = json.loads((folder / "transforms.json").read_text())
+    for frame in found["frames"]:
+        frame["depth_path"] = frame.pop("depth_file_path")
+    (folder / "transforms.json").write_text(json.dumps(found))
+    frame = imported(folder)[1][1]
+    assert np.allclose(frame.T_world_camera[:3, 3], 2 * poses()[1][:3, 3])
+    assert frame.depth_m is not None and np.allclose(frame.depth_m[frame.depth_m > 0], 2 * 1.501)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "pinhole"),
+    [
+        ("SIMPLE_DIVISION", [50, 32, 24, 0], True),
+        ("DIVISION", [50, 50, 32, 24, 0], True),
+        ("EUCM", [50, 50, 32, 24, 0, 1.0], True),
+        ("SIMPLE_FISHEYE", [50, 32, 24], False),
+        ("FISHEYE", [50, 50, 32, 24], False),
+        ("SKEWED_PINHOLE", [50, 50, 32, 24, 0], True),
+        ("BROWN_CONRADY", [50, 32, 24, 0, 0, 0, 0, 0], True),
+    ],
+)
+def test_newer_models_of_colmap_are_judged_by_their_values(model: str, params: list[float], pinhole: bool) -> None:
+    found = intrinsics_of(model, 64, 48, params, "camera 1")
+    assert (found.fx, found.cx) == (50, 31.5) and found.distorted != pinhole
+    for other in ("EQUIRECTANGULAR", "DIVISION", "RAD_TAN_THIN_PRISM_FISHEYE", "SKEWED_PINHOLE"):
+        count = dict(MODELS.values())[other]
+        with pytest.raises(ImportSourceError, match="image_undistorter"):
+            intrinsics_of(other, 64, 48, [1.0] * count, "camera 1")
+
+
+def test_coefficients_of_brown_conrady_come_in_the_order_of_opencv() -> None:
+    """COLMAP has k1 k2 k3 p1 p2, OpenCV k1 k2 p1 p2 k3."""
+    found = intrinsics_of("BROWN_CONRADY", 64, 48, [50, 32, 24, 0.1, 0.2, 0.3, 0.01, 0.02], "camera 1")
+    assert found.distortion[:5] == (0.1, 0.2, 0.01, 0.02, 0.3) and found.fy == 50
+
+
+@pytest.mark.parametrize(
+    ("times", "fps", "stamps_ms", "says"),
+    [
+        ([5.0, 5.5], 10, [0, 500, 600], "lack 1 picture; "),
+        ([5.0], 10, [0, 100, 200], "lack 2 pictures; "),
+        ([None, 5.0, 5.5], 10, [0, 100, 600], "follow at 10 frames a second"),
+        ([5.0, "x", 6.0], 10, [0, 500, 1000], "lack 1 picture; "),
+        ([5.0, 5.5], None, [0, 500, 517], "follow at 60 frames a second (assumed)"),
+    ],
+)
+def test_times_that_record3d_lacks_follow_at_its_rate(
+    tmp_path: Path, times: list[Any], fps: float | None, stamps_ms: list[int], says: str
+) -> None:
+    report, frames = imported(make_record3d(tmp_path / "phone", frameTimestamps=times, fps=fps))
+    assert [round(frame.stamp_ns / 1e6) for frame in frames] == stamps_ms and says in said(report)
+
+
+def change(folder: Path, **changes: Any) -> list[dict[str, Any]]:
+    models = json.loads((folder / "reconstruction.json").read_text())
+    models[0].update(changes)
+    (folder / "reconstruction.json").write_text(json.dumps(models))
+    return models
+
+
+def test_a_reconstruction_of_opensfm_is_imported_with_its_metres(tmp_path: Path) -> None:
+    folder = make_opensfm(tmp_path / "flight", flight())
+    assert detect_format(folder) == "opensfm"
+    report, frames = imported(folder)
+    assert report.info.scale_known and report.info.metadata[ORIGIN_KEY].startswith("52.5")
+    for frame, T in zip(frames, flight(), strict=True):  # 10 comes behind 9
+        assert np.allclose(frame.T_world_camera, T, atol=1e-9)
+    k = frames[0].intrinsics
+    assert (k.fx, k.cx, k.cy) == (pytest.approx(F), (W - 1) / 2, (H - 1) / 2)
+    with pytest.raises(ImportSourceError, match="in metres already"):
+        imported(folder, scale=2.0)
+
+
+def test_a_reconstruction_without_gps_is_made_of_room_size(tmp_path: Path) -> None:
+    folder = make_opensfm(tmp_path / "flight", flight())
+    for reference in (None, {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}):
+        change(folder, reference_lla=reference)
+        report, frames = imported(folder)
+        assert not report.info.scale_known
+        ratio = np.linalg.norm(frames[6].T_world_camera[:3, 3] - frames[0].T_world_camera[:3, 3]) / 40
+        assert ratio == pytest.approx(2 / 36, rel=0.1)  # cameras are 36 m from the points
+    assert imported(folder, scale=3.0)[0].info.scale_known
+    (folder / "reference_lla.json").write_text('{"latitude": 1.0, "longitude": 2.0, "altitude": 3.0}')
+    change(folder, reference_lla=None)
+    assert imported(folder)[0].info.scale_known
+    change(folder, reference_lla={"latitude": 200.0, "longitude": 0.0, "altitude": 0.0})
+    with pytest.raises(ImportSourceError, match=r"reference_lla\.latitude|<= 90"):
+        imported(folder)
+
+
+def test_a_lens_of_browns_model_is_undone(tmp_path: Path) -> None:
+    """Where OpenSfM projects a point in the picture with distortion, a white dot is where the log's camera has it."""
+    lens = {"k1": -0.2, "k2": 0.05, "p1": 0.004, "p2": -0.003, "k3": 0.01}
+    brown = {"projection_type": "brown", "focal_x": 0.7, "focal_y": 0.72, "c_x": 0.02, "c_y": -0.03}
+    folder = make_opensfm(tmp_path / "flight", flight(4), **brown, **lens)
+    x, y = -0.3, 0.25  # on the plane at depth 1
+    r2 = x * x + y * y
+    radial = 1 + r2 * (lens["k1"] + r2 * (lens["k2"] + r2 * lens["k3"]))
+    u = 0.7 * (x * radial + 2 * lens["p1"] * x * y + lens["p2"] * (r2 + 2 * x * x)) + 0.02
+    v = 0.72 * (y * radial + 2 * lens["p2"] * x * y + lens["p1"] * (r2 + 2 * y * y)) - 0.03
+    pixel = np.array((u * W + W / 2 - 0.5, v * W + H / 2 - 0.5))
+    rows, columns = np.mgrid[:H, :W]
+    dot = 255 * np.exp(-((columns - pixel[0]) ** 2 + (rows - pixel[1]) ** 2) / 4)
+    Image.fromarray(np.repeat(dot[..., None], 3, 2).astype(np.uint8)).save(folder / "images" / "DJI_0.JPG", quality=98)
+    frame = imported(folder)[1][0]
+    light = np.where(frame.rgb[..., 0] > 60, frame.rgb[..., 0], 0).astype(float)
+    found = np.array(((light * columns).sum(), (light * rows).sum())) / light.sum()
+    expected = (camera_matrix(frame.intrinsics) @ (x, y, 1))[:2]
+    assert np.abs(found - expected).max() < 0.3 < np.abs(pixel - expected).max()
