@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 import semantic_mapper.config
-from semantic_mapper.config import AtLeastOne, Positive
+from semantic_mapper.config import AtLeastOne
 
 Preset = Literal["as-is", "default", "hand", "high_accuracy", "high_density", "medium_density"]
 
@@ -25,7 +25,3 @@ class Config(semantic_mapper.config.Config, frozen=True):
     # The stereo matcher's preset. This one would rather leave a pixel without depth than guess: a map has other views.
     preset: Preset = "high_accuracy"
     ir_dots: bool = True  # the dot projector: depth on bare walls
-    search_s: Positive = 2.0  # how long the device is looked for before it counts as missing
-    start_s: Positive = 10.0  # how long the first image may take after the device has been opened
-    stall_s: Positive = 3.0  # without images for so long, the device is closed and opened again
-    retry_s: Positive = 1.0  # between two attempts to find a device that has gone

@@ -13,8 +13,8 @@ from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
 
 if TYPE_CHECKING:
-    from semantic_mapper.drivers.calibrating.solve import Calibration
-    from semantic_mapper.nodes.calibration.run import Gathering
+    from semantic_mapper.drivers.calibrating.rig import Calibration
+    from semantic_mapper.nodes.calibration.sources import Gathering
 
 _WORST = 3  # views named in the report
 
@@ -117,7 +117,7 @@ def board_settings(path: Path | None, square_mm: float) -> Any:
 
 
 def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
-    from semantic_mapper.drivers.calibrating.sheet import sheet_png
+    from semantic_mapper.drivers.poses.board import sheet_png
     from semantic_mapper.nodes.calibration.report import write_whole
     from semantic_mapper.replay.run_folder import prepare_file
 
@@ -136,9 +136,8 @@ def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
 def _calibrate(
     sources: list[str], settings: Any, size: str, *, known: bool, rig: bool, seconds: float
 ) -> tuple[Calibration, Gathering]:
-    from semantic_mapper.drivers.calibrating.solve import solve
-    from semantic_mapper.nodes.calibration.run import Gathering
-    from semantic_mapper.nodes.calibration.sources import parse_sources
+    from semantic_mapper.drivers.calibrating.rig import solve
+    from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources
 
     places = parse_sources(sources, size)
     gathered = Gathering(settings.board, settings.calibration)
@@ -155,9 +154,8 @@ def _calibrate(
 def _calibrate_stereo(
     sources: list[str], settings: Any, size: str, seconds: float
 ) -> tuple[str, Calibration, Gathering]:
-    from semantic_mapper.drivers.calibrating.solve import solve
-    from semantic_mapper.nodes.calibration.run import Gathering
-    from semantic_mapper.nodes.calibration.sources import parse_stereo
+    from semantic_mapper.drivers.calibrating.rig import solve
+    from semantic_mapper.nodes.calibration.sources import Gathering, parse_stereo
 
     name, source = parse_stereo(sources, size)
     gathered = Gathering(settings.board, settings.calibration)

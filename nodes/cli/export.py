@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def export(
     source: Annotated[
         Path,
-        typer.Argument(metavar="MAP|LOG", help="Saved map, log, or a folder: of results, tiles, or parts of a log."),
+        typer.Argument(metavar="MAP|LOG", help="Saved map, log, or a folder: of results, or of parts of a log."),
     ],
     out: Annotated[Path, typer.Option("--out", help="File to write; its ending says the format.")],
     format: Annotated[  # noqa: A002 - the name of the option
@@ -91,19 +91,13 @@ def export(
 
 def _export_map(output: Output, folder_or_map: Path, out: Path, request: ExportRequest) -> None:
     from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.queries.tiles import TiledMap
     from semantic_mapper.replay.exporters.map_files import export_map
-    from semantic_mapper.replay.run_folder import holds_tiles, map_path, prepare_file, refuse_overwriting
+    from semantic_mapper.replay.run_folder import map_path, prepare_file, refuse_overwriting
 
-    if holds_tiles(str(folder_or_map)):
-        prepare_file(out)
-        voxel_map = TiledMap.open(folder_or_map).load()
-    else:
-        source = map_path(folder_or_map)
-        refuse_overwriting(out, source)
-        prepare_file(out)
-        voxel_map = VoxelMap.load(source)
-    report = export_map(voxel_map, out, request)
+    source = map_path(folder_or_map)
+    refuse_overwriting(out, source)
+    prepare_file(out)
+    report = export_map(VoxelMap.load(source), out, request)
     output.print(f"{' and '.join(map(str, report.files))}: {report.content}")
     for line in report.found:
         output.print(f"  {line}")

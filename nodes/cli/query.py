@@ -53,8 +53,7 @@ def query(
         str,
         typer.Argument(
             metavar="MAP",
-            help="Saved map, folder of results, `live` for the launch that runs here, ipc://PATH, tcp://HOST:PORT, or "
-            "folder or URL of tiles (`fleet merge`).",
+            help="Saved map, folder of results, `live` for the launch that runs here, ipc://PATH or tcp://HOST:PORT.",
         ),
     ],
     question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest, instances or graph.")],
@@ -89,8 +88,7 @@ def query(
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
     things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
     that `refine` has told things apart in, those. graph: floors, their rooms, which part at doors, the doors between
-    them, and the same things with their rooms. Of a map in tiles, only tiles that an answer needs are in memory; graph
-    needs all.
+    them, and the same things with their rooms.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
@@ -100,13 +98,9 @@ def query(
     Example: semantic-mapper query live nearest chair 0 0 1 --json
     Example: semantic-mapper query live instances --gone --json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
-    Example: semantic-mapper query s3://maps/house nearest chair 0 0 1
     """
     class_name, point = _read_arguments(question, arguments or [])
-    from semantic_mapper.replay.run_folder import holds_tiles
-
-    in_tiles = holds_tiles(source)
-    endpoint = "" if in_tiles else map_endpoint(source)
+    endpoint = map_endpoint(source)
     if gone and not (endpoint and question is Question.INSTANCES):
         raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
     if picture is not None and question is not Question.GRAPH:
@@ -119,7 +113,7 @@ def query(
     for path in (out, picture):
         if path is not None:
             prepare_file(path)
-    ask = ask_tiles if in_tiles else ask_mapper if endpoint else ask_file
+    ask = ask_mapper if endpoint else ask_file
     asked = Asked(question, class_name, point, up, min_confidence, server, keys, gone, picture)
     found = {"map": source, **ask(endpoint or source, asked)}
     if out is not None:
@@ -159,42 +153,6 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
             up = asked.up or _find_up(snapshot)
             return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot), by)
         case Question.GRAPH:
-            return _answer_graph(source, GraphTracker(asked.up).update(snapshot), asked.picture)
-
-
-def ask_tiles(source: str, asked: Asked) -> dict[str, Any]:
-    """The same of a map in tiles.
-
-    Raises:
-        ConfigError, MapError, LabelError: no tiles there, or a question that cannot be answered.
-        StoreError: the store cannot be reached.
-    """
-    from semantic_mapper.mapping.files.up_axis import find_up
-    from semantic_mapper.nodes import map_answers
-    from semantic_mapper.nodes.fleet.tile_reading import open_tiles
-    from semantic_mapper.queries.graph import GraphTracker
-    from semantic_mapper.queries.mirror import MapMirror
-
-    tiled = open_tiles(source)
-    match asked.question:
-        case Question.INFO:
-            return map_answers.describe_tiles(tiled.manifest)
-        case Question.AT:
-            return map_answers.answer_at(tiled.manifest.label_set, asked.point, tiled.at([asked.point]))
-        case Question.NEAREST:
-            hit = tiled.nearest(asked.class_name, asked.point, asked.min_confidence)
-            return map_answers.answer_nearest(asked.class_name, asked.point, hit)
-        case Question.INSTANCES:
-            up = asked.up
-            if up is None:
-                points = tiled.points()
-                try:
-                    up = tuple(find_up(points, tiled.manifest.label_set).tolist())
-                except MapError:
-                    up = map_answers.UP
-            return map_answers.answer_instances(up, tiled.instances(up=up), map_answers.CONNECTED)
-        case Question.GRAPH:
-            snapshot = MapMirror.of(tiled.load()).snapshot()
             return _answer_graph(source, GraphTracker(asked.up).update(snapshot), asked.picture)
 
 

@@ -11,8 +11,7 @@ from semantic_mapper.drivers.calibration import load_calibration, load_mount, sa
 from semantic_mapper.drivers.mounts import mount_of
 from semantic_mapper.drivers.poses.config import FixedPose
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
-from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
-from semantic_mapper.drivers.poses.still import FixedPoseSource
+from semantic_mapper.drivers.poses.sources import FixedPoseSource, make_poses, read_pose_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import CameraIntrinsics
 from tests.drivers.poses.images import ListCamera, image, rigid
@@ -82,9 +81,9 @@ def test_poses_of_the_camera_itself_are_left_alone_or_the_mistake_is_told(tmp_pa
                 "kind": "topic",
                 "endpoint": "ipc://x",
                 "T_base_rig": np.eye(4).tolist(),
-                "cameras": {"a": np.eye(4).tolist()},
+                "T_base_camera": T_RIG_CAMERA.tolist(),
             },
-            "give T_base_rig, or else",
+            "give T_base_camera or",
         ),
         ({"kind": "topic", "endpoint": "ipc://x", "T_base_rig": (2 * np.eye(4)).tolist()}, "T_base_rig"),
     ],

@@ -13,9 +13,9 @@ import pytest
 
 from research.scenes import render_view
 from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.calibration import load_stereo, save_stereo
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo import list_devices
-from semantic_mapper.drivers.stereo.calibration import load_stereo, save_stereo
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.types import Float64
@@ -156,7 +156,7 @@ def test_what_cannot_work_is_refused_before_the_device_is_opened(
 def test_a_pair_that_is_not_side_by_side_and_a_film_of_another_size_are_refused(film: Film, tmp_path: Path) -> None:
     turned = dataclasses.replace(pairs.pair(), T_right_left=shift(0.1))
     save_stereo(tmp_path / "turned.toml", turned, {})
-    with pytest.raises(ConfigError, match="the right camera is not beside the left one"):
+    with pytest.raises(ConfigError, match="the right camera is not next to the left one"):
         stereo(film.path, str(tmp_path / "turned.toml"))
     small = pairs.write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
     camera = stereo(small, pairs.write_pair(tmp_path / "pair.toml"))

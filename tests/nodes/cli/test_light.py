@@ -108,7 +108,6 @@ def test_errors_that_need_no_heavy_package_load_none(files: Path) -> None:
         "relocalize none.npz room.mcap": 1,
         "relocalize map.npz none.mcap": 1,
         "calibrate none": 1,
-        "train --config none.toml --out x": 1,
         "fleet run replay none.mcap --out x": 1,
         "refine none.npz --out x.npz": 1,
         "boxes none.json": 1,

@@ -1,26 +1,42 @@
-"""Focal length, principal point and lens distortion of one camera."""
+"""Focal length, principal point and lens distortion of one camera, and a picture of how well they are known."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.coverage import area_counts, shortfalls, tilt_degrees
-from semantic_mapper.drivers.calibrating.views import BoardView
+from semantic_mapper.drivers.calibrating.views import (
+    CELLS,
+    MIN_TILT_DEG,
+    BoardView,
+    area_counts,
+    shortfalls,
+    tilt_degrees,
+)
 from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
 from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.plots import BAD, DIM_TEXT, GOOD, PANEL, SMALL_PT, TITLE_PT, WARN, cut, new_figure, rendered
 from semantic_mapper.types import CameraIntrinsics, Float64
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 OUTLIER = 3.0  # times the median error of a view: it was blurred, or the board was bent
 OUTLIER_FLOOR_PX = 0.3
 MAX_LEFT_OUT = 0.2  # fraction of the views
+MAX_FOCAL_SIGMA = 0.005  # one sigma of the focal length, as a fraction of it
+_LONGEST = 0.03  # of the image's width, for the 95th percentile of the residuals in the picture
+_MAX_TILT_DEG = 60
+_GOOD, _BAD, _WARN, _DIM, _PANEL = (tuple(v / 255 for v in c) for c in (GOOD, BAD, WARN, DIM_TEXT, PANEL))
 _FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
 
 
@@ -36,7 +52,7 @@ class CameraCalibration:
         views: Those used.
         residuals: (N, 2) a view, seen minus predicted, pixels.
         errors_px: RMS of each view.
-        tilts: (V, 2) degrees; counts: corners a cell; see ``coverage``.
+        tilts: (V, 2) degrees; counts: corners a cell; see ``views``.
         left_out: Names of views that did not fit the others.
     """
 
@@ -78,18 +94,7 @@ def calibrate_camera(
         used = [view for i, view in enumerate(used) if i not in worst]
         found = _calibrate(used, size, config)
     _check(camera_id, found, config)
-    return CameraCalibration(
-        found.intrinsics,
-        True,
-        found.rms_px,
-        found.sigmas,
-        found.views,
-        found.residuals,
-        found.errors_px,
-        found.tilts,
-        found.counts,
-        tuple(left_out),
-    )
+    return replace(found, left_out=tuple(left_out))
 
 
 def compare_camera(
@@ -195,27 +200,90 @@ def _check(camera_id: str, found: CameraCalibration, config: CalibrationConfig) 
         raise _refusal(camera_id, lacks)
     _check_error(camera_id, found, config)
     fraction = max(found.sigmas["fx"] / found.intrinsics.fx, found.sigmas["fy"] / found.intrinsics.fy)
-    if fraction > config.max_focal_sigma:
-        raise _refusal(
-            camera_id,
-            (
-                f"the focal length is known to {100 * fraction:.2f} % only (one sigma; "
-                f"{100 * config.max_focal_sigma:g} % "
-                "is needed): show the board nearer, and lean it further, in more images",
-            ),
+    if fraction > MAX_FOCAL_SIGMA:
+        lack = (
+            f"the focal length is known to {100 * fraction:.2f} % only (one sigma; {100 * MAX_FOCAL_SIGMA:g} % is "
+            "needed): show the board nearer, and lean it further, in more images"
         )
+        raise _refusal(camera_id, (lack,))
 
 
 def _check_error(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> None:
     if found.rms_px > config.max_error_px:
-        raise _refusal(
-            camera_id,
-            (
-                f"corners are off by {found.rms_px:.2f} px (RMS; {config.max_error_px:g} are allowed): check the sizes "
-                "of the board, glue it to something flat, hold it still, and use sharp images",
-            ),
+        lack = (
+            f"corners are off by {found.rms_px:.2f} px (RMS; {config.max_error_px:g} are allowed): check the sizes of "
+            "the board, glue it to something flat, hold it still, and use sharp images"
         )
+        raise _refusal(camera_id, (lack,))
 
 
 def _refusal(camera_id: str, lacks: Sequence[str]) -> CameraError:
     return CameraError(f"camera '{camera_id}' cannot be calibrated from these images: {'; '.join(lacks)}")
+
+
+@rendered
+def draw_calibration(camera_id: str, found: CameraCalibration) -> Figure:
+    """Residuals of all corners, the error of each view, and the tilts of the board."""
+    figure = new_figure(1400, 760, layout="constrained")
+    title = f"{cut(camera_id, 700, TITLE_PT)}: {len(found.views)} views, {found.rms_px:.3f} px RMS"
+    figure.suptitle(title, x=0.012, ha="left")
+    grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1))
+    _draw_residuals(figure.add_subplot(grid[:, 0]), found)
+    _draw_errors(figure.add_subplot(grid[0, 1]), found)
+    _draw_tilts(figure.add_subplot(grid[1, 1]), found)
+    return figure
+
+
+def _draw_residuals(axes: Axes, found: CameraCalibration) -> None:
+    """The image with its cells, the corners, and their residuals enlarged."""
+    i = found.intrinsics
+    values = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy}
+    sigmas = {name: f" ± {found.sigmas[name]:.2f}" if name in found.sigmas else "" for name in values}
+    axes.set_title(",  ".join(f"{name} {value:.2f}{sigmas[name]}" for name, value in values.items()))
+    right, bottom = i.width - 0.5, i.height - 0.5
+    edges = np.linspace(-0.5, right, CELLS + 1), np.linspace(-0.5, bottom, CELLS + 1)
+    seen = np.where(found.counts > 0, 0.12, 0.0)
+    axes.imshow(np.dstack([np.ones((CELLS, CELLS, 3)), seen]), extent=(-0.5, right, bottom, -0.5), aspect="equal")
+    label = {"color": _DIM, "zorder": 5, "bbox": {"facecolor": _PANEL, "linewidth": 0, "pad": 1}}
+    for (row, column), count in np.ndenumerate(found.counts):
+        place = edges[0][column], edges[1][row]
+        axes.annotate(str(count), place, (4, -4), textcoords="offset points", va="top", fontsize=SMALL_PT, **label)
+    pixels = np.concatenate([view.pixels for view in found.views])
+    residuals = np.concatenate(found.residuals)
+    lengths = np.linalg.norm(residuals, axis=1)
+    longest = max(float(np.percentile(lengths, 95)), 1e-6)
+    enlarged = _LONGEST * i.width / longest
+    colors = np.where((lengths <= longest)[:, None], _GOOD, _BAD)
+    style = {"angles": "xy", "scale_units": "xy", "width": 0.0015, "headwidth": 1, "headlength": 0, "headaxislength": 0}
+    axes.quiver(*pixels.T, *residuals.T, color=colors, scale=1 / enlarged, **style)
+    axes.plot(*pixels.T, ".", color="white", markersize=2.5)
+    axes.set(xticks=edges[0], yticks=edges[1], xlim=(-0.5, right), ylim=(bottom, -0.5))
+    axes.tick_params(length=0, labelbottom=False, labelleft=False)
+    axes.set_axisbelow(False)
+    axes.grid(color=_PANEL, linewidth=1.5)
+    note = f"lines: seen minus predicted, {enlarged:.0f} times enlarged, orange: the longest 5 %\n"
+    axes.set_xlabel(f"{note}numbers: corners in a cell; dark cells: none", loc="left")
+
+
+def _draw_errors(axes: Axes, found: CameraCalibration) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    left_out = f", {len(found.left_out)} left out" if found.left_out else ""
+    axes.set(title=f"error of each view{left_out}", xlabel="view", ylabel="px RMS")
+    axes.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=_GOOD)
+    axes.axhline(found.rms_px, color=_WARN, label=f"all corners: {found.rms_px:.2f}")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(0, max(1.25 * max(found.errors_px), 1e-6))
+    axes.legend(loc="upper right")
+
+
+def _draw_tilts(axes: Axes, found: CameraCalibration) -> None:
+    """How the board leaned in each view, and how far it has to have leaned at least once."""
+    up, side = np.clip(found.tilts, -_MAX_TILT_DEG, _MAX_TILT_DEG).T
+    least, ticks = MIN_TILT_DEG, range(-_MAX_TILT_DEG, _MAX_TILT_DEG + 1, 20)
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * least
+    axes.plot(*square.T, "-", color=_WARN, linewidth=1, label=f"needed: beyond {least:g}° each way")
+    axes.plot(side, up, "o", color=_GOOD)
+    axes.set(title="how the board leaned", xlabel="to a side, degrees", ylabel="up or down, degrees")
+    axes.set(xlim=(-65, 65), ylim=(65, -65), xticks=ticks, yticks=ticks, aspect="equal")
+    axes.legend(loc="upper center", handlelength=1)

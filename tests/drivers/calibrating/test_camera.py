@@ -7,11 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from semantic_mapper.drivers.calibrating import camera
+from semantic_mapper.drivers.calibrating.camera import calibrate_camera, compare_camera, draw_calibration, ideal_pixels
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.coverage import REGIONS, area_counts, missing_regions
-from semantic_mapper.drivers.calibrating.intrinsics import calibrate_camera, compare_camera, ideal_pixels
-from semantic_mapper.drivers.calibrating.picture import draw_calibration
-from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer
+from semantic_mapper.drivers.calibrating.views import REGIONS, BoardView, ViewGatherer, area_counts, missing_regions
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import camera_matrix, project
@@ -66,10 +65,10 @@ def test_a_known_camera_is_found_from_pictures(gathered: ViewGatherer) -> None:
     assert off_px.max() < 1.5 and turned < 0.8
     assert list(found.sigmas) == ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
     assert len(found.errors_px) == len(found.views) == len(found.residuals) == len(found.tilts)
-    picture = draw_calibration("cam", found, CONFIG)
+    picture = draw_calibration("cam", found)
     assert picture.dtype == np.uint8 and picture.shape[2] == 3
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50  # corners, lines and bars, not an empty panel
-    assert not misplaced_texts(figure_of(draw_calibration, "cam", found, CONFIG))
+    assert not misplaced_texts(figure_of(draw_calibration, "cam", found))
 
 
 def test_corners_are_found_where_the_lens_shows_them() -> None:
@@ -91,7 +90,7 @@ def test_the_uncertainty_is_that_of_many_calibrations() -> None:
 
 
 @pytest.mark.parametrize("coefficients", [4, 5, 8])
-def test_as_many_coefficients_as_asked_for(coefficients: int) -> None:
+def test_as_many_coefficients_as_requested(coefficients: int) -> None:
     config = CalibrationConfig(coefficients=coefficients)  # type: ignore[arg-type]
     found = calibrate_camera("cam", made_up(views(20), 0.02), SIZE, config)
     assert len(found.intrinsics.distortion) == coefficients
@@ -119,19 +118,19 @@ def test_views_in_the_middle_alone_are_refused_with_what_is_missing() -> None:
 
 
 def test_a_board_that_never_leaned_is_refused() -> None:
-    config = CalibrationConfig(max_focal_sigma=0.5)
     with pytest.raises(CameraError, match="never leaned up or down by 15 degrees"):
-        calibrate_camera("cam", made_up(views(20, tilted=False), 0.02), SIZE, config)
+        calibrate_camera("cam", made_up(views(20, tilted=False), 0.02), SIZE, CONFIG)
 
 
-def test_too_few_views_wrong_sizes_and_open_focal_lengths_are_refused() -> None:
+def test_too_few_views_wrong_sizes_and_open_focal_lengths_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CameraError, match="5 views that differ from each other, 10 are needed"):
         calibrate_camera("cam", made_up(views(20))[:5], SIZE, CONFIG)
     bent = [dataclasses.replace(v, pixels=v.pixels + 4 * np.sin(v.points[:, :1] * 60)) for v in made_up(views(20))]
     with pytest.raises(CameraError, match=r"corners are off by \d.*check the sizes"):
         calibrate_camera("cam", bent, SIZE, CONFIG)
+    monkeypatch.setattr(camera, "MAX_FOCAL_SIGMA", 1e-4)
     with pytest.raises(CameraError, match=r"known to \d.\d\d % only"):
-        calibrate_camera("cam", made_up(views(20), 0.5), SIZE, CalibrationConfig(max_focal_sigma=1e-4))
+        calibrate_camera("cam", made_up(views(20), 0.5), SIZE, CONFIG)
 
 
 def test_a_camera_that_is_calibrated_is_compared_only() -> None:

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from semantic_mapper.drivers.calibrating import extrinsics
+from semantic_mapper.drivers.calibrating import rig
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.extrinsics import calibrate_rig
-from semantic_mapper.drivers.calibrating.solve import solve
-from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibrating.rig import calibrate_rig, solve
+from semantic_mapper.drivers.calibrating.views import MAX_VIEWS, BoardView, ViewGatherer, simultaneous
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import Float64
@@ -90,13 +89,14 @@ def test_a_board_that_was_moved_between_two_cameras_hardly_matters(monkeypatch: 
         fits.append(least_squares(*args, **settings))
         return fits[-1]
 
-    monkeypatch.setattr(extrinsics, "least_squares", noted)
+    monkeypatch.setattr(rig, "least_squares", noted)
+    monkeypatch.setattr(rig, "MAX_POSITION_SIGMA_M", 1.0)
     groups = shows(("left", "right"), 24)
     moved = views(30, aside=0.6)[29]
     wrong = seen(moved, 99, 0.1, np.random.default_rng(2))
     assert wrong is not None
     found = calibrate_rig({"left": LENS, "right": LENS}, groups, CONFIG)
-    config = CalibrationConfig(max_error_px=50.0, max_position_sigma_m=1.0)
+    config = CalibrationConfig(max_error_px=50.0)
     spoilt = calibrate_rig({"left": LENS, "right": LENS}, [*groups, {**groups[0], "right": wrong}], config)
     check_close(spoilt.T_rig_camera["right"], found.T_rig_camera["right"], 0.005, 0.5)
     with pytest.raises(CameraError, match="do not agree on where the board is"):
@@ -104,14 +104,15 @@ def test_a_board_that_was_moved_between_two_cameras_hardly_matters(monkeypatch: 
     assert len(fits) == 3 and max(fit.nfev for fit in fits) < 200
 
 
-def test_too_few_moments_in_common_are_refused() -> None:
+def test_too_few_moments_in_common_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     groups = shows(("left", "right"), 24)
     with pytest.raises(CameraError, match="camera 'right': saw the board at only 5 moments"):
         calibrate_rig({"left": LENS, "right": LENS}, groups[:5], CONFIG)
     with pytest.raises(CameraError, match="camera 'back': saw the board at only 0 moments"):
         calibrate_rig({"left": LENS, "right": LENS, "back": LENS}, groups, CONFIG)
+    monkeypatch.setattr(rig, "MAX_POSITION_SIGMA_M", 1e-7)
     with pytest.raises(CameraError, match="place on the rig is known to"):
-        calibrate_rig({"left": LENS, "right": LENS}, groups, CalibrationConfig(max_position_sigma_m=1e-7))
+        calibrate_rig({"left": LENS, "right": LENS}, groups, CONFIG)
 
 
 def test_views_count_as_simultaneous_within_a_time() -> None:
@@ -121,14 +122,14 @@ def test_views_count_as_simultaneous_within_a_time() -> None:
         return BoardView(str(ms), ms * 1_000_000, points, points[:, :2])
 
     own = {"a": [at(0), at(100), at(200)], "b": [at(15), at(130), at(201)], "c": [at(19)]}
-    groups = simultaneous(own, CONFIG)
+    groups = simultaneous(own)
     assert [{n: v.name for n, v in g.items()} for g in groups] == [
         {"a": "0", "b": "15", "c": "19"},
         {"a": "200", "b": "201"},
     ]
     many = {name: [at(1000 * i) for i in range(200)] for name in "ab"}
-    thin = simultaneous(many, CONFIG)
-    assert len(thin) == CONFIG.max_views and thin[0]["a"].name == "0" and thin[-1]["b"].name == "199000"
+    thin = simultaneous(many)
+    assert len(thin) == MAX_VIEWS and thin[0]["a"].name == "0" and thin[-1]["b"].name == "199000"
 
 
 def test_pictures_of_two_cameras_give_lenses_and_rig_at_once() -> None:

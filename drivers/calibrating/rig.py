@@ -1,8 +1,8 @@
-"""Where the cameras of a rig sit relative to each other, from a board that several see at once."""
+"""From gathered views to calibrated cameras and, of those that see the board at once, to where they sit on a rig."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,14 +10,21 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from semantic_mapper.drivers.calibrating.camera import (
+    CameraCalibration,
+    calibrate_camera,
+    compare_camera,
+    ideal_pixels,
+)
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.intrinsics import ideal_pixels
-from semantic_mapper.drivers.calibrating.views import BoardView
+from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer, simultaneous
 from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import CameraIntrinsics, Float64
 
+MIN_INSTANTS = 8  # at which two cameras see the board at once
+MAX_POSITION_SIGMA_M = 0.003  # one sigma of a camera's place on the rig
 _HUBER_PX = 1.0  # residuals beyond count less
 
 
@@ -37,6 +44,53 @@ class RigCalibration:
     instants: dict[str, int]
     position_sigma_m: dict[str, float]
     turn_sigma_deg: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """All that came out.
+
+    Args:
+        cameras: By name; rig: None where it was not requested.
+    """
+
+    cameras: dict[str, CameraCalibration]
+    rig: RigCalibration | None
+
+
+def solve(
+    gathered: Mapping[str, ViewGatherer], known: Collection[str], config: CalibrationConfig, *, rig: bool
+) -> Calibration:
+    """Calibrate.
+
+    Args:
+        gathered: By camera; the first one is where the rig is.
+        known: Cameras whose intrinsics are right as their source gives them.
+        config: What a result has to be like.
+        rig: Also find where the cameras sit relative to each other.
+
+    Raises:
+        CameraError: one of them cannot be calibrated; says why and what to do.
+    """
+    cameras: dict[str, CameraCalibration] = {}
+    for name, views in gathered.items():
+        if views.size is None or views.intrinsics is None:
+            raise CameraError(f"camera '{name}': gave no image")
+        if not views.seen:
+            raise CameraError(
+                f"camera '{name}': the board was found in none of {views.images} images; are its columns, rows, "
+                "dictionary and pattern those of the settings (`calibrate --board FILE.png` draws the board that is "
+                "looked for)?"
+            )
+        if name in known:
+            cameras[name] = compare_camera(name, views.kept or views.steady, views.intrinsics, config)
+        else:
+            cameras[name] = calibrate_camera(name, views.kept, views.size, config)
+    if not rig:
+        return Calibration(cameras, None)
+    instants = simultaneous({name: views.steady for name, views in gathered.items()})
+    found = calibrate_rig({name: camera.intrinsics for name, camera in cameras.items()}, instants, config)
+    return Calibration(cameras, found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +120,7 @@ def calibrate_rig(
     names = list(cameras)
     lenses = [cameras[name] for name in names]
     sights = _sights(names, lenses, instants)
-    T_rig_camera = _first_guess(names, sights, config)
+    T_rig_camera = _first_guess(names, sights)
     boards = {s.instant: T_rig_camera[s.camera] @ s.T_camera_board for s in reversed(sights)}
     fit = _adjust_bundle(lenses, sights, T_rig_camera, boards)
     if fit.rms_px > config.max_error_px:
@@ -80,10 +134,10 @@ def calibrate_rig(
         for part in (fit.sigmas[:, :3], fit.sigmas[:, 3:])
     )
     for name, sigma in positions.items():
-        if sigma > config.max_position_sigma_m:
+        if sigma > MAX_POSITION_SIGMA_M:
             raise CameraError(
                 f"camera '{name}': its place on the rig is known to {1000 * sigma:.1f} mm only (one sigma; "
-                f"{1000 * config.max_position_sigma_m:g} are needed): show the board nearer to both cameras at once"
+                f"{1000 * MAX_POSITION_SIGMA_M:g} are needed): show the board nearer to both cameras at once"
             )
     return RigCalibration(
         dict(zip(names, fit.T_rig_camera, strict=True)),
@@ -110,7 +164,7 @@ def _sights(
     return found
 
 
-def _first_guess(names: Sequence[str], sights: Sequence[_Sight], config: CalibrationConfig) -> list[Float64]:
+def _first_guess(names: Sequence[str], sights: Sequence[_Sight]) -> list[Float64]:
     """T_rig_camera along the pairs of cameras that see the board together most often.
 
     Raises:
@@ -128,11 +182,11 @@ def _first_guess(names: Sequence[str], sights: Sequence[_Sight], config: Calibra
             if b not in known
         }
         (a, b), pairs = max(shared.items(), key=lambda item: len(item[1]))
-        if len(pairs) < config.min_instants:
+        if len(pairs) < MIN_INSTANTS:
             lost = ", ".join(f"'{name}'" for i, name in enumerate(names) if i not in known)
             raise CameraError(
                 f"camera {lost}: saw the board at only {len(pairs)} moments together with another camera of the rig; "
-                f"{config.min_instants} are needed: hold it where both see it, still, in several places"
+                f"{MIN_INSTANTS} are needed: hold it where both see it, still, in several places"
             )
         known[b] = known[a] @ _middle([p.T_camera_board @ invert_pose(q.T_camera_board) for p, q in pairs])
     return [known[i] for i in range(len(names))]
