@@ -14,8 +14,7 @@ from semantic_mapper.mapping.map_scale import length_unit, scale_name
 from semantic_mapper.plain_text import counted
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.lookup import PointAnswers
-from semantic_mapper.queries.nearest import NearestSurface
+from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
@@ -51,7 +50,7 @@ def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
 
 
 def answer_at(labels: LabelSet, point: Sequence[float], answers: PointAnswers) -> dict[str, Any]:
-    """What is at a point: the answers of ``lookup.at`` to it alone."""
+    """What is at a point: the answers of ``nearest.at`` to it alone."""
     label = int(answers.label[0])
     known = np.isfinite(answers.distance_m[0])
     return {

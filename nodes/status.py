@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import structlog
 
 from semantic_mapper.errors import CodecError
@@ -9,6 +11,13 @@ from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import Publisher
 
 _log = structlog.get_logger(__name__)
+
+
+class PartStatus(NamedTuple):
+    """What one part of a node says of itself: counts, and what does not work as it should."""
+
+    counters: dict[str, int]
+    warnings: tuple[str, ...] = ()
 
 
 def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0) -> None:

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml
 from semantic_mapper.errors import LogError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import NearestSurface, nearest
+from semantic_mapper.queries.nearest import NearestSurface, at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.replay.compare import MAP_FILE, Comparison, Run, Tolerances, compare_runs, read_run
@@ -60,7 +59,7 @@ class ReplayedMap:
         """Name of the class of the surface at a point; None where there is none, or nobody knows what it is.
 
         Raises:
-            MapError: not a point, or a radius beyond what ``queries.lookup.at`` takes.
+            MapError: not a point, or a radius beyond what ``queries.nearest.at`` takes.
         """
         labels, found = self.snapshot.label_set, int(at(self.snapshot, np.asarray(point)[None], radius_m).label[0])
         return None if found == labels.ignore_id else labels.names[labels.ids.index(found)]

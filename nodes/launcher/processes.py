@@ -126,7 +126,7 @@ class NodeProcess:
             given = _in_memory(msgspec.json.encode(msgspec.structs.replace(job, heartbeat_fd=beats)))
             theirs.callback(os.close, given)
             if server is not None and PROCESS_TABLE[kind].preloaded:
-                self._process = server.fork(f"semantic_mapper.nodes.{kind}.node", given, beats, output)
+                self._process = server.fork(f"semantic_mapper.nodes.{kind}.__main__", given, beats, output)
             else:
                 self._process = _start_interpreter(kind, given, beats, output)
             ours.callback(self._end)

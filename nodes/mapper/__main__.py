@@ -1,6 +1,24 @@
 """The process of a mapper node."""
 
-from semantic_mapper.nodes.mapper.node import main
+from __future__ import annotations
+
+from typing import NoReturn
+
+from semantic_mapper.nodes.node import NodeContext, run_node
+from semantic_mapper.nodes.options import MapperOptions, NodeJob
+
+
+def run(context: NodeContext, options: MapperOptions) -> None:
+    """Be a mapper; see ``node.run_mapper``."""
+    from semantic_mapper.nodes.mapper.node import run_mapper  # loads torch: thread counts are set, and heartbeats go
+
+    run_mapper(context, options)
+
+
+def main(job: NodeJob | None = None) -> NoReturn:
+    """Run the node of this process to its end, then exit."""
+    run_node(MapperOptions, run, job)
+
 
 if __name__ == "__main__":
     main()

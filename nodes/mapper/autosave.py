@@ -11,9 +11,10 @@ import structlog
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.files.map_saving import MapSaving
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.status import PartStatus
 
 FIRST_S = 2.0  # until the first save, twice as long until each further one: who is killed often still gets somewhere
-REST_SHARE = 1.0  # rests as long as it works, so that the next frame finds the processor free half of the time
+REST_FRACTION = 1.0  # rests as long as it works, so that the next frame finds the processor free half of the time
 
 _log = structlog.get_logger(__name__)
 
@@ -50,6 +51,11 @@ class Autosave:
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 
+    def status(self) -> PartStatus:
+        """For the mapper's status."""
+        failed = (f"the map was not saved: {self.failure}",) if self.failure else ()
+        return PartStatus({"saves": self.saves}, failed)
+
     def follow(self) -> None:
         """Begin a save if it is time; to be called between two frames."""
         if self._ending.is_set():
@@ -83,7 +89,7 @@ class Autosave:
 
         def rest() -> None:
             nonlocal worked_since
-            if self._ending.wait(REST_SHARE * (time.monotonic() - worked_since)):
+            if self._ending.wait(REST_FRACTION * (time.monotonic() - worked_since)):
                 raise _GivenUpError
             worked_since = time.monotonic()
 

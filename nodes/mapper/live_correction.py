@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from dataclasses import asdict
 
 import numpy as np
 import structlog
@@ -15,13 +15,14 @@ from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.worlds import MapWorlds
+from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.queries.questions import Correction, CorrectPosesRequest
 from semantic_mapper.replay.corrected_poses import match_frames
 from semantic_mapper.replay.session import MapSession
-from semantic_mapper.transport.query_messages import CorrectPosesRequest
 from semantic_mapper.types import Float64
 
 HISTORY_A_STEP = 2  # frames of the history for each step where no time is to spare: more than come, so that it ends
-STOPPED_S = 30.0  # how long a mapper that was asked to stop goes on with a correction
+STOPPED_S = 30.0  # how long a mapper that is to stop continues a correction
 _REMEMBERED = 64  # requests whose answer may have been lost
 
 _log = structlog.get_logger(__name__)
@@ -48,25 +49,21 @@ class LiveCorrection:
         """Whether a correction is under way."""
         return self._pipeline.corrector.status.running
 
-    @property
-    def counters(self) -> dict[str, int]:
-        """For the mapper's status; empty where no history is kept."""
+    def status(self) -> PartStatus:
+        """For the mapper's status; no counts where no history is kept."""
         status = self._pipeline.corrector.status
-        if not self._pipeline.corrector.records:
-            return {}
-        return {"corrections": status.completed, "correction_done": status.done, "correction_left": status.left}
+        counters: dict[str, int] = {}
+        if self._pipeline.corrector.records:
+            counters = {
+                "corrections": status.completed,
+                "correction_done": status.done,
+                "correction_left": status.left,
+            }
+        failed = (f"the last correction of poses was given up: {status.failure}",) if status.failure else ()
+        return PartStatus(counters, failed)
 
-    @property
-    def degraded(self) -> tuple[str, ...]:
-        """What does not work as it should, for the mapper's status."""
-        failure = self._pipeline.corrector.status.failure
-        return (f"the last correction of poses was given up: {failure}",) if failure else ()
-
-    def begin(self, request: CorrectPosesRequest) -> dict[str, Any]:
+    def begin(self, request: CorrectPosesRequest) -> Correction:
         """Begin a correction, unless this very request has done so before; see ``MappingPipeline.correct_poses``.
-
-        Returns:
-            Fields of the answer, see ``describe``.
 
         Raises:
             CodecError: arrays that do not go together.
@@ -81,15 +78,12 @@ class LiveCorrection:
                     del self._outcomes[old]
             return self.describe(*self._outcomes[request.id])
 
-    def describe(self, used: int = 0, left_out: int = 0) -> dict[str, Any]:
-        """Fields of a ``CorrectionAnswer``: how far corrections are."""
+    def describe(self, used: int = 0, left_out: int = 0) -> Correction:
+        """Where corrections stand."""
         status = self._pipeline.corrector.status
-        names = ("running", "done", "total", "completed", "poses", "frozen", "lost")
-        fields = {name: getattr(status, name) for name in names}
-        epoch = self._pipeline.voxel_map.epoch
-        return {**fields, "failure": status.failure[:4096], "map_epoch": epoch, "used": used, "left_out": left_out}
+        return Correction(**asdict(status), used=used, left_out=left_out, epoch=self._pipeline.voxel_map.epoch)
 
-    def carry_on(self, session: MapSession | None, *, mapped: bool) -> None:
+    def advance(self, session: MapSession | None, *, mapped: bool) -> None:
         """Go on with a correction, for about the time of one frame; for the mapper's thread, between two frames.
 
         Args:
@@ -107,12 +101,12 @@ class LiveCorrection:
     def finish(self, session: MapSession, stopped: Callable[[], bool], on_wait: Callable[[], None]) -> None:
         """End a correction that is under way, before the results are written; refuse those that come later.
 
-        Once somebody has asked to stop, it goes on for ``STOPPED_S`` at most; what is left then is reported in the
+        Once a stop was requested, it continues for ``STOPPED_S`` at most; what is left then is reported in the
         log and in ``session.unfinished_correction``.
 
         Args:
-            session: As for ``carry_on``.
-            stopped: Whether somebody has asked to stop.
+            session: As for ``advance``.
+            stopped: Whether a stop was requested.
             on_wait: Called now and then.
         """
         with self._lock:
@@ -148,8 +142,11 @@ class LiveCorrection:
         """The poses by the frames they are of."""
         stamps, poses = request.stamps_ns, request.poses
         camera, names = request.camera.astype(np.int64), list(request.cameras)
-        if not len(stamps) == len(poses) == len(camera):
-            raise CodecError(f"correct_poses: {len(stamps)} stamps, {len(camera)} cameras and {len(poses)} poses")
+        if not (stamps.shape == camera.shape == poses.shape[:1] and poses.shape[1:] == (4, 4)):
+            raise CodecError(
+                f"correct_poses: stamps of shape {stamps.shape}, cameras {camera.shape} and poses {poses.shape} do not "
+                "go together; expected (N,), (N,) and (N, 4, 4)"
+            )
         if len(set(names)) < len(names) or ("" in names and len(names) > 1) or (camera >= len(names)).any():
             raise CodecError(f"correct_poses: cameras {names} must differ, and each pose be of one of them")
         if len(set(zip(camera.tolist(), stamps.tolist(), strict=True))) < len(stamps):
@@ -184,7 +181,7 @@ class LiveCorrection:
     def _advance(self, frames: int) -> None:
         try:
             self._pipeline.advance_correction(frames)
-        except MapError as error:  # given up and kept as ``failure``; mapping goes on
+        except MapError as error:  # given up and kept as ``failure``; mapping continues
             _log.warning("map_stays_uncorrected", reason=str(error))
 
     def _follow(self, session: MapSession | None) -> None:

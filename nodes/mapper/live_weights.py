@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Self
 
 import structlog
-from msgspec import to_builtins
-from msgspec.structs import replace
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint
@@ -22,16 +19,17 @@ from semantic_mapper.mapping.views.weights_check import FieldTrial
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER, file_of_version, keep_offer, read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
+from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.queries.questions import Weights, WeightsEntry
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate, digest_of
-from semantic_mapper.transport.query_messages import WeightsEntry
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 COMPARED = 4  # frames of the session, well spread, in which new weights are compared with the map
 MAX_PAUSE_S = 5.0  # the first look may compile
-MAX_SHARE = 0.1  # of the mapper's time that looking at new weights may take; the pause after a long look is longer
-KEPT = 8  # versions whose files are kept, beside those that the mapper was started with
+MAX_FRACTION = 0.1  # of the mapper's time that looking at new weights may take; the pause after a long look is longer
+KEPT = 8  # versions whose files are kept, in addition to those that the mapper was started with
 LISTED = 64  # versions that are listed
 _WAITING = 2  # offers, of some 20 MB each
 _NOTE = "weights"  # for the process that takes over when this one is killed
@@ -59,58 +57,31 @@ class _Answer:
     contradicts: bool = False
 
 
-@contextmanager
-def taking_weights(
-    context: NodeContext, options: MapperOptions, bundle: Mapper, publisher: Publisher
-) -> Iterator[LiveWeights | None]:
-    """What takes the weights of the learner that ``options`` name; None where they name none.
+class LiveWeights:
+    """Takes, refuses and lists weights, and goes back to earlier ones. A context manager.
+
+    Args:
+        context: Of the mapper's node.
+        options: Of the mapper, with its learner.
+        bundle: What the mapper was started with.
+        publisher: Reports which weights are in use.
 
     Raises:
         TransportError: no endpoint.
     """
-    if not options.learner:
-        yield None
-        return
-    with LosslessSubscriber(context.endpoint(options.learner), ("weights",), hwm=_WAITING) as offers:
-        weights = LiveWeights(context, bundle, Path(options.out) / FOLDER, options.min_map_agreement, publisher, offers)
-        try:
-            yield weights
-        finally:
-            weights.close()
 
-
-class LiveWeights:
-    """Takes, refuses and lists weights, and goes back to earlier ones.
-
-    Args:
-        context: Of the mapper's node.
-        bundle: What the mapper was started with.
-        folder: For the files of what it is offered.
-        min_map_agreement: With what the map is sure of, in 0..1; less is refused.
-        publisher: Reports which weights are in use.
-        offers: Of the learner.
-    """
-
-    def __init__(
-        self,
-        context: NodeContext,
-        bundle: Mapper,
-        folder: Path,
-        min_map_agreement: float,
-        publisher: Publisher,
-        offers: LosslessSubscriber,
-    ) -> None:
+    def __init__(self, context: NodeContext, options: MapperOptions, bundle: Mapper, publisher: Publisher) -> None:
         self._context = context
         self._bundle = bundle
-        self._folder = folder
-        self._least_agreement = min_map_agreement
+        self._folder = Path(options.out) / FOLDER
+        self._least_agreement = options.min_map_agreement
         self._publisher = publisher
-        self._offers = offers
+        self._offers = LosslessSubscriber(context.endpoint(options.learner), ("weights",), hwm=_WAITING)
         self._lock = threading.Lock()  # of what requests see and change: versions, counts, the one requested
-        self._versions = {0: _entry(0, digest_of(bundle.weights_path.read_bytes()), "in use")}
+        self._versions = {0: WeightsEntry(0, digest_of(bundle.weights_path.read_bytes()), "in use")}
         self._in_use = 0
         self._requested: int | None = None
-        self._counts = {"weights_taken": 0, "weights_refused": 0, "weights_rolled_back": 0}
+        self._counts = {"taken": 0, "refused": 0, "rolled_back": 0}
         self._newest = 0
         self._answer = _Answer()
         self._task: _Task | None = None
@@ -119,18 +90,23 @@ class LiveWeights:
         self._restore()
         self._report()
 
-    @property
-    def counters(self) -> dict[str, int]:
+    def status(self) -> PartStatus:
         """For the mapper's status."""
-        return {"weights_version": self._in_use, **self._counts}
-
-    @property
-    def degraded(self) -> tuple[str, ...]:
-        """What does not work as it should, for the mapper's status."""
         refused = self._answer.judged and not self._answer.accepted
-        return (f"weights {self._answer.judged} were refused: {self._answer.reason}",) if refused else ()
+        warnings = (f"weights {self._answer.judged} were refused: {self._answer.reason}",) if refused else ()
+        counters = {f"weights_{name}": count for name, count in self._counts.items()}
+        return PartStatus({"weights_version": self._in_use, **counters}, warnings)
 
-    def carry_on(self, session: MapSession | None, *, mapped: bool) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+        self._offers.close()
+
+    def advance(self, session: MapSession | None, *, mapped: bool) -> None:
         """Receive an offer, and do one small piece of the work; for the mapper's thread.
 
         Args:
@@ -154,7 +130,7 @@ class LiveWeights:
         except (SemanticMapperError, OSError) as error:
             self._end_task(task, str(error))
         now = time.monotonic()
-        self._pause_until = now + min((now - began) / MAX_SHARE, MAX_PAUSE_S)
+        self._pause_until = now + min((now - began) / MAX_FRACTION, MAX_PAUSE_S)
 
     def offer(self, update: WeightsUpdate) -> None:
         """Begin to look at weights; unfinished earlier ones are refused."""
@@ -165,7 +141,6 @@ class LiveWeights:
             score=update.score,
             parent_score=update.parent_score,
             keyframes=update.keyframes,
-            reason="",
         )
         if update.version <= self._newest:
             known = self._versions.get(update.version)
@@ -181,26 +156,23 @@ class LiveWeights:
         reading = self._reader.submit(keep_offer, update, self._folder, self._bundle.checkpoint)
         self._task = _Task(entry, reading, requested=False)
 
-    def describe(self) -> dict[str, Any]:
-        """Fields of a ``WeightsAnswer``; for any thread."""
+    def describe(self) -> Weights:
+        """Which weights there are; for any thread."""
         with self._lock:
             requested = self._requested
             if requested is None and self._task is not None and self._task.requested:
                 requested = self._task.version.version
             earlier = [n for n, v in self._versions.items() if v.state == "earlier" and n < self._in_use]
-            return {
-                "in_use": self._in_use,
-                "before": max(earlier, default=None),
-                "wanted": requested,
-                "entries": tuple(self._versions.values()),
+            return Weights(
+                in_use=self._in_use,
+                before=max(earlier, default=None),
+                wanted=requested,
+                versions=tuple(self._versions.values()),
                 **self._counts,
-            }
+            )
 
-    def ask_for(self, number: int) -> dict[str, Any]:
+    def return_to(self, number: int) -> Weights:
         """Request weights that were in use before; for any thread.
-
-        Returns:
-            As ``describe``.
 
         Raises:
             MapError: no such weights, or they were never in use.
@@ -214,22 +186,22 @@ class LiveWeights:
                 self._requested = number
         return self.describe()
 
-    def close(self) -> dict[str, Any]:
+    def close(self) -> Weights:
         """End the thread; unfinished weights are refused. Harmless when repeated.
 
         Returns:
-            What became of all that was offered, as plain data.
+            What became of all that was offered.
         """
         self._drop_task("the mapper ends")
         self._reader.shutdown(wait=True, cancel_futures=True)
-        return to_builtins(self.describe())
+        return self.describe()
 
     def _restore(self) -> None:
         """After a restart, go back to the weights that were in use, as if a person had requested them."""
         number, _, digest = self._context.note(_NOTE).partition(" ") if self._context.restarts else ("", "", "")
         if number not in ("", "0") and file_of_version(self._folder, int(number)).exists():
             self._requested = self._newest = int(number)
-            self._versions[self._newest] = _entry(self._newest, digest, "earlier")
+            self._versions[self._newest] = WeightsEntry(self._newest, digest, "earlier")
 
     def _begin_return(self, number: int) -> None:
         self._drop_task("older ones were requested")
@@ -256,7 +228,7 @@ class LiveWeights:
         agreement = task.trial.agreement
         if agreement is not None and agreement < self._least_agreement:
             found = f"where the map is sure of itself, they agree with {agreement:.2f} of it"
-            wanted = f"at least {self._least_agreement:g} is wanted (min_map_agreement)"
+            wanted = f"at least {self._least_agreement:g} is required (min_map_agreement)"
             self._end_task(task, f"{found}; {wanted}", contradicts=True)
             return
         task.trial.exchange()
@@ -273,7 +245,7 @@ class LiveWeights:
             self._in_use = number
             self._versions[before] = replace(self._versions[before], state="rolled back" if back else "earlier")
             self._versions[number] = replace(task.version, state="in use")
-            self._counts["weights_rolled_back" if back else "weights_taken"] += 1
+            self._counts["rolled_back" if back else "taken"] += 1
             self._forget()
         if not task.requested:
             self._answer = _Answer(number, accepted=True)
@@ -302,7 +274,7 @@ class LiveWeights:
         self._answer = _Answer(entry.version, accepted=False, reason=reason, contradicts=contradicts)
         with self._lock:
             self._versions.setdefault(entry.version, replace(entry, reason=reason[:512]))
-            self._counts["weights_refused"] += 1
+            self._counts["refused"] += 1
             self._forget()
         _log.warning("weights_refused", version=entry.version, reason=reason)
         self._report()
@@ -326,11 +298,7 @@ class LiveWeights:
             self._answer.judged,
             self._answer.accepted,
             self._answer.reason,
-            self._counts["weights_rolled_back"],
+            self._counts["rolled_back"],
             self._answer.contradicts,
         )
         self._publisher.publish(encode(in_use))
-
-
-def _entry(number: int, digest: str, state: Any) -> WeightsEntry:
-    return WeightsEntry(version=number, digest=digest, state=state, score=0.0, parent_score=0.0, keyframes=0, reason="")

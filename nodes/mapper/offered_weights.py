@@ -10,7 +10,7 @@ from semantic_mapper.fields.learned import encode_alike
 from semantic_mapper.files import atomic_path
 from semantic_mapper.transport.messages import WeightsUpdate, digest_of
 
-FOLDER = "weights"  # beside the map
+FOLDER = "weights"  # next to the map
 
 
 def file_of_version(folder: Path, number: int) -> Path:

@@ -1,9 +1,9 @@
-"""How a mapper that replaces a killed one goes on from its map, and how maps of earlier launches are kept."""
+"""How a mapper that replaces a killed one resumes its map, and how maps of earlier launches are kept."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import structlog
 
-from semantic_mapper.config import MapperConfig, VoxelMapConfig
+from semantic_mapper.config import MapperConfig, VoxelMapConfig, read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -32,10 +32,10 @@ _RESULTS = (
 _log = structlog.get_logger(__name__)
 
 
-def take_up(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
+def resume_map(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
     """In a restarted mapper, make ``voxel_map`` the one that its forerunner has saved in the course of this launch.
 
-    Frames come with poses in the same world as before, so a saved map goes on as if the frames after it had never come.
+    Poses are of the same session as before, so a saved map continues as if the frames after it had not come.
     A saved map that cannot be gone on with is put aside, so that nothing is written over it.
 
     Args:
@@ -61,14 +61,14 @@ def take_up(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
         except MapError as error:
             why = str(error)
         else:
-            _log.info("map_taken_up", map=str(path), frames=voxel_map.frames, blocks=voxel_map.block_count)
+            _log.info("map_resumed", map=str(path), frames=voxel_map.frames, blocks=voxel_map.block_count)
             return f"the mapper was restarted and went on from the map saved after {voxel_map.frames} frames"
     kept = _put_aside(context, path) if earlier and _identity(path) not in (earlier, _NO_FILE) else ""
-    _log.warning("map_begun_anew", reason=why)
+    _log.warning("empty_map_begun", reason=why)
     return f"the mapper was restarted and began an empty map: {why}{kept}"
 
 
-def go_on(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
+def continue_map(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
     """Make ``voxel_map`` the saved one, unless it was taken up already.
 
     Raises:
@@ -88,28 +88,30 @@ def go_on(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
             f"{name}: has nothing to find oneself by: it was made without depth, by an older release, or with "
             "keyframes.save_places = false; map its log again, or begin a new map"
         )
-    _log.info("going_on", map=name, frames=voxel_map.frames, places=len(voxel_map.places))
+    _log.info("map_continued", map=name, frames=voxel_map.frames, places=len(voxel_map.places))
 
 
-def stored_settings(config: MapperConfig, given: Collection[str], path: Path) -> MapperConfig:
-    """The settings of a run that goes on in a saved map: what its data means is the map's, the rest is this run's.
+def stored_settings(config: MapperConfig, path: Path | None, voxel_size_m: float, saved: Path) -> MapperConfig:
+    """The settings of a run that continues a saved map: what its data means is the map's, the rest is this run's.
 
     Args:
         config: Of this run.
-        given: Names in ``voxel_map`` that the user has set: they are not replaced, so that they may be refused.
-        path: The map.
+        path: The TOML file that it comes from: what stands there is not replaced, so that it may be refused.
+        voxel_size_m: The same, given by itself; 0 = not given.
+        saved: The map.
 
     Raises:
         MapError: it cannot be read.
     """
-    with open_map(path) as reader:
-        saved = reader.manifest.config
-    kept = {name: getattr(saved, name) for name in VoxelMapConfig.stored if name not in given}
+    given = {*(read_toml(path).get("voxel_map", {}) if path else ()), *(("voxel_size_m",) if voxel_size_m else ())}
+    with open_map(saved) as reader:
+        stored = reader.manifest.config
+    kept = {name: getattr(stored, name) for name in VoxelMapConfig.stored if name not in given}
     return msgspec.structs.replace(config, voxel_map=msgspec.structs.replace(config.voxel_map, **kept))
 
 
 def note_worlds(context: NodeContext, known: Mapping[int, Float64]) -> None:
-    """Leave word of where worlds lie in the map, for a mapper that takes it up."""
+    """Note where sessions lie in the map, for a mapper that resumes it."""
     plain = {str(world): T.ravel().tolist() for world, T in known.items()}
     context.try_to_leave_note(_WORLDS, json.dumps(plain), "a mapper that replaces it has to look for the camera again")
 
@@ -122,7 +124,7 @@ def noted_worlds(context: NodeContext) -> dict[int, Float64]:
 
 def forbid(context: NodeContext, why: str) -> bool:
     """From now on a saved map is not to be gone on with; False where that cannot be noted."""
-    return context.try_to_leave_note(_UNSOUND, why, "a mapper that replaces it goes on from a map that it should not")
+    return context.try_to_leave_note(_UNSOUND, why, "a mapper that replaces it resumes a map that it should not")
 
 
 def keep_earlier(context: NodeContext, path: Path) -> None:

@@ -19,9 +19,8 @@ from semantic_mapper.nodes.bridge.packing import thinned, thinning
 from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import Streams
-from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.graph import GraphTracker, find_graph
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import BlockAges, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.exporters.rerun_layout import rr
 from semantic_mapper.replay.exporters.rerun_log import RerunLog

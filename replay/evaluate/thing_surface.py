@@ -13,9 +13,9 @@ from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import check_room_for_scipy
-from semantic_mapper.queries.class_surface import class_surface
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.surface import class_surface
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 AT_SURFACE = 2.0  # voxels that a pixel of the map's surface is from a surface voxel at most

@@ -28,7 +28,8 @@ from semantic_mapper.nodes.launcher.launcher import process_stats
 from semantic_mapper.nodes.launcher.processes import NodeProcess
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.transport.codec import decode, decode_request, encode, encode_frame, unpack_parts
+from semantic_mapper.queries.questions import decode_question
+from semantic_mapper.transport.codec import decode, encode, encode_frame, unpack_parts
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
@@ -44,7 +45,7 @@ def bad_messages(target: str, seed: int, count: int = POOL) -> list[list[bytes]]
     """Structured mutations of real messages, and noise, all of which have to be refused."""
     rng = random.Random(seed)
     seeds = TARGETS[target].seeds()
-    accepts = {"message": decode, "question": decode_request, "pose": decode_pose}[target]
+    accepts = {"message": decode, "question": decode_question, "pose": decode_pose}[target]
     found: list[list[bytes]] = []
     while len(found) < count:
         if rng.random() < 0.2:

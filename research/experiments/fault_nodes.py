@@ -84,7 +84,7 @@ def _hit(launch: LiveLaunch, node: str, fault: Callable[[int, LiveLaunch], str])
         back_s, lost_frames = launch.camera.first_after("frame", started_s)
     else:
         back_s, lost_frames = launch.mapper.first_after("map", started_s)
-        taken = re.findall(r"blocks=(\d+) frames=(\d+)", told.wait("map_taken_up|map_begun_anew", began_s)[1])
+        taken = re.findall(r"blocks=(\d+) frames=(\d+)", told.wait("map_resumed|empty_map_begun", began_s)[1])
         if saved is not None:
             lost_blocks = max(0, int(saved[1][1]) - int(taken[0][0] if taken else 0))
             counts = {"blocks had been saved": int(saved[1][1])}

@@ -11,11 +11,12 @@ import os
 import random
 import struct
 import tempfile
+import types
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgpack
 import numpy as np
@@ -23,40 +24,39 @@ from mcap.opcode import Opcode
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.labels import NYU40
+from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED
+from semantic_mapper.queries.questions import QUESTIONS, WeightsEntry, decode_question
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.transport import codec
 from semantic_mapper.transport.codec import pack_parts, unpack_parts
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, LabelSetForm, Status, StreamInfo
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
-from semantic_mapper.transport.query_messages import QUESTIONS, Answer, Request, WeightsEntry, array_forms
+from semantic_mapper.transport.query_messages import (
+    MapState,
+    decode_answer,
+    encode_answer,
+    encode_error,
+    encode_request,
+    read_name,
+)
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 Spoil = Callable[[bytes], bytes]
-QueryT = TypeVar("QueryT", bound=Request | Answer)
 _CAMERA = CameraIntrinsics(6.5, 6.0, 3.5, 2.5, 8, 6)
 _MAGIC_BYTES = 8
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
-# What fields of questions and answers may hold.
+# What fields of questions and answers hold; others get a value of their type.
 _VALUES: dict[str, Any] = {
-    **dict.fromkeys(("class_name", "id", "map_id", "failure"), "chair"),
-    **dict.fromkeys(("point", "lower", "xyz", "origin_m"), (0.0, 0.0, 0.0)),
-    **dict.fromkeys(("up", "upper"), (0.0, 0.0, 1.0)),
-    **dict.fromkeys(("max_m", "voxel_size_m", "truncation_voxels", "distance_m", "confidence"), 0.5),
-    **dict.fromkeys(("since", "newest", "version", "epoch", "blocks", "used", "left_out", "done", "total"), 3),
-    **dict.fromkeys(("completed", "poses", "frozen", "lost", "map_epoch"), 1),
-    **dict.fromkeys(("found", "running"), True),
-    **dict.fromkeys(("in_use", "before", "wanted", "to", "weights_taken"), 1),
-    **dict.fromkeys(("weights_refused", "weights_rolled_back"), 0),
-    "entries": (
-        WeightsEntry(
-            version=1, digest="0" * 64, state="in use", score=0.7, parent_score=0.5, keyframes=8, reason="better"
-        ),
-    ),
+    "up": (0.0, 0.0, 1.0),
+    "label_set": NYU40,
+    "state": "in use",
+    "versions": (WeightsEntry(1, "0" * 64, "in use", 0.7, 0.5, 8, "better"),),
     "cameras": ("front",),
-    "label_set": LabelSetForm.of(NYU40),
+    "cleared": NONE_CLEARED,
 }
+_CLASS_VARS = (ClassVar[bool],)
 _STRANGE = (None, True, -1, 0, 2**63 - 1, 2**64 - 1, 1.5, float("nan"), "", "x" * 5000, b"\0\xff", [], [[[]]], {})
 
 
@@ -127,34 +127,45 @@ def _read_message(data: bytes) -> None:
             continue
 
 
-def _filled(kind: type[QueryT]) -> QueryT:
-    """A question or an answer, with arrays of the right form."""
-    forms = array_forms(kind)
-    arrays = {name: np.zeros((2,) * form.free + form.tail, form.dtype) for name, form in forms.items()}
-    return kind(**{**{name: value for name, value in _VALUES.items() if name in kind.__struct_fields__}, **arrays})
+def _example(name: str, hint: Any) -> Any:
+    """A value of a field of a question or an answer."""
+    if get_origin(hint) is np.ndarray:
+        return np.zeros((2, 3), get_args(get_args(hint)[1])[0])
+    if name in _VALUES:
+        return _VALUES[name]
+    if get_origin(hint) in (Union, types.UnionType):
+        return _example(name, next(part for part in get_args(hint) if part is not types.NoneType))
+    if get_origin(hint) is Annotated:
+        return _example(name, get_args(hint)[0])
+    if get_origin(hint) is tuple:
+        return tuple(_example("", part) for part in get_args(hint))
+    if hint in (int, float, bool, str):
+        return hint(1)
+    fields = {key: part for key, part in get_type_hints(hint, include_extras=True).items() if part not in _CLASS_VARS}
+    return hint(**{key: _example(key, part) for key, part in fields.items()})
 
 
 def _questions() -> list[bytes]:
     """One of each kind."""
-    return [pack_parts(codec.encode_request(kind, _filled(question.request))) for kind, question in QUESTIONS.items()]
+    return [pack_parts(encode_request(kind, _example("", question.request))) for kind, question in QUESTIONS.items()]
 
 
 def _read_question(data: bytes) -> None:
-    parts = unpack_parts(data)
-    codec.decode_request(parts)
+    decode_question(unpack_parts(data))
 
 
 def _answers() -> list[bytes]:
     """One to each kind of question, and an error."""
-    good = [codec.encode_answer(kind, _filled(question.answer)) for kind, question in QUESTIONS.items()]
-    return [pack_parts(parts) for parts in (*good, codec.encode_error(MapError("no such class")))]
+    state = MapState("map", 3, 1)
+    good = [encode_answer(kind, state, _example("", question.answer)) for kind, question in QUESTIONS.items()]
+    return [pack_parts(parts) for parts in (*good, encode_error(MapError("no such class")))]
 
 
 def _read_answer(data: bytes) -> None:
     parts = unpack_parts(data)
-    kind = bytes(parts[0][:32]).decode("ascii", errors="replace") if parts else ""
-    kind = kind if kind in QUESTIONS else next(iter(QUESTIONS))
-    codec.decode_answer(kind, QUESTIONS[kind].answer, parts)
+    name = read_name(parts)
+    name = name if name in QUESTIONS else "at"
+    decode_answer(name, QUESTIONS[name].answer, parts)
 
 
 def _poses() -> list[bytes]:

@@ -80,7 +80,7 @@ class _Names:
         self._taken: list[tuple[float, float, float, float]] = []
 
     def take(self, at: tuple[float, float], text: str, lines: float, *, centred: bool = False) -> bool:
-        """Take room for a name beside a point, or around it; False where another name stands there."""
+        """Take room for a name next to a point, or around it; False where another name stands there."""
         width, height = self._letter_m * len(text), 2 * self._letter_m * lines
         left, low = (at[0] - width / 2, at[1] - height / 2) if centred else at
         free = all(left >= b[2] or left + width <= b[0] or low >= b[3] or low + height <= b[1] for b in self._taken)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -19,12 +21,9 @@ from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_direction
-from semantic_mapper.queries.class_surface import ClassSurface, class_surface
-from semantic_mapper.queries.components import Components, components_of, find_components
-from semantic_mapper.queries.oriented_box import OrientedBox, upright_box
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import surface_voxels
-from semantic_mapper.types import Bool, Float64, Int32, Int64
+from semantic_mapper.queries.surface import ClassSurface, class_surface, surface_voxels
+from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8
 
 MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
 SURE_VOXELS = 200  # smaller things are wrong more often
@@ -327,3 +326,124 @@ def _changed(fresh: NDArray[np.bool_], start: Int64, component: Int64, count: in
     changed = np.zeros(count + 1, np.bool_)  # the last is for voxels without a component
     changed[component[np.repeat(fresh, np.diff(start))]] = True
     return changed[:count]
+
+
+class Components(NamedTuple):
+    """C components of N surface voxels.
+
+    Args:
+        component: (N,) int64 0..C-1, numbered in the order of their first voxels; -1 = in a piece that is too small.
+        order: (M,) int64 voxels of the first component, ascending, then those of the second, and so on.
+        ends: (C,) int64 where in ``order`` each component ends.
+    """
+
+    component: NDArray[np.int64]
+    order: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+
+def find_components(surface: ClassSurface, min_voxels: int) -> Components:
+    """Surface voxels of one class that touch by face, edge or corner; pieces of fewer voxels are left out."""
+    count = len(surface.voxel)
+    used = np.diff(surface.start) > 0
+    node, first = np.full((int(used.sum()), 512), -1, np.int32), np.empty(count, np.int64)
+    connect_voxels(surface.packed, surface.start, surface.voxel, surface.label, np.cumsum(used) - 1, node, first)
+    return _kept(first, min_voxels)
+
+
+def components_of(number: NDArray[np.int64], min_voxels: int) -> Components:
+    """Surface voxels (N,) of the same number, whether they touch or not; -1 belongs to none."""
+    _, index, inverse = np.unique(number, return_index=True, return_inverse=True)
+    return _kept(index[inverse.reshape(-1)], min_voxels, number >= 0)
+
+
+def _kept(first: NDArray[np.int64], min_voxels: int, wanted: NDArray[np.bool_] | None = None) -> Components:
+    """The components that are large enough, given the first voxel (N,) of each voxel's; of ``wanted`` (N,) ones."""
+    count = len(first)
+    sizes = np.bincount(first, minlength=count)  # at the first voxel of each component
+    if wanted is not None:
+        sizes = sizes * wanted
+    large = np.flatnonzero(sizes >= min_voxels)
+    number = np.full(count, -1, np.int64)
+    number[large] = np.arange(len(large))
+    component = number[first]
+    kept = np.flatnonzero(component >= 0)
+    # Numpy sorts integers of 16 bits, which nearly always suffice, much faster than longer ones.
+    order = kept[np.argsort(component[kept].astype(np.min_scalar_type(len(large))), kind="stable")]
+    return Components(component, order, np.cumsum(sizes[large]))
+
+
+@kernel
+def connect_voxels(
+    packed: Int64, start: Int64, voxel: Int32, label: UInt8, used: Int64, node: Int32, first: Int64
+) -> None:
+    """Write the first voxel of each voxel's component (N,): union-find over 26 neighbours.
+
+    Args:
+        packed, start, voxel, label: Of a ``ClassSurface``.
+        used: (B,) number of each block among the U that have voxels.
+        node: (U, 512) scratch, -1.
+        first: (N,) written.
+    """
+    ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OrientedBox:
+    """A box that stands upright.
+
+    Args:
+        center: (3,) float64 world metres.
+        size: (3,) float64 metres along its own axes: x the longer level side, y the shorter, z along up.
+        R_world_box: (3, 3) float64, columns are its axes in the world.
+    """
+
+    center: Float64
+    size: Float64
+    R_world_box: Float64
+
+
+def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
+    """The box round points that is level and has the least floor area; one of its sides lies on their hull.
+
+    Args:
+        xyz: (N, 3) points, N > 0.
+        up: (3,) unit vector.
+    """
+    frame = _level_frame(up)
+    middle = xyz.mean(axis=0)
+    plan = (xyz - middle) @ frame
+    hull = cv2.convexHull(plan[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
+    yaw = _best_yaw(hull)
+    if np.diff(np.ptp(plan[:, :2] @ _turn(yaw), axis=0))[0] > 0:
+        yaw += np.pi / 2
+    R = frame.copy()
+    R[:, :2] = frame[:, :2] @ _turn(yaw)
+    own = (xyz - middle) @ R
+    low, high = own.min(axis=0), own.max(axis=0)
+    return OrientedBox(middle + R @ ((low + high) / 2), high - low, R)
+
+
+def _level_frame(up: Float64) -> Float64:
+    """A right-handed rotation (3, 3) whose third column is ``up``; the identity for up = z."""
+    ux, uy, uz = up
+    x = np.array((uz, 0.0, -ux) if abs(uy) < 0.9 else (-uy, ux, 0.0))
+    x /= np.linalg.norm(x)
+    y = np.array((uy * x[2] - uz * x[1], uz * x[0] - ux * x[2], ux * x[1] - uy * x[0]))
+    return np.stack((x, y, up), axis=1)
+
+
+def _turn(yaw: float) -> Float64:
+    """(2, 2) whose columns are the axes turned by ``yaw``."""
+    return np.array(((np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))))
+
+
+def _best_yaw(hull: Float64) -> float:
+    """Of the directions of a hull's (N, 2) sides, below 90 degrees, the one with the least area; the smaller of two."""
+    sides = np.roll(hull, -1, axis=0) - hull
+    yaws = [math.atan2(y, x) % (math.pi / 2) for x, y in sides if x or y]
+    if not yaws:  # one point
+        return 0.0
+    c, s = np.array([[math.cos(yaw)] for yaw in yaws]), np.array([[math.sin(yaw)] for yaw in yaws])
+    along, across = hull[:, 0] * c + hull[:, 1] * s, hull[:, 1] * c - hull[:, 0] * s  # (sides, N)
+    return min(zip(np.ptp(along, axis=1) * np.ptp(across, axis=1), yaws, strict=True))[1]

@@ -1,4 +1,4 @@
-"""What a camera or a ray meets: the map's own way of walking along rays (``march`` of ray_casting.h) on a snapshot."""
+"""What a ray meets: the map's own way of walking along rays (``march`` of ray_casting.h) on a snapshot."""
 
 from __future__ import annotations
 
@@ -8,19 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.geometry import check_pose
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.checks import (
     as_numbers,
     check_direction,
     check_points,
     check_positive,
-    voxel_coordinates,
 )
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
 MAX_RANGE_M = 100.0  # beyond, a ray through nothing takes long
 
@@ -62,51 +59,9 @@ def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, 
         raise MapError(f"cast_rays: {len(origin)} origins and {len(direction)} directions do not go together")
     count = max(len(origin), len(direction)) if len(origin) and len(direction) else 0
     origin, direction = np.broadcast_to(origin, (count, 3)), np.broadcast_to(direction, (count, 3))
-    return _cast(snapshot, origin, direction, max_m)
-
-
-def ray_cast(
-    snapshot: MapSnapshot, T_world_camera: Float64, intrinsics: CameraIntrinsics, max_m: float = 10.0
-) -> MapView:
-    """The map as a camera would see it up to z = ``max_m``; as ``VoxelMap.ray_cast``, with classes of single voxels.
-
-    A picture needs no metres: without a known scale, pose, depth and range are in the map's own unit.
-
-    Args:
-        snapshot: The map.
-        T_world_camera: (4, 4) float64.
-        intrinsics: Of the view wanted; pixel centres are integers.
-        max_m: At most 100.
-
-    Raises:
-        PoseError: the pose is not a rigid transform.
-        MapError: a camera beyond the reach of a map, or a range out of bounds.
-    """
-    check_pose(T_world_camera, "ray_cast")
-    height, width = intrinsics.height, intrinsics.width
-    v, u = np.indices((height, width))
-    d_camera = np.stack(
-        ((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(v.shape)), -1
-    )
-    direction = d_camera.reshape(-1, 3) @ T_world_camera[:3, :3].T  # of unit z: distances along it are depths
-    origin = voxel_coordinates(T_world_camera[None, :3, 3], snapshot, "T_world_camera")
-    hits = _cast(snapshot, np.broadcast_to(origin, direction.shape), direction, max_m)
-    size = (height, width)
-    return MapView(
-        hits.distance_m.reshape(size),
-        hits.rgb.reshape(*size, 3),
-        hits.label.reshape(size),
-        hits.confidence.reshape(size),
-        None if hits.measured is None else hits.measured.reshape(size),
-    )
-
-
-def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: float) -> RayHits:
-    """``origin`` (N, 3) in voxels, ``direction`` (N, 3) in metres a unit of the result."""
     if check_positive(max_m, "max_m") > MAX_RANGE_M:
         raise MapError(f"max_m must be at most {MAX_RANGE_M:g}, got {max_m}")
     step = np.ascontiguousarray(direction / snapshot.voxel_size_m)
-    count = len(step)
     distance, slot, voxel = np.empty(count, np.float32), np.empty(count, np.int64), np.empty(count, np.int64)
     march_rays(
         np.ascontiguousarray(origin),
@@ -123,15 +78,6 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
     return RayHits(distance, label, confidence, rgb, snapshot.measured(slot, voxel))
 
 
-def nearest_corners(points: Float64, snapshot: MapSnapshot) -> tuple[Int64, Int64]:
-    """Slot (-1 = none) and voxel (N,) of the observed voxel nearest to points (N, 3), units of voxels, among the eight
-    round each; of those with votes if any has some."""
-    points = np.ascontiguousarray(points)
-    slot, voxel = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
-    find_nearest_corners(points, snapshot.index, snapshot.voxels, slot, voxel)
-    return slot, voxel
-
-
 @kernel
 def march_rays(
     origins: Float64,
@@ -144,7 +90,8 @@ def march_rays(
     slots: Int64,
     chosen: Int64,
 ) -> None:
-    """Write distances (N,), 0 = miss, and what ``nearest_corners`` gives for the places that were hit.
+    """Write distances (N,), 0 = miss, and the observed voxel nearest to each place that was hit, among the eight round
+    it; of those with votes if any has some.
 
     Args:
         origins: (N, 3) in units of voxels.
@@ -154,10 +101,4 @@ def march_rays(
         index, voxels: Of the snapshot.
         distance, slots, chosen: (N,) written.
     """
-    ...
-
-
-@kernel
-def find_nearest_corners(points: Float64, index: BlockIndex, voxels: BlockVoxels, slots: Int64, chosen: Int64) -> None:
-    """Write slots and voxels (N,); see ``nearest_corners``."""
     ...

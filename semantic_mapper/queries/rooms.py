@@ -184,9 +184,9 @@ def _passages(room: Int64, clearance: Float64) -> tuple[Passage, ...]:
 
 
 def _touching(room: Int64, a: int, b: int) -> NDArray[np.bool_]:
-    """Cells (H, W) of room ``a`` that have one of room ``b`` beside them."""
-    beside = np.zeros(room.shape, np.bool_)
+    """Cells (H, W) of room ``a`` that have one of room ``b`` next to them."""
+    adjacent = np.zeros(room.shape, np.bool_)
     for here, there in _NEIGHBOURS:
-        beside[here] |= room[there] == b
-        beside[there] |= room[here] == b
-    return beside & (room == a)
+        adjacent[here] |= room[there] == b
+        adjacent[there] |= room[here] == b
+    return adjacent & (room == a)

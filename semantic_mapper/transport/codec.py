@@ -1,15 +1,14 @@
-"""The one codec of wire and log: messages, questions and answers <-> multipart ``[name, msgpack header, buffers...]``.
+"""The one codec of wire and log: messages <-> multipart ``[topic, msgpack header, buffers...]``.
 
-What encodes and decodes raises nothing but ``CodecError``; only ``decode_answer`` raises what the answer says. Every
-size is bounded and checked before anything is allocated by it. Decoded arrays are fresh and writable. In a log a
-message is a msgpack array of binaries, which any msgpack reader opens.
+What encodes and decodes raises nothing but ``CodecError``. Every size is bounded and checked before anything is
+allocated by it. Decoded arrays are fresh and writable. In a log a message is a msgpack array of binaries, which any
+msgpack reader opens. Questions about a map have a codec of their own, ``query_messages``.
 """
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
@@ -17,10 +16,8 @@ import msgpack
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
-from semantic_mapper import errors
-from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
+from semantic_mapper.errors import CodecError, LabelError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.images import (
     CodecOptions,
@@ -33,8 +30,6 @@ from semantic_mapper.transport.images import (
     encode_depth,
     encode_rgb,
     encode_uint8,
-    zstd_compress,
-    zstd_decompress,
 )
 from semantic_mapper.transport.messages import (
     MAX_ENTRIES,
@@ -65,16 +60,6 @@ from semantic_mapper.transport.messages import (
     read_topic,
     topic_bytes,
 )
-from semantic_mapper.transport.query_messages import (
-    MAX_REQUEST_ROWS,
-    QUESTIONS,
-    Answer,
-    ArrayForm,
-    ArraySpec,
-    ErrorAnswer,
-    Request,
-    array_forms,
-)
 from semantic_mapper.types import MAX_PIXELS, MAX_POSE_SIGMA_M, CameraIntrinsics, Float32, MapUpdate, PosedFrame, UInt8
 
 PROTOCOL_VERSION = 1  # raise it when a header changes its meaning; readers refuse what they do not know
@@ -85,18 +70,11 @@ _UPDATE_SCALARS = (
     "stamp_ns seq camera_id fused is_keyframe source_seqs blocks blocks_touched rays samples stage_ms world".split()
 )
 _WeightsBytes = Annotated[int, Meta(ge=1, le=MAX_WEIGHTS_BYTES)]
-_ERROR = "error"  # in the place of an answer's kind
-_RAISED = {
-    e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError, errors.PoseError)
-}
 _BEYOND = re.compile(r"Expected `float` [<>]= \S+e\+308")  # how msgspec says it
 _NOT_SENT_AS_0 = (  # what most messages do not need
     "unreadable",
-    "scale_unknown",
-    "computed",
     "pseudo_label",
     "depth_sigma",
-    "gone",
     "moving",
     "world",
     "T_map_world",
@@ -104,7 +82,6 @@ _NOT_SENT_AS_0 = (  # what most messages do not need
 _Pose = Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)]  # (4, 4) float64 row by row, exact
 
 MessageT = TypeVar("MessageT")
-AnswerT = TypeVar("AnswerT", bound=Answer)
 WireT = TypeVar("WireT")
 
 
@@ -326,15 +303,18 @@ def unpack_header(packed: Buffer, what: str) -> dict[str, Any]:
     return fields
 
 
-def check_header(header: object, kind: type[WireT], what: str) -> WireT:
-    """Plain fields -> a struct or dataclass. Values that are arrays already, or such objects, stay what they are.
+def check_header(
+    header: object, kind: type[WireT], what: str, read: Callable[[Any, object], object] | None = None
+) -> WireT:
+    """Plain fields -> a struct or dataclass. Values that are arrays already, or such objects, stay what they are;
+    ``read`` makes a value of any other type that is not plain from what stands for it.
 
     Raises:
         CodecError: an unknown or missing field, a wrong type, a number out of bounds or not finite, or what
             ``__post_init__`` refuses; names the field.
     """
     try:
-        return msgspec.convert(header, kind)
+        return msgspec.convert(header, kind, dec_hook=read)
     except (ValueError, TypeError, RecursionError, OverflowError) as error:
         raise CodecError(f"{what}: bad header: {_BEYOND.sub('only finite numbers can be sent', str(error))}") from error
 
@@ -535,79 +515,6 @@ def read_envelope(parts: Parts) -> Envelope:
     )
 
 
-def encode_request(kind: str, request: Request) -> list[bytes]:
-    """Question -> parts.
-
-    Args:
-        kind: A key of ``QUESTIONS``.
-        request: Of its type; arrays are converted to the dtypes of their forms.
-
-    Raises:
-        CodecError: too many rows, or a value that cannot be sent.
-    """
-    parts, specs = _encode_query(kind, request, kind)
-    _check_rows(specs, kind)
-    return parts
-
-
-def decode_request(parts: Parts) -> tuple[str, Request]:
-    """Parts -> kind and question.
-
-    Raises:
-        CodecError: anything that ``encode_request`` would not have made.
-    """
-    kind = _query_kind(parts)
-    question = QUESTIONS.get(kind)
-    if question is None:
-        raise CodecError(f"unknown question {kind!r}; there are {', '.join(QUESTIONS)}")
-    fields, specs = _open_query(parts, question.request, kind)
-    _check_rows(specs, kind)
-    return kind, _decode_query(fields, specs, parts, question.request, kind)
-
-
-def encode_answer(kind: str, answer: Answer) -> list[bytes]:
-    """Answer -> parts; see ``encode_request``.
-
-    Raises:
-        CodecError: larger than a message may be, or a value that cannot be sent.
-    """
-    parts, _ = _encode_query(kind, answer, f"answer to '{kind}'")
-    return parts
-
-
-def encode_error(error: SemanticMapperError) -> list[bytes]:
-    """An error in the place of an answer; an overlong text is cut."""
-    text = str(error).encode("utf-8", errors="replace").decode()[:4000]
-    return [_ERROR.encode(), _pack({"error": type(error).__name__, "text": text}, ErrorAnswer, "error")]
-
-
-def decode_answer(kind: str, answer: type[AnswerT], parts: Parts) -> AnswerT:
-    """Parts -> the answer to a question.
-
-    Args:
-        kind: Of the question.
-        answer: The answer type of the question.
-        parts: What came.
-
-    Raises:
-        MapError, LabelError, CodecError, ShapeError, PoseError: the other side answered with this error.
-        TransportError: it answered with another one.
-        CodecError: anything that ``encode_answer`` would not have made, or an answer to another question.
-    """
-    what = f"answer to '{kind}'"
-    actual = _query_kind(parts)
-    if actual == _ERROR:
-        said = check_header(unpack_header(parts[1], what), ErrorAnswer, what)
-        raise _RAISED.get(said.error, TransportError)(said.text)
-    if actual != kind:
-        raise CodecError(f"{what}: got one to {actual!r}")
-    fields, specs = _open_query(parts, answer, what)
-    lengths = {s.shape[: f.free] for f, s in zip(array_forms(answer).values(), specs, strict=False)}
-    if QUESTIONS[kind].aligned and len(lengths) > 1:
-        raise CodecError(f"{what}: arrays of different lengths {sorted(lengths)}")
-    return _decode_query(fields, specs, parts, answer, what)
-
-
 def _pack(header: dict[str, Any], kind: type[object], what: str) -> bytes:
     """A header, checked as its reader will check it."""
     _leave_out_zeros(header)
@@ -621,11 +528,11 @@ def _pack_struct(header: FrameHeader | MapUpdateHeader) -> bytes:
 
 def _read(header: Mapping[str, Any], kind: type[WireT], what: str) -> WireT:
     """Plain fields -> struct; a label set among them becomes what it is in Python."""
-    if header.get("label_set") is not None and kind is not ErrorAnswer:
+    if header.get("label_set") is not None:
         form = check_header(header["label_set"], LabelSetForm, f"{what}: label_set")
         try:
             header = {**header, "label_set": form.to_label_set()}
-        except errors.LabelError as error:
+        except LabelError as error:
             raise CodecError(f"{what}: bad header: {error}") from error
     return check_header(header, kind, what)
 
@@ -774,79 +681,7 @@ def _check_keyframe_size(lens: CameraIntrinsics, parts: Parts, what: str) -> Non
         raise CodecError(f"{what}: {size} bytes in all; a keyframe has at most {MAX_KEYFRAME_BYTES}")
 
 
-def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list[bytes], tuple[ArraySpec, ...]]:
-    forms = array_forms(type(message))
-    arrays: dict[str, NDArray[np.generic]] = {}
-    specs: list[ArraySpec] = []
-    buffers: list[bytes] = []
-    for name, form in forms.items():
-        if form.optional and getattr(message, name) is None:
-            continue
-        array = arrays[name] = np.ascontiguousarray(getattr(message, name), form.dtype)
-        if array.nbytes > MAX_PART_BYTES:  # before it is copied; the rest is checked when all are there
-            raise CodecError(f"{what}: {name} of {array.nbytes} bytes, at most {MAX_PART_BYTES} can be sent")
-        data = array.tobytes()
-        buffers.append(zstd_compress(data) if form.is_compressed else data)
-        specs.append(ArraySpec(array.shape, len(buffers[-1])))
-    _check_specs(forms, specs, what)
-    scalars = {name: getattr(message, name) for name in message.__struct_fields__ if name not in forms}
-    header = to_plain({**scalars, "arrays": specs}, what)
-    check_header({**header, **arrays}, type(message), what)
-    _leave_out_zeros(header)
-    return [kind.encode(), pack_header(header, what), *buffers], tuple(specs)
-
-
 def _leave_out_zeros(header: dict[str, Any]) -> None:
     for name in _NOT_SENT_AS_0:
         if header.get(name, 1) in (0, None):
             del header[name]
-
-
-def _query_kind(parts: Parts) -> str:
-    if not 2 <= len(parts) <= MAX_PARTS:
-        raise CodecError(f"a question or answer has 2 to {MAX_PARTS} parts, got {len(parts)}")
-    return bytes(parts[0][:32]).decode("ascii", errors="replace")
-
-
-def _open_query(parts: Parts, kind: type[object], what: str) -> tuple[dict[str, Any], tuple[ArraySpec, ...]]:
-    """Fields of a header, and the forms of the arrays, which are checked."""
-    fields, forms = unpack_header(parts[1], what), array_forms(kind)
-    specs = check_header(fields.get("arrays", ()), tuple[ArraySpec, ...], f"{what}: arrays")
-    _check_specs(forms, specs, what)
-    if not forms.keys().isdisjoint(fields):
-        raise CodecError(f"{what}: bad header: arrays travel in buffers")
-    return fields, specs
-
-
-def _decode_query(
-    fields: Mapping[str, Any], specs: tuple[ArraySpec, ...], parts: Parts, kind: type[WireT], what: str
-) -> WireT:
-    """Fresh and writable arrays, whose sizes were checked by ``_check_specs``, in a question or answer."""
-    forms = array_forms(kind)
-    buffers = check_buffers(parts, [spec.bytes for spec in specs], what)
-    arrays: dict[str, NDArray[np.generic]] = {}
-    for (name, form), spec, buffer in zip(list(forms.items())[: len(specs)], specs, buffers, strict=True):
-        data = zstd_decompress(buffer, math.prod(spec.shape), f"{what}: {name}") if form.is_compressed else buffer
-        array = np.frombuffer(data, form.dtype).reshape(spec.shape)
-        arrays[name] = array.astype(np.dtype(form.dtype).newbyteorder("="))
-    return check_header({**fields, **arrays}, kind, what)
-
-
-def _check_rows(specs: tuple[ArraySpec, ...], what: str) -> None:
-    for spec in specs:
-        if spec.shape[0] > MAX_REQUEST_ROWS:
-            raise CodecError(f"{what}: {spec.shape[0]} rows; ask for at most {MAX_REQUEST_ROWS} at once")
-
-
-def _check_specs(forms: Mapping[str, ArrayForm], specs: Sequence[ArraySpec], what: str) -> None:
-    needed = sum(not form.optional for form in forms.values())
-    if not needed <= len(specs) <= len(forms):
-        raise CodecError(f"{what}: has the arrays {list(forms)}, got {len(specs)}")
-    for (name, form), spec in zip(forms.items(), specs, strict=False):  # those that are left out stand last
-        if len(spec.shape) != form.free + len(form.tail) or spec.shape[form.free :] != form.tail:
-            raise CodecError(f"{what}: {name} of shape {spec.shape}, expected {('N',) * form.free + form.tail}")
-        size = math.prod(spec.shape) * np.dtype(form.dtype).itemsize
-        if size > MAX_PART_BYTES:
-            raise CodecError(f"{what}: {name} of {size} bytes, at most {MAX_PART_BYTES} are accepted; ask for less")
-        if not form.is_compressed and spec.bytes != size:
-            raise CodecError(f"{what}: {name} of shape {spec.shape} has {size} bytes, the header means {spec.bytes}")

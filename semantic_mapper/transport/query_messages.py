@@ -1,376 +1,208 @@
-"""Questions about a map and their answers: one struct each, whose array fields travel as buffers, and one table."""
+"""Questions about a map and their answers as bytes: three parts, ``[name, msgpack header, arrays]``.
+
+A question is a struct of fields; an answer is any struct or frozen dataclass, as the library's own results are. Where
+one of them has an array, its header says ``{dtype, shape, start, bytes}``: its elements, little-endian and row by row,
+lie in the third part from ``start`` on. Arrays of single bytes are zstd frames there.
+
+Header of a question: its fields. Of an answer: ``map`` (``MapState``) and ``answer``. In the place of an answer may
+come an error, ``["error", header]``. Every size is checked before anything is allocated by it, and whatever is wrong is
+a ``CodecError``.
+"""
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
-from typing import Annotated, Literal, get_type_hints
+import math
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from semantic_mapper.transport.messages import (
-    Count,
-    Digest,
-    Finite,
-    LabelSetForm,
-    PartBytes,
-    Sentence,
-    Stamp,
-    Wire,
-    Word,
-)
-from semantic_mapper.types import Float32, Float64, Int32, Int64, UInt8
+from semantic_mapper import errors
+from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
+from semantic_mapper.transport.codec import check_header, pack_header, unpack_header
+from semantic_mapper.transport.images import zstd_compress, zstd_decompress
+from semantic_mapper.transport.messages import MAX_PART_BYTES, Count, PartBytes, Parts, Sentence, Wire, Word
 
 MAX_REQUEST_ROWS = 1 << 16  # points, rays or poses of one question
-BLOCK_VOXELS = 512
-MAX_WAIT_S = 3600.0  # for an answer, of who does not say
+MAX_WAIT_S = 3600.0  # for an answer, of a client that does not say
 
-Point = tuple[Finite, Finite, Finite]
-DType = Literal["u1", "i1", "<i4", "<i8", "<f4", "<f8"]
+AnswerT = TypeVar("AnswerT")
+RequestT = TypeVar("RequestT", bound="Request[Any]")
+
+_ERROR = "error"  # in the place of an answer's name
+_RAISED = {
+    e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError, errors.PoseError)
+}
 
 
-@dataclass(frozen=True, slots=True)
-class ArrayForm:
-    """What an array must look like.
+class Request(Wire, Generic[AnswerT], frozen=True, kw_only=True):
+    """What every question has; ``AnswerT`` is what answers it.
 
-    Args:
-        dtype: Of its elements; arrays of bytes travel compressed.
-        tail: Its last axes.
-        free: Number of axes before these, of any length.
-        optional: It may be left out (None): it came later, and what does not need it is read by older releases, too.
-            Such fields are the last arrays of their message.
+    ``asker`` is the same for all questions of a client that awaits each answer, through whichever socket; empty = not
+    known. Nobody waits for the answer after ``waits_s``.
     """
 
-    dtype: DType
-    tail: tuple[int, ...] = ()
-    free: int = 1
-    optional: bool = False
+    takes_long: ClassVar[bool] = False  # more than a few milliseconds
+    about_map: ClassVar[bool] = True  # answered from a snapshot, which has to be up to date
 
-    @property
-    def is_compressed(self) -> bool:
-        """Whether its buffer is compressed."""
-        return np.dtype(self.dtype).itemsize == 1
-
-
-Points = Annotated[Float64, ArrayForm("<f8", (3,))]
-Labels = Annotated[UInt8, ArrayForm("u1")]
-Floats = Annotated[Float32, ArrayForm("<f4")]
-Colors = Annotated[UInt8, ArrayForm("u1", (3,))]
-Computed = Annotated[UInt8 | None, ArrayForm("u1", optional=True)]  # 1 where no sensor measured it; None = nowhere
-
-
-@functools.cache
-def array_forms(kind: type) -> dict[str, ArrayForm]:
-    """Array fields of a question or an answer, in the order of their buffers."""
-    hints = get_type_hints(kind, include_extras=True)
-    noted = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-    return {name: notes[0] for name, notes in noted.items() if notes and isinstance(notes[0], ArrayForm)}
-
-
-class ArraySpec(Wire, frozen=True):
-    """One buffer: its array's shape and its size as sent."""
-
-    shape: Annotated[tuple[Annotated[int, Meta(ge=0, le=1 << 31)], ...], Meta(max_length=4)]
-    bytes: PartBytes
-
-
-ArraySpecs = Annotated[tuple[ArraySpec, ...], Meta(max_length=6)]
-
-
-class Request(Wire, frozen=True, kw_only=True):
-    """Of every question; ``arrays`` says how its array fields travel, and is filled in by the codec.
-
-    ``asker`` is the same for all questions of a client that has one at a time, through whichever socket; empty = a
-    stranger. Nobody waits for the answer after ``waits_s``.
-    """
-
-    arrays: ArraySpecs = ()
     asker: Word = ""
     waits_s: Annotated[float, Meta(ge=0, le=MAX_WAIT_S)] = MAX_WAIT_S
 
 
-class Answer(Wire, frozen=True, kw_only=True):
-    """Of every answer: which state of which map it is about.
+class MapState(Wire, frozen=True):
+    """Which state of which map an answer is about.
 
-    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared. With
-    ``scale_unknown`` its lengths are not metres; sent only then.
+    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared.
     """
 
     map_id: Word
     version: Count
     epoch: Count
-    arrays: ArraySpecs = ()
-    scale_unknown: bool = False
 
 
-class InfoRequest(Request, frozen=True, kw_only=True):
-    """What the map is."""
+class _ArraySpec(Wire, frozen=True):
+    dtype: Literal["|b1", "|u1", "|i1", "<i4", "<i8", "<f4", "<f8"]
+    shape: Annotated[tuple[Annotated[int, Meta(ge=0, le=1 << 31)], ...], Meta(min_length=1, max_length=4)]
+    start: PartBytes
+    bytes: PartBytes
 
 
-class InfoAnswer(Answer, frozen=True, kw_only=True):
-    """What the map is."""
-
-    blocks: Count
-    voxel_size_m: Finite
-    truncation_voxels: Finite
-    label_set: LabelSetForm
-
-
-class AtRequest(Request, frozen=True, kw_only=True):
-    """What is at points."""
-
-    points: Points
-    radius_m: Finite | None = None
-
-
-class AtAnswer(Answer, frozen=True, kw_only=True):
-    """``PointAnswers``."""
-
-    label: Labels
-    confidence: Floats
-    distance_m: Floats
-    state: Labels
-    computed: Computed = None
-
-
-class NearestRequest(Request, frozen=True, kw_only=True):
-    """Where the nearest surface of a class is."""
-
-    class_name: Word
-    point: Point
-    min_confidence: Finite = 0.0
-
-
-class NearestAnswer(Answer, frozen=True, kw_only=True):
-    """Where it is; zeros where ``found`` is false."""
-
-    found: bool
-    xyz: Point
-    distance_m: Finite
-    confidence: Finite
-    computed: bool = False  # no sensor measured it; sent only then
-
-
-class RaysRequest(Request, frozen=True, kw_only=True):
-    """What rays meet."""
-
-    max_m: Finite
-    origins: Points
-    directions: Points
-
-
-class RaysAnswer(Answer, frozen=True, kw_only=True):
-    """``RayHits``."""
-
-    distance_m: Floats
-    label: Labels
-    confidence: Floats
-    rgb: Colors
-    computed: Computed = None
-
-
-class BoxRequest(Request, frozen=True, kw_only=True):
-    """Surface points in a box."""
-
-    lower: Point
-    upper: Point
-
-
-class BoxAnswer(Answer, frozen=True, kw_only=True):
-    """``MapPoints``."""
-
-    xyz: Annotated[Float32, ArrayForm("<f4", (3,))]
-    rgb: Colors
-    label: Labels
-    confidence: Floats
-    computed: Computed = None
-
-
-class InstancesRequest(Request, frozen=True, kw_only=True):
-    """Countable things; ``gone``: also those that have gone lately (sent only then)."""
-
-    up: Point
-    gone: bool = False
-
-
-class InstancesAnswer(Answer, frozen=True, kw_only=True):
-    """All things, packed.
-
-    ``numbers``: id, class id, voxels. ``places``: confidence, centroid, box: center, size, R_world_box row by row.
-    ``voxels``: of all things, one behind the other. ``measured``: fraction of each, None = 1. ``gone_ns``: stamp of the
-    frame at which most of each was gone, -1 = it is there; None = that was not asked.
-    """
-
-    numbers: Annotated[Int64, ArrayForm("<i8", (3,))]
-    places: Annotated[Float64, ArrayForm("<f8", (19,))]
-    voxels: Annotated[Int32, ArrayForm("<i4", (3,))]
-    measured: Annotated[Float64 | None, ArrayForm("<f8", optional=True)] = None
-    gone_ns: Annotated[Int64 | None, ArrayForm("<i8", optional=True)] = None
-
-
-class OccupancyRequest(Request, frozen=True, kw_only=True):
-    """Free, occupied or unknown at points."""
-
-    points: Points
-
-
-class OccupancyAnswer(Answer, frozen=True, kw_only=True):
-    """A ``State`` for each point."""
-
-    state: Labels
-
-
-class DistanceRequest(Request, frozen=True, kw_only=True):
-    """Distances to obstacles in a box."""
-
-    lower: Point
-    upper: Point
-    unknown_is_occupied: bool = False
-
-
-class DistanceAnswer(Answer, frozen=True, kw_only=True):
-    """Where its grid lies."""
-
-    origin_m: Point
-    voxel_size_m: Finite
-    distance_m: Annotated[Float32, ArrayForm("<f4", free=3)]
-    state: Annotated[UInt8, ArrayForm("u1", free=3)]
-
-
-class ChangesRequest(Request, frozen=True, kw_only=True):
-    """Blocks changed since a version of the map ``map_id``; of another map, all blocks are sent."""
-
-    since: Count
-    limit: Count = 0  # blocks, see ``VoxelMap.changes``; 0 = all
-    map_id: Word = ""
-
-
-class ChangesAnswer(Answer, frozen=True, kw_only=True):
-    """Where these blocks begin; complete up to ``version``, while the map is at ``newest``."""
-
-    since: Count
-    newest: Count
-    keys: Annotated[Int32, ArrayForm("<i4", (3,))]
-    tsdf: Annotated[NDArray[np.int8], ArrayForm("i1", (BLOCK_VOXELS,))]
-    label: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS,))]
-    confidence: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS,))]
-    rgb: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS, 3))]
-    computed: Annotated[UInt8 | None, ArrayForm("u1", (BLOCK_VOXELS,), optional=True)] = None
-
-
-class CorrectPosesRequest(Request, frozen=True, kw_only=True):
-    """Move the map to corrected poses of its frames; the one request that changes something.
-
-    ``id`` makes it safe to ask again where an answer was lost: of requests with the same one, the first counts.
-    """
-
-    id: Word
-    cameras: Annotated[tuple[Word, ...], Meta(min_length=1, max_length=256)]  # ("",) = whichever took the frame
-    until_ns: Stamp | None = None  # see ``MappingPipeline.correct_poses``
-    within_ns: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 0  # how far from a stamp its frame may be
-    stamps_ns: Annotated[Int64, ArrayForm("<i8")]
-    camera: Labels  # index of ``cameras``
-    poses: Annotated[Float64, ArrayForm("<f8", (4, 4))]
-
-
-class CorrectionRequest(Request, frozen=True, kw_only=True):
-    """How far corrections are."""
-
-
-class CorrectionAnswer(Answer, frozen=True, kw_only=True):
-    """``CorrectionStatus`` of the map itself, which is ahead of the mirror that ``version`` and ``epoch`` speak of."""
-
-    used: Count  # poses of this request; 0 where none were sent
-    left_out: Count  # those of them without a frame
-    running: bool
-    done: Count
-    total: Count
-    completed: Count
-    poses: Count
-    frozen: Count
-    lost: Count
-    failure: Sentence
-    map_epoch: Count
-
-
-class WeightsRequest(Request, frozen=True, kw_only=True):
-    """Which weights there are; with ``to``, go back to these. To ask twice is as to ask once."""
-
-    to: Count | None = None
-
-
-class WeightsEntry(Wire, frozen=True):
-    """Weights that a mapper was started with (version 0) or was offered."""
-
-    version: Count
-    digest: Digest
-    state: Literal["in use", "earlier", "refused", "rolled back"]
-    score: Finite
-    parent_score: Finite
-    keyframes: Count
-    reason: Sentence
-
-
-class WeightsAnswer(Answer, frozen=True, kw_only=True):
-    """Which weights there are; ``before`` were in use before, ``wanted`` are about to be."""
-
-    in_use: Count
-    before: Count | None
-    wanted: Count | None
-    weights_taken: Count
-    weights_refused: Count
-    weights_rolled_back: Count
-    entries: Annotated[tuple[WeightsEntry, ...], Meta(max_length=256)]
-
-
-class PoseRequest(Request, frozen=True, kw_only=True):
-    """Where the last frame was taken."""
-
-
-class PoseAnswer(Answer, frozen=True, kw_only=True):
-    """``CameraPose``; no ``camera_id`` before the first frame, no ``T_map_camera`` (row by row) where not known."""
-
-    camera_id: Word = ""
-    stamp_ns: Stamp = 0
-    T_map_camera: Annotated[tuple[Finite, ...], Meta(max_length=16)] = ()
-    reason: Sentence = ""
-
-
-class ErrorAnswer(Wire, frozen=True):
+class _ErrorHeader(Wire, frozen=True):
     """The name of an error class of ours, and what it says."""
 
     error: Word
     text: Sentence
 
 
-@dataclass(frozen=True, slots=True)
-class Question:
-    """One row of the table.
+def encode_request(name: str, request: Request[Any]) -> list[bytes]:
+    """Question -> parts; arrays are converted to the dtypes of their fields.
+
+    Raises:
+        CodecError: too many rows, or a value that cannot be sent.
+    """
+    parts = _encode(name, {}, request, name)
+    decode_request(parts, type(request))  # as its reader will
+    return parts
+
+
+def read_name(parts: Parts) -> str:
+    """The name of a question or answer.
+
+    Raises:
+        CodecError: it is neither.
+    """
+    if not 2 <= len(parts) <= 3:
+        raise CodecError(f"a question or answer has 2 or 3 parts, got {len(parts)}")
+    return bytes(parts[0][:32]).decode("ascii", errors="replace")
+
+
+def decode_request(parts: Parts, kind: type[RequestT]) -> RequestT:
+    """Parts -> question; its arrays are fresh and writable.
+
+    Raises:
+        CodecError: anything that ``encode_request`` would not have made.
+    """
+    name = read_name(parts)
+    return _convert(unpack_header(parts[1], name), kind, parts, name, MAX_REQUEST_ROWS)
+
+
+def encode_answer(name: str, state: MapState, answer: object) -> list[bytes]:
+    """Answer -> parts.
+
+    Raises:
+        CodecError: larger than a message may be, or a value that cannot be sent.
+    """
+    return _encode(name, {"map": msgspec.to_builtins(state)}, answer, f"answer to '{name}'")
+
+
+def encode_error(error: SemanticMapperError) -> list[bytes]:
+    """An error in the place of an answer; an overlong text is cut."""
+    text = str(error).encode("utf-8", errors="replace").decode()[:4000]
+    return [_ERROR.encode(), pack_header({"error": type(error).__name__, "text": text}, "error")]
+
+
+def decode_answer(name: str, kind: type[AnswerT], parts: Parts) -> tuple[MapState, AnswerT]:
+    """Parts -> what the answer is about, and the answer; its arrays are fresh and writable.
 
     Args:
-        request, answer: Types of question and answer.
-        aligned: Whether all arrays of the answer have the same free axes.
+        name: Of the question.
+        kind: Type of the answer.
+        parts: What came.
+
+    Raises:
+        MapError, LabelError, CodecError, ShapeError, PoseError: the other side answered with this error.
+        TransportError: it answered with another one.
+        CodecError: anything that ``encode_answer`` would not have made, or an answer to another question.
     """
+    what = f"answer to '{name}'"
+    actual = read_name(parts)
+    header = unpack_header(parts[1], what)
+    if actual == _ERROR:
+        reported = check_header(header, _ErrorHeader, what)
+        raise _RAISED.get(reported.error, TransportError)(reported.text)
+    if actual != name:
+        raise CodecError(f"{what}: got one to {actual!r}")
+    if header.keys() != {"map", "answer"}:
+        raise CodecError(f"{what}: bad header: expected `map` and `answer`, got {', '.join(header)}")
+    state = check_header(header["map"], MapState, what)
+    return state, _convert(header["answer"], kind, parts, what)
 
-    request: type[Request]
-    answer: type[Answer]
-    aligned: bool = True
+
+def _encode(name: str, about: dict[str, Any], message: object, what: str) -> list[bytes]:
+    buffers: list[bytes] = []
+    size = 0
+
+    def pack(value: object) -> object:
+        nonlocal size
+        if isinstance(value, np.generic):
+            return value.item()
+        if not isinstance(value, np.ndarray):
+            raise TypeError(f"no header holds a {type(value).__name__}")
+        array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+        if array.nbytes > MAX_PART_BYTES:  # before it is copied
+            raise CodecError(f"{what}: an array of {array.nbytes} bytes, at most {MAX_PART_BYTES} can be sent")
+        data = array.tobytes()
+        if array.itemsize == 1:
+            data = zstd_compress(data)
+        spec = {"dtype": array.dtype.str, "shape": value.shape, "start": size, "bytes": len(data)}
+        buffers.append(data)
+        size += len(data)
+        return spec
+
+    try:
+        plain = msgspec.to_builtins(message, enc_hook=pack)
+    except CodecError:
+        raise
+    except (ValueError, TypeError, OverflowError) as error:
+        raise CodecError(f"{what}: cannot be sent: {error}") from error
+    if size > MAX_PART_BYTES:
+        raise CodecError(f"{what}: arrays of {size} bytes, at most {MAX_PART_BYTES} can be sent; ask for less")
+    header = pack_header({**about, "answer": plain} if about else plain, what)
+    return [name.encode(), header, *([b"".join(buffers)] if buffers else [])]
 
 
-QUESTIONS = {
-    "info": Question(InfoRequest, InfoAnswer),
-    "at": Question(AtRequest, AtAnswer),
-    "nearest": Question(NearestRequest, NearestAnswer),
-    "cast_rays": Question(RaysRequest, RaysAnswer),
-    "points_in_box": Question(BoxRequest, BoxAnswer),
-    "instances": Question(InstancesRequest, InstancesAnswer, aligned=False),
-    "occupancy": Question(OccupancyRequest, OccupancyAnswer),
-    "distance_field": Question(DistanceRequest, DistanceAnswer),
-    "changes": Question(ChangesRequest, ChangesAnswer),
-    "correct_poses": Question(CorrectPosesRequest, CorrectionAnswer),
-    "correction": Question(CorrectionRequest, CorrectionAnswer),
-    "weights": Question(WeightsRequest, WeightsAnswer),
-    "pose": Question(PoseRequest, PoseAnswer),
-}
+def _convert(header: object, kind: type[AnswerT], parts: Parts, what: str, max_rows: int = 1 << 31) -> AnswerT:
+    blob = memoryview(parts[2]) if len(parts) > 2 else memoryview(b"")
+
+    def unpack(annotation: Any, value: object) -> NDArray[np.generic]:
+        wanted = np.dtype(get_args(get_args(annotation)[1])[0])  # of NDArray[...]
+        spec = msgspec.convert(value, _ArraySpec)
+        if np.dtype(spec.dtype) != wanted:
+            raise CodecError(f"expected an array of {wanted.name}, got {np.dtype(spec.dtype).name}")
+        if spec.shape and spec.shape[0] > max_rows:
+            raise CodecError(f"{spec.shape[0]} rows; ask for at most {max_rows} at once")
+        size = math.prod(spec.shape) * wanted.itemsize
+        if size > MAX_PART_BYTES:
+            raise CodecError(f"an array of {size} bytes, at most {MAX_PART_BYTES} are accepted; ask for less")
+        data = blob[spec.start : spec.start + spec.bytes]
+        if wanted.itemsize == 1:
+            data = zstd_decompress(data, size, "an array")
+        if len(data) != size:
+            raise CodecError(f"an array of shape {spec.shape} has {size} bytes, got {len(data)}")
+        if wanted == np.bool_:
+            return np.frombuffer(data, np.uint8).reshape(spec.shape) != 0
+        return np.frombuffer(data, spec.dtype).reshape(spec.shape).astype(wanted)
+
+    return check_header(header, kind, what, unpack)

@@ -10,13 +10,13 @@ from types import TracebackType
 import zmq
 
 from semantic_mapper.errors import CodecError, TransportError
-from semantic_mapper.transport.codec import encode_error
 from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
 from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
-from semantic_mapper.transport.messages import MAX_PART_BYTES, MAX_PARTS, Buffer
+from semantic_mapper.transport.messages import MAX_HEADER_BYTES, MAX_PART_BYTES, MAX_PARTS, Buffer
+from semantic_mapper.transport.query_messages import encode_error
 from semantic_mapper.transport.sockets import receive_bounded
 
-MAX_REQUEST_BYTES = 1 << 23  # of a part; who sends more is cut off. Twice that of all parts
+MAX_REQUEST_BYTES = 10_000_000  # of a part: 65,536 poses, and some room; a client that sends more is cut off
 _ENVELOPE_PARTS = 2  # who asks, and the empty part that REQ sockets put first
 _WAITING = 64  # questions and answers that may wait for each client
 
@@ -68,8 +68,8 @@ class QueryServer:
         try:
             (sender, *parts), trouble = receive_bounded(
                 self._socket,
-                max_parts=MAX_PARTS + _ENVELOPE_PARTS,
-                max_bytes=2 * MAX_REQUEST_BYTES,
+                max_parts=3 + _ENVELOPE_PARTS,
+                max_bytes=MAX_REQUEST_BYTES + MAX_HEADER_BYTES,
                 flags=zmq.NOBLOCK,
             )
         except zmq.Again:
@@ -96,7 +96,7 @@ class QueryServer:
 class QuerySocket:
     """Asks a ``QueryServer``. Any thread may ask; questions wait for each other.
 
-    Where no answer comes in time the socket is thrown away and the question asked again through a new one, so that a
+    Where no answer comes in time the socket is thrown away and the question sent again through a new one, so that a
     server that was restarted is found again. Questions change nothing, so to ask twice does no harm; a request that
     does carries an id, and a server that has seen it only answers.
 
@@ -176,7 +176,7 @@ class QuerySocket:
             return answer
         except zmq.Again:
             return None
-        finally:  # also after Ctrl-C: a REQ socket that has asked can only wait for that answer
+        finally:  # also after Ctrl-C: a REQ socket that has sent can only wait for that answer
             if not answered:
                 self._socket.close(linger=0)
                 self._socket = self._connect()

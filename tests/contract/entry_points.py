@@ -15,9 +15,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -38,7 +36,10 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.console import Output
@@ -53,6 +54,12 @@ from semantic_mapper.nodes.options import (
     MapperOptions,
     RecorderOptions,
 )
+from semantic_mapper.queries import questions
+from semantic_mapper.queries.instances import Instance, OrientedBox
+from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+from semantic_mapper.queries.occupancy import DistanceField
+from semantic_mapper.queries.questions import Correction, InstanceArrays, MapInfo, Weights, WeightsEntry
+from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.replay.compare import Tolerances
 from semantic_mapper.replay.corrected_poses import read_corrections
 from semantic_mapper.replay.importers.base import RenameConfig
@@ -81,12 +88,18 @@ __all__ = [
     "COMMAND",
     "ROOMS",
     "TOPICS",
+    "BlockChanges",
     "CameraIntrinsics",
+    "CameraPose",
     "Checkpoint",
     "CodecOptions",
+    "Correction",
+    "DistanceField",
     "EndOfStream",
     "FinetuneConfig",
     "FrameRefused",
+    "Instance",
+    "InstanceArrays",
     "Kept",
     "KeyframePool",
     "LabelSet",
@@ -95,10 +108,17 @@ __all__ = [
     "LogReader",
     "LogReplays",
     "LogWriter",
+    "MapInfo",
+    "MapPoints",
+    "MapState",
     "MapUpdate",
     "MapperConfig",
+    "NearestSurface",
     "OnlineConfig",
+    "OrientedBox",
+    "PointAnswers",
     "PosedFrame",
+    "RayHits",
     "SRay",
     "SRayConfig",
     "SemanticMapperError",
@@ -106,6 +126,8 @@ __all__ = [
     "StreamInfo",
     "Tolerances",
     "VoxelMap",
+    "Weights",
+    "WeightsEntry",
     "WeightsInUse",
     "WeightsUpdate",
     "convert_config",
@@ -198,46 +220,25 @@ decode_pose, encode_pose = pose_message.decode_pose, pose_message.encode_pose
 label_set_header = LabelSetForm.of
 
 
-def _without_arrays(kind: type[Any]) -> Callable[..., Any]:
-    """A question or answer that still lacks its arrays."""
-    return lambda **fields: partial(kind, **fields)
+QUESTIONS, MapState, decode_question = questions.QUESTIONS, query_messages.MapState, questions.decode_question
 
 
-# How to make a question and an answer of each kind, of which the arrays are given when it is encoded.
-QUESTIONS = {
-    kind: SimpleNamespace(request=_without_arrays(row.request), answer=_without_arrays(row.answer))
-    for kind, row in query_messages.QUESTIONS.items()
-}
-WeightsEntry = query_messages.WeightsEntry
-
-
-def decode_question(parts: Sequence[bytes]) -> tuple[Any, dict[str, Any]]:
-    """Header and arrays."""
-    _, request = codec.decode_request(parts)
-    return request, _arrays(request)
-
-
-def encode_question(kind: str, header: Any, arrays: Mapping[str, Any]) -> list[bytes]:
+def encode_question(kind: str, request: Any) -> list[bytes]:
     """Parts of a question."""
-    return codec.encode_request(kind, header(**arrays) if isinstance(header, partial) else header)
+    return query_messages.encode_request(kind, request)
 
 
-def decode_answer(kind: str, parts: Sequence[bytes]) -> tuple[Any, dict[str, Any]]:
-    """Header and arrays; raises what the other side has answered in place of these."""
-    answer = codec.decode_answer(kind, query_messages.QUESTIONS[kind].answer, parts)
-    return answer, _arrays(answer)
+def decode_answer(kind: str, parts: Sequence[bytes]) -> tuple[Any, Any]:
+    """What it is about, and the answer; raises what the other side has answered in place of these."""
+    return query_messages.decode_answer(kind, QUESTIONS[kind].answer, parts)
 
 
-def encode_answer(kind: str, header: Any, arrays: Mapping[str, Any]) -> list[bytes]:
+def encode_answer(kind: str, state: Any, answer: Any) -> list[bytes]:
     """Parts of an answer."""
-    return codec.encode_answer(kind, header(**arrays) if isinstance(header, partial) else header)
+    return query_messages.encode_answer(kind, state, answer)
 
 
-def _arrays(message: Any) -> dict[str, Any]:
-    return {name: getattr(message, name) for name in query_messages.array_forms(type(message))}
-
-
-encode_error = codec.encode_error
+encode_error = query_messages.encode_error
 
 
 def keep_learning(store: LearningStore, kept: Sequence[Kept]) -> None:

@@ -17,7 +17,7 @@ import os
 import shutil
 import tempfile
 from base64 import b64encode
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -42,14 +42,12 @@ def record_wire(folder: Path) -> None:
             del said["rgb"]["digest"]
             more = {"pixels": b64encode(decoded.rgb.tobytes()).decode()}
         _keep(wire["messages"], name, parts, said, "jpeg" not in name, topic=topic, options=options, **more)
-    for kind, (fields, arrays) in samples.questions().items():
-        parts = api.encode_question(kind, api.QUESTIONS[kind].request(**fields), arrays)
-        header, found = api.decode_question(parts)
-        _keep(wire["questions"], kind, parts, _said(header, found), True, kind=kind)
-    for kind, (fields, arrays) in samples.answers().items():
-        parts = api.encode_answer(kind, api.QUESTIONS[kind].answer(**fields), arrays)
-        header, found = api.decode_answer(kind, parts)
-        _keep(wire["answers"], kind, parts, _said(header, found), True, kind=kind)
+    for kind, fields in samples.questions().items():
+        parts = api.encode_question(kind, api.QUESTIONS[kind].request(**fields))
+        _keep(wire["questions"], kind, parts, golden.plain(api.decode_question(parts)), True, kind=kind)
+    for kind, answer in samples.answers().items():
+        parts = api.encode_answer(kind, samples.STATE, answer)
+        _keep(wire["answers"], kind, parts, golden.plain(api.decode_answer(kind, parts)), True, kind=kind)
     for name in ("MapError", "LabelError", "CodecError", "ShapeError", "PoseError", "WeightsError"):
         parts = api.encode_error(api.importable("semantic_mapper.errors", name)("the box is empty"))
         try:
@@ -82,10 +80,6 @@ def _keep(entries: dict[str, Any], name: str, parts: list[bytes], said: Any, exa
 
 def _texts(parts: list[bytes]) -> list[str]:
     return [b64encode(part).decode() for part in parts]
-
-
-def _said(header: Any, arrays: Mapping[str, Any]) -> dict[str, Any]:
-    return {"header": golden.meaning(header), "arrays": golden.plain(arrays)}
 
 
 def record_map(folder: Path) -> None:

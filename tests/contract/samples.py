@@ -79,8 +79,8 @@ def messages() -> dict[str, tuple[str, Any, dict[str, Any]]]:
     }
 
 
-def questions() -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
-    """Fields of the header, and arrays, by kind."""
+def questions() -> dict[str, dict[str, Any]]:
+    """Fields by kind."""
     rng = np.random.default_rng(5)
     points = rng.normal(size=(5, 3))
     who = {"asker": "robot", "waits_s": 2.5}
@@ -88,87 +88,86 @@ def questions() -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = points[:2]
     return {
-        "info": (who, {}),
-        "at": ({**who, "radius_m": 0.1}, {"points": points}),
-        "nearest": ({**who, "class_name": "wall", "point": (0.0, 0.5, 1.0), "min_confidence": 0.25}, {}),
-        "cast_rays": ({**who, "max_m": 7.5}, {"origins": points, "directions": points[::-1].copy()}),
-        "points_in_box": ({**who, **box}, {}),
-        "instances": ({**who, "up": (0.0, 0.0, 1.0)}, {}),
-        "occupancy": (who, {"points": points}),
-        "pose": (who, {}),
-        "distance_field": ({**who, **box, "unknown_is_occupied": True}, {}),
-        "changes": ({**who, "since": 3, "limit": 500, "map_id": "another map"}, {}),
-        "correct_poses": (
-            {**who, "id": "x1", "cameras": ("rooms",), "until_ns": 10**9, "within_ns": 5_000_000},
-            {"stamps_ns": np.array((66_666_667, 200_000_001)), "camera": np.zeros(2, np.uint8), "poses": poses},
-        ),
-        "correction": (who, {}),
-        "weights": ({**who, "to": 1}, {}),
+        "info": who,
+        "at": {**who, "radius_m": 0.1, "points": points},
+        "nearest": {**who, "class_name": "wall", "point": (0.0, 0.5, 1.0), "min_confidence": 0.25},
+        "cast_rays": {**who, "max_m": 7.5, "origins": points, "directions": points[::-1].copy()},
+        "points_in_box": {**who, **box},
+        "instances": {**who, "up": (0.0, 0.0, 1.0)},
+        "occupancy": {**who, "points": points},
+        "pose": who,
+        "distance_field": {**who, **box, "unknown_is_occupied": True},
+        "changes": {**who, "since": 3, "limit": 500, "map_id": "another map"},
+        "correct_poses": {
+            **who,
+            "id": "x1",
+            "cameras": ("rooms",),
+            "until_ns": 10**9,
+            "within_ns": 5_000_000,
+            "stamps_ns": np.array((66_666_667, 200_000_001)),
+            "camera": np.zeros(2, np.uint8),
+            "poses": poses,
+        },
+        "correction": who,
+        "weights": {**who, "to": 1},
     }
 
 
-def answers() -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
-    """Fields of the header, and arrays, by kind."""
+STATE = api.MapState("m1", 7, 1)
+
+
+def answers() -> dict[str, Any]:
+    """By kind."""
     rng = np.random.default_rng(6)
-    about = {"map_id": "m1", "version": 7, "epoch": 1}
     u8, f4 = rng.integers(0, 255, 3).astype(np.uint8), rng.random(3).astype(np.float32)
     rgb, xyz = rng.integers(0, 255, (3, 3)).astype(np.uint8), rng.random((3, 3)).astype(np.float32)
-    label_set = api.label_set_header(LABELS)
-    correction = {
-        "used": 2, "left_out": 1, "running": True, "done": 3, "total": 9, "completed": 1, "poses": 4, "frozen": 5,
-        "lost": 6, "failure": "no room", "map_epoch": 2,
-    }  # fmt: skip
-    entry = api.WeightsEntry(
-        version=1, digest="ab" * 32, state="in use", score=0.7, parent_score=0.5, keyframes=9, reason=""
+    measured = np.array((True, False, True))
+    correction = api.Correction(
+        running=True,
+        done=3,
+        total=9,
+        disk_bytes=10,
+        completed=1,
+        poses=4,
+        frozen=5,
+        lost=6,
+        failure="no room",
+        used=2,
+        left_out=1,
+        epoch=2,
     )
-    block = {"tsdf": np.arange(512, dtype=np.int64).astype(np.int8)[None], "keys": np.array([[-1, 0, 3]], np.int32)}
+    entry = api.WeightsEntry(1, "ab" * 32, "in use", 0.7, 0.5, 9)
+    box = api.OrientedBox(*rng.random((2, 3)), rng.random((3, 3)))
+    voxels = np.array([[1, 2, 3], [4, 5, -6]], np.int32)
+    thing = api.Instance(4, 9, "counter top", 0.75, rng.random(3), box, voxels)
+    changes = api.BlockChanges(
+        since=3,
+        version=7,
+        newest=9,
+        epoch=1,
+        keys=np.array([[-1, 0, 3]], np.int32),
+        tsdf=np.arange(512, dtype=np.int64).astype(np.int8)[None],
+        label=np.full((1, 512), 9, np.uint8),
+        confidence=np.full((1, 512), 200, np.uint8),
+        rgb=np.arange(1536).astype(np.uint8).reshape(1, 512, 3),
+    )
+    far = np.array((1.5, np.inf, 0.25), np.float32)
     return {
-        "info": ({**about, "blocks": 9, "voxel_size_m": 0.05, "truncation_voxels": 4.0, "label_set": label_set}, {}),
-        "at": (about, {"label": u8, "confidence": f4, "distance_m": f4[::-1], "state": u8 % 3}),
-        "nearest": ({**about, "found": True, "xyz": (0.1, 0.2, 1 / 3), "distance_m": 0.5, "confidence": 0.75}, {}),
-        "cast_rays": (
-            about,
-            {"distance_m": np.array((1.5, np.inf, 0.25), np.float32), "label": u8, "confidence": f4, "rgb": rgb},
+        "info": api.MapInfo("m1", 7, 1, 9, 0.05, 4.0, LABELS),
+        "at": api.PointAnswers(u8, f4, f4[::-1], u8 % 3, measured),
+        "nearest": api.NearestSurface(np.array((0.1, 0.2, 1 / 3)), 0.5, 0.75),
+        "cast_rays": api.RayHits(far, u8, f4, rgb, measured),
+        "points_in_box": api.MapPoints(xyz, rgb, u8, f4, measured),
+        "instances": api.InstanceArrays.of([thing], LABELS),
+        "occupancy": u8 % 3,
+        "pose": api.CameraPose("rooms", 7, np.eye(4)),
+        "distance_field": api.DistanceField(
+            np.array((0.0, 0.1, 0.2)), 0.05, f4.reshape(1, 1, 3), u8.reshape(1, 1, 3) % 3
         ),
-        "points_in_box": (about, {"xyz": xyz, "rgb": rgb, "label": u8, "confidence": f4}),
-        "instances": (
-            about,
-            {
-                "numbers": np.array([[4, 9, 2]]),
-                "places": rng.random((1, 19)),
-                "voxels": np.array([[1, 2, 3], [4, 5, -6]], np.int32),
-            },
-        ),
-        "occupancy": (about, {"state": u8 % 3}),
-        "pose": ({**about, "camera_id": "rooms", "stamp_ns": 7, "T_map_camera": tuple(np.eye(4).ravel())}, {}),
-        "distance_field": (
-            {**about, "origin_m": (0.0, 0.1, 0.2), "voxel_size_m": 0.05},
-            {"distance_m": f4.reshape(1, 1, 3), "state": u8.reshape(1, 1, 3) % 3},
-        ),
-        "changes": (
-            {**about, "since": 3, "newest": 9},
-            {
-                **block,
-                "label": np.full((1, 512), 9, np.uint8),
-                "confidence": np.full((1, 512), 200, np.uint8),
-                "rgb": np.arange(1536).astype(np.uint8).reshape(1, 512, 3),
-            },
-        ),
-        "correct_poses": ({**about, **correction}, {}),
-        "correction": ({**about, **correction, "used": 0}, {}),
-        "weights": (
-            {
-                **about,
-                "in_use": 1,
-                "before": 0,
-                "wanted": None,
-                "weights_taken": 1,
-                "weights_refused": 2,
-                "weights_rolled_back": 3,
-                "entries": (entry,),
-            },
-            {},
-        ),
+        "changes": changes,
+        "correct_poses": correction,
+        "correction": correction,
+        "weights": api.Weights(1, 0, None, 1, 2, 3, (entry,)),
     }
 
 

@@ -14,9 +14,19 @@ from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.rays import ray_cast
+from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.types import CameraIntrinsics
-from tests.mapping.rendered_views import INTRINSICS, LABELS, around, frame, plane_depth, small_map, sphere_depth, sure
+from tests.mapping.rendered_views import (
+    INTRINSICS,
+    LABELS,
+    around,
+    frame,
+    plane_depth,
+    ray_directions,
+    small_map,
+    sphere_depth,
+    sure,
+)
 
 State = dict[str, NDArray[np.generic]]
 CENTER = np.array([0.3, -0.2, 0.5])
@@ -151,7 +161,7 @@ def test_what_the_map_is_unsure_of_is_unknown_wherever_it_is_read(tmp_path: Path
         (plain.mesh(), strict.mesh()),
         (plain.ray_cast(np.eye(4), INTRINSICS), strict.ray_cast(np.eye(4), INTRINSICS)),
         (plain.changes(0), strict.changes(0)),
-        (ray_cast(at_voxels[0], np.eye(4), INTRINSICS), ray_cast(at_voxels[1], np.eye(4), INTRINSICS)),
+        tuple(cast_rays(s, (0, 0, 0), ray_directions(INTRINSICS, np.eye(4)).reshape(-1, 3)) for s in at_voxels),
     ]
     for free, reading in readings:
         np.testing.assert_array_equal(reading.confidence, free.confidence)

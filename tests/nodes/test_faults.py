@@ -104,7 +104,7 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
     with capsys.disabled():
         print("\nback after:", ", ".join(f"{case} {seconds:.2f} s" for case, seconds in took.items()))  # noqa: T201
     summary = json.loads((out / "summary.json").read_text())
-    taken_up = [int(n) for n in re.findall(r"map_taken_up .*frames=(\d+)", running.text)]
+    taken_up = [int(n) for n in re.findall(r"map_resumed .*frames=(\d+)", running.text)]
     assert len(taken_up) == 3 and f"saved after {taken_up[-1]} frames" in summary["restarted"]
     assert VoxelMap.load(out / "map.npz").frames == taken_up[-1] + summary["frames"]["fused"]
     numbers: list[int] = []

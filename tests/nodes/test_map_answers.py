@@ -9,8 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from semantic_mapper.nodes.map_answers import answer_instances, answer_table
-from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.oriented_box import OrientedBox
+from semantic_mapper.queries.instances import Instance, OrientedBox
 
 
 def test_a_narrow_terminal_cuts_no_number() -> None:

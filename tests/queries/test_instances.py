@@ -13,13 +13,18 @@ from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries import class_surface as class_surface_module
-from semantic_mapper.queries.class_surface import class_surface
-from semantic_mapper.queries.components import find_components
-from semantic_mapper.queries.instances import Instance, InstanceTracker, _Found, _LabelledVoxels, find_overlaps
+from semantic_mapper.queries import surface as class_surface_module
+from semantic_mapper.queries.instances import (
+    Instance,
+    InstanceTracker,
+    _Found,
+    _LabelledVoxels,
+    find_components,
+    find_overlaps,
+    upright_box,
+)
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.oriented_box import upright_box
-from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.queries.surface import class_surface, surface_voxels
 from semantic_mapper.types import UInt8
 from tests.mapping.rendered_views import small_map
 from tests.queries.random_map import random_changes, random_map, voxel_places

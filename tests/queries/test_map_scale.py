@@ -5,22 +5,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.geometry import look_at
-from semantic_mapper.queries.boxes import mesh_in_box, points_in_box
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
-from semantic_mapper.queries.rays import cast_rays, ray_cast
+from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import surface_voxels
-from tests.mapping.rendered_views import INTRINSICS, small_map
-from tests.queries.scene import LABELS, MIDDLE, integrate, poses, whole
+from semantic_mapper.queries.surface import points_in_box
+from tests.mapping.rendered_views import small_map
+from tests.queries.scene import LABELS, integrate, poses, whole
 
 LOW, HIGH = (-1, -1, -1), (1, 1, 1)
 WITH_METRES: dict[str, Callable[[MapSnapshot], object]] = {
@@ -28,7 +24,6 @@ WITH_METRES: dict[str, Callable[[MapSnapshot], object]] = {
     "nearest": lambda s: nearest(s, "cup", (0, 0, 0)),
     "cast_rays": lambda s: cast_rays(s, (0, 0, 1), (0, 0, -1)),
     "points_in_box": lambda s: points_in_box(s, LOW, HIGH),
-    "mesh_in_box": lambda s: mesh_in_box(s, LOW, HIGH),
     "occupancy": lambda s: occupancy(s, [(0, 0, 0)]),
     "distance_field": lambda s: distance_field(s, LOW, HIGH),
     "instances": lambda s: InstanceTracker().update(s),
@@ -40,14 +35,6 @@ def test_metres_are_refused(name: str) -> None:
     WITH_METRES[name](whole())
     with pytest.raises(MapError, match=r"the scale is unknown; give a scale.*--distance"):
         WITH_METRES[name](dataclasses.replace(whole(), scale_known=False))
-
-
-def test_pictures_and_classes_go_on() -> None:
-    unknown = dataclasses.replace(whole(), scale_known=False)
-    pose = look_at(MIDDLE + np.array((1.0, 0.0, 1.0)), MIDDLE, np.array((0.0, 0.0, 1.0)))
-    view, known = ray_cast(unknown, pose, INTRINSICS), ray_cast(whole(), pose, INTRINSICS)
-    assert (view.label == known.label).all() and set(np.unique(view.label)) >= {2, 5, 9}
-    assert len(surface_voxels(unknown).voxel) == len(surface_voxels(whole()).voxel)
 
 
 def test_mirrors_of_mirrors_follow_it() -> None:

@@ -22,9 +22,8 @@ from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import mirror as mirror_module
-from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
 from tests.mapping.rendered_views import frame, small_map
@@ -239,7 +238,7 @@ def test_a_mirror_needs_no_open3d() -> None:
     program = (
         "import sys, numpy as np\n"
         "from tests.queries.scene import LABELS, TABLE, painted\n"
-        "from semantic_mapper.queries.boxes import points_in_box\n"
+        "from semantic_mapper.queries.surface import points_in_box\n"
         "from semantic_mapper.queries.instances import InstanceTracker\n"
         "from semantic_mapper.queries.mirror import MapMirror\n"
         "snapshot = MapMirror(0.02, 4.0, LABELS).apply(painted(np.full((8, 8), TABLE, np.uint8), 0, 1))\n"

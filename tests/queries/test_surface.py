@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.queries.surface import points_in_box, surface_voxels
 from tests.queries.random_map import random_map, voxel_places
 from tests.queries.scene import CUP, FLOOR, TABLE, surface_of, truth_distance, whole
 
@@ -89,3 +89,16 @@ def test_surface_voxels_of_random_blocks_are_all_found(seed: int) -> None:
     expected, points = brute_force(snapshot)
     np.testing.assert_array_equal(places[order], expected)
     np.testing.assert_allclose(surface.point[order], points, atol=1e-12)
+
+
+def test_points_are_all_surface_points_in_the_box() -> None:
+    lower, upper = (-0.3137, -0.2711, 0.0513), (0.8329, 0.3317, 0.3719)
+    xyz, label, confidence = surface_of(whole())
+    inside = ((xyz >= lower) & (xyz <= upper)).all(axis=1)
+    found = points_in_box(whole(), lower, upper)
+    assert 500 < inside.sum() < 0.8 * len(xyz)
+    np.testing.assert_allclose(found.xyz, xyz[inside], atol=1e-6)
+    np.testing.assert_array_equal(found.label, label[inside])
+    np.testing.assert_allclose(found.confidence, confidence[inside] / 255, atol=1e-6)
+    assert found.xyz.dtype == found.confidence.dtype == np.float32 and found.rgb.shape == found.xyz.shape
+    assert len(points_in_box(whole(), (5, 5, 5), (6, 6, 6)).xyz) == 0

@@ -17,8 +17,7 @@ from semantic_mapper.fields.primitives import Primitive, resized
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.nodes.map_answers import answer_instances
-from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.oriented_box import OrientedBox
+from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.replay.boxes import QUERY_MARGIN_M, BoxFile, load_boxes, save_boxes, with_classes, with_times
 from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.replay.log.format import LogWriter

@@ -16,7 +16,7 @@ import pytest
 from semantic_mapper.errors import ConfigError, LabelError, LogError, MapError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.nearest import at
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.replay.testing import LogReplays, ReplayedMap
 from semantic_mapper.types import PosedFrame

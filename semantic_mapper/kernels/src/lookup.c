@@ -1,4 +1,4 @@
-/* The surface nearest to points, where it is near; see queries/lookup.py. */
+/* The surface nearest to points, where it is near; see queries/nearest.py. */
 #include "surface.h"
 
 typedef struct {

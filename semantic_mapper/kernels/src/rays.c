@@ -45,17 +45,3 @@ KERNEL(march_rays, MarchArguments) {
     }
     return 0;
 }
-
-typedef struct {
-    F64 points; /* (N, 3) units of voxels */
-    BlockIndex index;
-    BlockVoxels voxels;
-    I64 slots;  /* (N,) out: -1 = none */
-    I64 chosen; /* (N,) out: voxel of the block */
-} CornerArguments;
-
-KERNEL(find_nearest_corners, CornerArguments) {
-    for (int64_t n = 0; n < a->points.shape[0]; n++)
-        a->slots.data[n] = nearest_corner(a->points.data + 3 * n, &a->index, &a->voxels, a->chosen.data + n);
-    return 0;
-}

@@ -27,7 +27,13 @@ from semantic_mapper.config import HistoryConfig
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction.history import FrameEntry, FrameHistory, FusedFrame
-from semantic_mapper.mapping.correction.pose_correction import ALWAYS, CorrectedPoses, PoseCorrection, move
+from semantic_mapper.mapping.correction.pose_correction import (
+    ALWAYS,
+    CorrectedPoses,
+    CorrectionStatus,
+    PoseCorrection,
+    move,
+)
 from semantic_mapper.mapping.correction.pose_matching import FrozenFrames, pair_poses
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.moving_filter import MovingAgain, MovingFilter
@@ -41,37 +47,6 @@ LEAST_WRITTEN = 64  # blocks that a step, or a frame of a rebuild, puts on disk 
 WRITTEN_SHARE = 8  # and at least this part of them
 
 _log = get_logger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class CorrectionStatus:
-    """Where corrections stand.
-
-    Args:
-        running: A rebuild is under way; the map in use is still the old one.
-        done, total: Frames of the history that the rebuild has gone through, and all.
-        disk_bytes: Of the history's frames, and of the journal of the map.
-        completed: Corrections that are in the map in use.
-        poses: Given by these, all together.
-        frozen: Frames that have left the history; corrections do not reach them.
-        lost: Frames that could not be read from disk again, and so are in the map no more after a rebuild.
-        failure: Why the last correction was given up; empty where it was not.
-    """
-
-    running: bool
-    done: int
-    total: int
-    disk_bytes: int
-    completed: int
-    poses: int
-    frozen: int
-    lost: int
-    failure: str
-
-    @property
-    def left(self) -> int:
-        """Frames that the rebuild has still to go through."""
-        return self.total - self.done if self.running else 0
 
 
 @dataclass(slots=True, eq=False)

@@ -11,6 +11,7 @@ moves with the first. A frame after the last moves with it only where the caller
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,37 @@ ALWAYS = 2**63 - 1  # later than any stamp
 
 # By stamp_ns, or by (camera_id, stamp_ns) where cameras share stamps: T_world_camera (4, 4).
 CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionStatus:
+    """Where corrections stand.
+
+    Args:
+        running: A rebuild is under way; the map in use is still the old one.
+        done, total: Frames of the history that the rebuild has gone through, and all.
+        disk_bytes: Of the history's frames, and of the journal of the map.
+        completed: Corrections that are in the map in use.
+        poses: Given by these, all together.
+        frozen: Frames that have left the history; corrections do not reach them.
+        lost: Frames that could not be read from disk again, and so are in the map no more after a rebuild.
+        failure: Why the last correction was given up; empty where it was not.
+    """
+
+    running: bool
+    done: int
+    total: int
+    disk_bytes: int
+    completed: int
+    poses: int
+    frozen: int
+    lost: int
+    failure: str
+
+    @property
+    def left(self) -> int:
+        """Frames that the rebuild has still to go through."""
+        return self.total - self.done if self.running else 0
 
 
 class PosePair(NamedTuple):

@@ -282,7 +282,7 @@ def test_a_mapper_learns_while_it_maps_from_what_the_command_line_labels(start: 
             assert eventually(lambda: heard.counters().get("taken") == 1)
             robot.send(list(FRAMES[2:6]))
         summary = robot.end(6)
-    assert summary["weights"]["learned"]["weights_taken"] == 1 and summary["weights"]["recipe"] == "online"
+    assert summary["weights"]["learned"]["taken"] == 1 and summary["weights"]["recipe"] == "online"
     assert summary["frames"]["excluded_from_scores"] == 2 and summary["frames"]["scored"] == 4
     assert summary["field"]["anchors"] == 3
 

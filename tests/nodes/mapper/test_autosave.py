@@ -121,24 +121,19 @@ def test_a_save_that_fails_is_told_and_tried_again_though_nothing_has_changed(tm
     autosave.close()
 
 
-@pytest.mark.parametrize("error", [MemoryError("a chunk"), KeyError("a bug")], ids=repr)
-def test_a_save_that_dies_of_anything_is_told_and_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_a_save_that_dies_is_reported_and_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     voxel_map, path = small_map(voxel_size_m=0.02), tmp_path / "map.npz"
     autosave = Autosave(voxel_map, path, ALWAYS)
     walk(voxel_map, 1)
 
     def fail(*arguments: object) -> None:
-        # A copy: the traceback of the parameter itself would keep the map, and Open3D ends a process in which tensors
-        # are alive at its very end with exit code 1.
-        raise type(error)(*error.args)
+        raise MemoryError("a chunk")
 
     monkeypatch.setattr(map_file, "_write_chunk", fail)
     autosave.follow()
-    assert eventually(lambda: autosave.failure == f"{type(error).__name__}: {error}", 20)
-    assert autosave.saves == 0
+    assert eventually(lambda: autosave.failure == "MemoryError: a chunk", 20)
+    assert autosave.status().warnings == ("the map was not saved: MemoryError: a chunk",)
     monkeypatch.undo()
-    assert eventually(lambda: autosave.follow() or autosave.saves == 1) and not autosave.failure
+    assert eventually(lambda: autosave.follow() or autosave.saves == 1) and not autosave.status().warnings
     assert describe_map(path).frames == 1
     autosave.close()

@@ -134,7 +134,7 @@ def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp
         )
         summary = learner.robot.end(8)
     told = summary["weights"]
-    assert told["learned"]["in_use"] == 2 and told["learned"]["weights_rolled_back"] == 1
+    assert told["learned"]["in_use"] == 2 and told["learned"]["rolled_back"] == 1
     assert told["file"] == "000002.safetensors" and (tmp_path / "out" / "weights" / told["file"]).exists()
     # Frames 0 to 3 had been learned from, 4 and 5 were scored before they were, 6 and 7 never were.
     assert summary["frames"]["scored"] == 4 and summary["frames"]["excluded_from_scores"] == 4

@@ -2,59 +2,57 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
-import structlog.testing
+from structlog.testing import capture_logs
 
+from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
-from semantic_mapper.nodes.mapper.autosave import Autosave
-from semantic_mapper.nodes.mapper.node import _Mapper
-from tests.mapping.rendered_views import small_map
-from tests.mapping.storage.test_paging import walk
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.mapper.resume import resume_map
+from tests.mapping.correction.test_corrected_map import true_poses
+from tests.nodes.mapper.test_live_correction import running_robot
 from tests.nodes.mapper.test_resume import context
 from tests.nodes.support import eventually
+from tests.small import tiny_frames
 
 
-class _FullDisk(_Mapper):
-    def __init__(self) -> None:
-        """No sockets: only what follows a failure is looked at."""
-
-    def finish(self) -> None:
+def test_a_failure_to_write_does_not_hide_what_ended_the_run(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: object) -> None:
         raise MapError("map.npz: no space left")
 
-
-def test_a_failure_to_write_does_not_hide_what_ended_the_run() -> None:
-    with structlog.testing.capture_logs() as logs:
-        _FullDisk().finish_after(MapError("the map is full"))
-    told: list[Any] = [e for e in logs if e["event"] == "results_not_written"]
-    assert told and told[0]["reason"] == "map.npz: no space left" and told[0]["after"] == "the map is full"
-
-
-class _Corrected(_Mapper):
-    def __init__(self, notes: Path, autosave: Autosave) -> None:
-        """No sockets: only what follows a first corrected pose is looked at."""
-        pipeline = SimpleNamespace(corrector=SimpleNamespace(status=SimpleNamespace(poses=3)))
-        self._bundle: Any = SimpleNamespace(pipeline=pipeline)
-        self._context = context(notes, 0)
-        self._autosave = autosave
-        self._corrected = False
+    monkeypatch.setattr("semantic_mapper.nodes.mapper.node.finish_session", full)
+    monkeypatch.setattr("semantic_mapper.replay.session.MapSession.process", full)
+    with capture_logs() as logs, running_robot(weights, tmp_path / "out", 0) as robot:
+        robot.send(list(tiny_frames(1)))
+        robot.thread.join(60)
+    assert [log["event"] for log in logs if log["log_level"] == "error"] == ["results_not_written"]
 
 
-@pytest.mark.parametrize("room", [True, False])
-def test_a_correction_that_cannot_be_noted_ends_the_saving_and_not_the_mapper(tmp_path: Path, room: bool) -> None:
-    voxel_map, path = small_map(voxel_size_m=0.02), tmp_path / "map.npz"
-    autosave = Autosave(voxel_map, path, 1e-9)
-    walk(voxel_map, 1)
-    mapper = _Corrected(tmp_path / "notes", autosave)
-    if not room:
-        (tmp_path / "notes").rmdir()
-    mapper._note_correction()
-    mapper._note_correction()
-    autosave.follow()
-    if room:
-        assert eventually(lambda: autosave.saves == 1) and not autosave.failure
-    else:
-        assert autosave._thread is None and not path.exists() and "no note could say so" in autosave.failure
+@pytest.mark.parametrize("noted", [True, False])
+def test_a_correction_that_cannot_be_noted_ends_the_saving_and_not_the_mapper(
+    weights: Path, tmp_path: Path, noted: bool
+) -> None:
+    frames, notes, out = tiny_frames(4), tmp_path / "notes", tmp_path / "out"
+    notes.mkdir()
+    with (
+        running_robot(weights, out, notes=notes, save_every_s=1e-3) as robot,
+        MapClient(robot.query, timeout_s=60) as client,
+    ):
+        robot.send(list(frames))
+        assert robot.fused(4)
+        if not noted:
+            shutil.rmtree(notes)
+        client.correct_poses(true_poses(frames, 1))
+        assert eventually(lambda: robot.status[-1].counters.get("corrections") == 1)
+        warnings = robot.status[-1].degraded
+        assert any("no note could say so" in warning for warning in warnings) is not noted
+        robot.end(4)
+    if noted:  # a mapper that replaced it would begin an empty map
+        assert "poses had been corrected" in resume_map(
+            context(notes, 1), out / "map.npz", VoxelMap.load(out / "map.npz")
+        )

@@ -1,4 +1,4 @@
-"""A map that is asked over real sockets answers as it does in process, whatever else arrives."""
+"""Answers over real sockets are those in process, whatever else arrives; long questions delay no others."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -21,22 +22,35 @@ from semantic_mapper.geometry import transform
 from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.mapping.worlds import CameraPose, Whereabouts
-from semantic_mapper.nodes.mapper import query_answers
+from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.queries.boxes import points_in_box
-from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import State, distance_field, occupancy
+from semantic_mapper.queries.questions import (
+    QUESTIONS,
+    AtRequest,
+    BoxRequest,
+    ChangesRequest,
+    CorrectPosesRequest,
+    DistanceRequest,
+    InfoRequest,
+    InstancesRequest,
+    NearestRequest,
+    OccupancyRequest,
+    RaysRequest,
+)
 from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.codec import encode_request
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import points_in_box
 from semantic_mapper.transport.keys import Keys
+from semantic_mapper.transport.query_messages import encode_request
 from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_moving import THING_M as PASSES_AT_M
 from tests.mapping.test_moving import scene as passer_by
+from tests.nodes.support import eventually
 from tests.queries.scene import BALL, LABELS, integrate, poses, whole, whole_map
 from tests.queries.test_measured import part_measured
 from tests.queries.test_mirror import assert_same
@@ -184,7 +198,9 @@ def test_a_bad_question_is_an_error_as_in_process(client: MapClient) -> None:
         client.points_in_box((0, 0, 0), (0, 1, 1))
     with pytest.raises(MapError, match="expected numbers"):
         client.at("here")
-    for wrong in (lambda: client.at((1, 2, 3)), lambda: client.nearest("cup", (1, 2)), lambda: client.instances(1)):
+    with pytest.raises(MapError, match="expected shape"):
+        client.at((1, 2, 3))
+    for wrong in (lambda: client.nearest("cup", (1, 2)), lambda: client.instances(1)):
         with pytest.raises(CodecError, match="expected"):
             wrong()
     with pytest.raises(CodecError, match="at most 65536 at once"):
@@ -207,11 +223,11 @@ def test_what_would_keep_others_waiting_is_refused(client: MapClient) -> None:
 
 
 def test_answers_that_are_too_large_are_errors(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semantic_mapper.transport.codec.MAX_PART_BYTES", 1000)
-    with pytest.raises(CodecError, match=r"xyz of \d+ bytes, at most 1000"):
+    monkeypatch.setattr("semantic_mapper.transport.query_messages.MAX_PART_BYTES", 1000)
+    with pytest.raises(CodecError, match=r"an array of \d+ bytes, at most 1000"):
         client.points_in_box((-1, -1, -1), (1, 1, 1))
     monkeypatch.undo()
-    monkeypatch.setattr(query_answers, "points_in_box", _out_of_memory)
+    monkeypatch.setattr(query_service, "points_in_box", _out_of_memory)
     with pytest.raises(MapError, match="no memory left"):
         client.points_in_box((-1, -1, -1), (1, 1, 1))
 
@@ -221,21 +237,19 @@ def _out_of_memory(*arguments: object) -> None:
 
 
 def good_questions() -> list[list[bytes]]:
-    points = {"points": PLACES[:4]}
-    box = messages.BoxRequest(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
-    rays = {"origins": PLACES[:2], "directions": PLACES[:2] + 1}
+    points, box = PLACES[:4], {"lower": (-1.0, -1.0, -1.0), "upper": (1.0, 1.0, 1.0)}
     return [
-        encode_request("info", messages.InfoRequest()),
-        encode_request("at", messages.AtRequest(radius_m=0.1, **points)),
-        encode_request("nearest", messages.NearestRequest(class_name="cup", point=(0.0, 0.0, 1.0))),
-        encode_request("cast_rays", messages.RaysRequest(max_m=4.0, **rays)),
-        encode_request("points_in_box", box),
-        encode_request("occupancy", messages.OccupancyRequest(**points)),
-        encode_request("changes", messages.ChangesRequest(since=3, limit=5)),
+        encode_request("info", InfoRequest()),
+        encode_request("at", AtRequest(radius_m=0.1, points=points)),
+        encode_request("nearest", NearestRequest(class_name="cup", point=(0.0, 0.0, 1.0))),
+        encode_request("cast_rays", RaysRequest(max_m=4.0, origins=points, directions=points + 1)),
+        encode_request("points_in_box", BoxRequest(**box)),
+        encode_request("occupancy", OccupancyRequest(points=points)),
+        encode_request("changes", ChangesRequest(since=3, limit=5)),
     ]
 
 
-class Stranger:
+class RawClient:
     """A raw socket that sends what it likes, and waits for an answer."""
 
     def __init__(self, endpoint: str) -> None:
@@ -250,10 +264,10 @@ class Stranger:
 
 
 @pytest.fixture(scope="module")
-def stranger(client: MapClient) -> Iterator[Stranger]:
-    stranger = Stranger(client._socket.endpoint)
-    yield stranger
-    stranger.socket.close()
+def raw(client: MapClient) -> Iterator[RawClient]:
+    raw = RawClient(client._socket.endpoint)
+    yield raw
+    raw.socket.close()
 
 
 @pytest.mark.parametrize(
@@ -273,43 +287,42 @@ def stranger(client: MapClient) -> Iterator[Stranger]:
     ],
     ids=range(11),
 )
-def test_junk_is_answered_with_an_error(client: MapClient, stranger: Stranger, parts: list[bytes]) -> None:
-    kind, header = stranger.ask(parts)
+def test_junk_is_answered_with_an_error(client: MapClient, raw: RawClient, parts: list[bytes]) -> None:
+    kind, header = raw.ask(parts)
     assert kind == b"error" and msgpack.unpackb(header)["error"] == "CodecError"
     assert client.info().version == 14
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_every_mutated_question_is_answered(client: MapClient, stranger: Stranger, data: st.DataObject) -> None:
+def test_every_mutated_question_is_answered(client: MapClient, raw: RawClient, data: st.DataObject) -> None:
     parts = [bytearray(p) for p in data.draw(st.sampled_from(good_questions()))]
     for _ in range(data.draw(st.integers(1, 3))):
         part = data.draw(st.sampled_from(parts))
         where = data.draw(st.integers(0, len(part)))
         part[where : where + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=4))
-    kind = stranger.ask([b"", *map(bytes, parts)])[0]
-    assert kind in {b"error", *(name.encode() for name in messages.QUESTIONS)}
+    kind = raw.ask([b"", *map(bytes, parts)])[0]
+    assert kind in {b"error", *(name.encode() for name in QUESTIONS)}
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=12, max_size=12), st.floats(-1e308, 1e308))
-def test_every_number_is_answered(client: MapClient, stranger: Stranger, values: list[float], scalar: float) -> None:
-    points = {"points": np.array(values).reshape(-1, 3)}
-    rays = {"origins": np.array(values[:6]).reshape(-1, 3), "directions": np.array(values[6:]).reshape(-1, 3)}
+def test_every_number_is_answered(client: MapClient, raw: RawClient, values: list[float], scalar: float) -> None:
+    points = np.array(values).reshape(-1, 3)
     three = tuple(v if np.isfinite(v) else 0.0 for v in values[:3])
     for question in (
-        encode_request("at", messages.AtRequest(radius_m=scalar, **points)),
-        encode_request("occupancy", messages.OccupancyRequest(**points)),
-        encode_request("cast_rays", messages.RaysRequest(max_m=scalar, **rays)),
-        encode_request("nearest", messages.NearestRequest(class_name="cup", point=three)),
-        encode_request("instances", messages.InstancesRequest(up=three)),
-        encode_request("distance_field", messages.DistanceRequest(lower=three, upper=(scalar, 1.0, 1.0))),
+        encode_request("at", AtRequest(radius_m=scalar, points=points)),
+        encode_request("occupancy", OccupancyRequest(points=points)),
+        encode_request("cast_rays", RaysRequest(max_m=scalar, origins=points[:2], directions=points[2:])),
+        encode_request("nearest", NearestRequest(class_name="cup", point=three)),
+        encode_request("instances", InstancesRequest(up=three)),
+        encode_request("distance_field", DistanceRequest(lower=three, upper=(scalar, 1.0, 1.0))),
     ):
-        assert stranger.ask([b"", *question])[0] in {b"error", question[0]}
+        assert raw.ask([b"", *question])[0] in {b"error", question[0]}
 
 
 def test_who_sends_too_much_is_cut_off_and_others_are_not(client: MapClient) -> None:
-    flooder = Stranger(client._socket.endpoint)
+    flooder = RawClient(client._socket.endpoint)
     flooder.socket.send_multipart([b"", b"at", b"", bytes(MAX_REQUEST_BYTES + 1)])
     assert client.info().version == 14
     assert not flooder.socket.poll(100)
@@ -317,8 +330,8 @@ def test_who_sends_too_much_is_cut_off_and_others_are_not(client: MapClient) -> 
 
 
 def test_a_client_that_takes_no_answers_stops_nobody(client: MapClient) -> None:
-    lazy = Stranger(client._socket.endpoint)
-    question = encode_request("points_in_box", messages.BoxRequest(lower=(-1.0,) * 3, upper=(1.0,) * 3))
+    lazy = RawClient(client._socket.endpoint)
+    question = encode_request("points_in_box", BoxRequest(lower=(-1.0,) * 3, upper=(1.0,) * 3))
     lazy.socket.setsockopt(zmq.RCVHWM, 1)
     for _ in range(300):
         lazy.socket.send_multipart([b"", *question])
@@ -444,3 +457,160 @@ def test_what_moves_is_an_obstacle_while_it_is_there() -> None:
         assert (field.state == State.MOVING).any() and not field.distance_m[field.state == State.MOVING].any()
         space.clear()
         assert (client.occupancy(points) != State.MOVING).all()
+
+
+@pytest.fixture
+def held(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, threading.Event]]:
+    """`instances` hangs: set once it does, and to be set to let it go on."""
+    hangs, may_go_on = threading.Event(), threading.Event()
+    update = InstanceTracker.update
+
+    def hang(self: InstanceTracker, snapshot: MapSnapshot) -> tuple[Instance, ...]:
+        hangs.set()
+        assert may_go_on.wait(60)
+        return update(self, snapshot)
+
+    monkeypatch.setattr(InstanceTracker, "update", hang)
+    yield hangs, may_go_on
+    may_go_on.set()
+
+
+def instances_along(up: tuple[float, float, float], **about: Any) -> list[bytes]:
+    return [b"", *encode_request("instances", InstancesRequest(up=up, **about))]
+
+
+def test_a_long_question_delays_no_short_one_but_of_its_own_client(
+    client: MapClient, held: tuple[threading.Event, threading.Event]
+) -> None:
+    hangs, may_go_on = held
+    first, second = RawClient(client._socket.endpoint), RawClient(client._socket.endpoint)
+    first.socket.send_multipart(instances_along((0.0, 0.1, 1.0)))
+    assert hangs.wait(60)
+    second.socket.send_multipart(instances_along((0.0, 0.2, 1.0)))
+    poses = {"stamps_ns": np.ones(1, np.int64), "camera": np.zeros(1, np.uint8), "poses": np.eye(4)[None]}
+    second.socket.send_multipart(
+        [b"", *encode_request("correct_poses", CorrectPosesRequest(id="a", cameras=("",), **poses))]
+    )
+    for _ in range(3):
+        assert_equal_fields(client.at(PLACES[:9]), at(whole(), PLACES[:9]))
+    first.socket.send_multipart([b"", *good_questions()[0]])
+    assert not first.socket.poll(200) and not second.socket.poll(0)
+    may_go_on.set()
+    for raw, names in ((first, [b"instances", b"info"]), (second, [b"instances", b"error"])):
+        for name in names:
+            assert raw.socket.poll(60_000)
+            assert raw.socket.recv_multipart()[1] == name
+        raw.socket.close()
+
+
+def test_a_client_with_too_many_long_questions_is_refused(
+    client: MapClient, held: tuple[threading.Event, threading.Event]
+) -> None:
+    hangs, may_go_on = held
+    greedy = RawClient(client._socket.endpoint)
+    for _ in range(query_service.MAX_OF_CLIENT):
+        greedy.socket.send_multipart(instances_along((0.3, 0.1, 1.0)))
+    assert hangs.wait(60)
+    kind, header = greedy.ask(instances_along((0.3, 0.1, 1.0)))
+    assert kind == b"error" and "too many questions wait" in msgpack.unpackb(header)["text"]
+    assert client.info().version == 14
+    may_go_on.set()
+    for _ in range(query_service.MAX_OF_CLIENT):
+        assert greedy.socket.poll(60_000)
+        assert greedy.socket.recv_multipart()[1] == b"instances"
+    greedy.socket.close()
+
+
+def test_a_repeated_question_keeps_its_turn_and_one_that_nobody_awaits_is_not_computed(
+    held: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs, may_go_on = held
+    with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
+        sockets = [RawClient(service.endpoint) for _ in range(5)]
+        under_way, first, again, other, silent = (raw.socket for raw in sockets)
+        under_way.send_multipart(instances_along((0.0, 0.1, 1.0), asker="u"))
+        assert hangs.wait(60)
+        for socket, asker, waits_s, y in ((first, "a", 60.0, 0.2), (silent, "c", 0.1, 0.4)):
+            socket.send_multipart(instances_along((0.0, y, 1.0), asker=asker, waits_s=waits_s))
+        assert eventually(lambda: len(service._pending) == 3, 20)
+        again.send_multipart(instances_along((0.0, 0.2, 1.0), asker="a", waits_s=60.0))
+        other.send_multipart(instances_along((0.0, 0.3, 1.0), asker="u"))  # no longer waits for its first one
+        assert eventually(lambda: len(service._pending) == 4, 20)
+        threading.Event().wait(0.2)
+        may_go_on.set()
+        for socket in (under_way, again, other):
+            assert socket.poll(20_000) and socket.recv_multipart()[1] == b"instances"
+        assert eventually(lambda: (service.abandoned, service.answered) == (1, 3), 20)
+        assert not any(socket.poll(0) for socket in (first, silent))
+        for raw in sockets:
+            raw.socket.close()
+
+
+def test_a_bug_in_an_answer_ends_nothing_and_spoils_no_later_one(
+    client: MapClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    update = InstanceTracker.update
+
+    def half_way(tracker: InstanceTracker, snapshot: MapSnapshot) -> None:
+        update(tracker, snapshot)
+        raise KeyError("a bug")
+
+    monkeypatch.setattr(InstanceTracker, "update", half_way)
+    with pytest.raises(MapError, match="could not compute this: 'a bug'"):
+        client.instances((0.5, 0.5, 1))
+    monkeypatch.undo()
+    assert client.instances((0.5, 0.5, 1))[0].id == 1
+
+
+def test_a_bug_in_a_snapshot_is_reported_and_does_not_reach_the_mapper(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(*arguments: object) -> None:
+        raise KeyError("a bug")
+
+    monkeypatch.setattr(MapMirror, "apply", wrong)
+    with answering(endpoint, whole_map()) as service:
+        with MapClient(endpoint, timeout_s=60) as client, pytest.raises(MapError, match="busy, or ending"):
+            client.info()
+        assert not service.alive and "no longer answered" in service.status().warnings[0]
+        service.follow()
+        service.hand_over()
+
+
+def test_the_first_question_waits_for_all_of_a_large_map(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(query_service, "MAX_BLOCKS", 50)
+    voxel_map, copies = small_map(LABELS), []
+    for seq, pose in enumerate(poses(14)):
+        integrate(voxel_map, pose, seq)
+    copy = VoxelMap.copy_changes
+    monkeypatch.setattr(VoxelMap, "copy_changes", lambda self, *a: copies.append(a) or copy(self, *a))
+    with QueryService(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
+        with pytest.raises(MapError, match="only answers questions"):  # not about the map: nothing is copied
+            client.correction()
+        assert not service.used
+        raw = RawClient(endpoint)
+        raw.socket.send_multipart([b"", *good_questions()[0]])
+        assert eventually(lambda: service.used, 20)
+        with pytest.raises(MapError, match="only answers questions"):
+            client.correct_poses({1: np.eye(4)})
+        assert eventually(lambda: service.follow() or bool(raw.socket.poll(0)), 20)
+        header = msgpack.unpackb(raw.socket.recv_multipart()[2])
+        assert header["map"]["version"] == voxel_map.version and len(copies) > 1
+        raw.socket.close()
+
+
+def test_where_the_mapper_is_busy_the_last_snapshot_answers_or_an_error(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(query_service, "CATCH_UP_S", 0.2)
+    monkeypatch.setattr(query_service, "LISTENED_S", 0.0)
+    voxel_map, places = small_map(LABELS), iter(poses(2))
+    integrate(voxel_map, next(places), 0)
+    with QueryService(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
+        for _ in range(2):
+            with pytest.raises(MapError, match="busy, or ending"):
+                client.info()
+        service.hand_over()  # as before its thread writes the map: somebody has asked
+        assert client.info().version == 1
+        integrate(voxel_map, next(places), 1)
+        assert client.info().version == 1

@@ -20,13 +20,13 @@ from semantic_mapper.nodes.camera.node import Playback
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.resume import (
+    continue_map,
     forbid,
-    go_on,
     keep_earlier,
     note_worlds,
     noted_worlds,
+    resume_map,
     stored_settings,
-    take_up,
 )
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
@@ -60,10 +60,10 @@ def assert_same(left: VoxelMap, right: VoxelMap) -> None:
 
 def test_map_saved_in_this_launch_is_gone_on_with_as_if_nothing_had_happened(tmp_path: Path) -> None:
     path, folder = tmp_path / "map.npz", tmp_path / "notes"
-    assert take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS)) == ""
+    assert resume_map(context(folder, 0), path, VoxelMap(CONFIG, ROOMS)) == ""
     some_map(3).save(path)
     resumed = VoxelMap(CONFIG, ROOMS)
-    said = take_up(context(folder, 1), path, resumed)
+    said = resume_map(context(folder, 1), path, resumed)
     assert said == "the mapper was restarted and went on from the map saved after 3 frames"
     for frame in tiny_frames(6)[3:]:
         assert frame.depth_m is not None
@@ -76,25 +76,27 @@ def test_map_of_an_earlier_run_is_no_map_of_this_one(tmp_path: Path) -> None:
     path, folder = tmp_path / "map.npz", tmp_path / "notes"
     some_map(2).save(path)
     before = path.read_bytes()
-    take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))
+    resume_map(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))
     fresh = VoxelMap(CONFIG, ROOMS)
-    assert "began an empty map: none had been saved" in take_up(context(folder, 1), path, fresh)
+    assert "began an empty map: none had been saved" in resume_map(context(folder, 1), path, fresh)
     assert fresh.frames == 0 and path.read_bytes() == before
     some_map(4).save(path)  # by the first restarted one
-    assert "after 4 frames" in take_up(context(folder, 2), path, fresh)
+    assert "after 4 frames" in resume_map(context(folder, 2), path, fresh)
 
 
 def test_a_run_that_goes_on_keeps_its_settings_but_for_what_the_stored_data_means(tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     some_map(2).save(path)
     user = VoxelMapConfig(memory_mb=400, unknown_below=0.3)
-    settings = stored_settings(MapperConfig(voxel_map=user), {"memory_mb", "unknown_below"}, path).voxel_map
+    toml = tmp_path / "a.toml"
+    toml.write_text("[voxel_map]\nmemory_mb = 400\nunknown_below = 0.3\n")
+    settings = stored_settings(MapperConfig(voxel_map=user), toml, 0.0, path).voxel_map
     assert (settings.voxel_size_m, settings.memory_mb, settings.unknown_below) == (0.05, 400, 0.3)
     loaded, fresh = VoxelMap.load(path, config=settings), VoxelMap(settings, ROOMS)
     assert loaded.config == settings
     fresh.take_over(loaded)
     assert_same(fresh, some_map(2))
-    other = stored_settings(MapperConfig(), {"voxel_size_m"}, path).voxel_map
+    other = stored_settings(MapperConfig(), None, 0.02, path).voxel_map
     with pytest.raises(ConfigError, match=r"map.npz: was made with voxel_map.voxel_size_m = 0.05 .* 0.02: leave"):
         VoxelMap.load(path, config=other)
 
@@ -102,18 +104,18 @@ def test_a_run_that_goes_on_keeps_its_settings_but_for_what_the_stored_data_mean
 def test_a_saved_map_is_gone_on_in_where_it_can_be_found_again(tmp_path: Path) -> None:
     saved, fresh = some_map(3), VoxelMap(CONFIG, ROOMS)
     with pytest.raises(ConfigError, match="nothing to find oneself by"):
-        go_on(fresh, saved, "a.npz")
+        continue_map(fresh, saved, "a.npz")
     found = Features(np.zeros((4, 2)), np.ones(4), np.zeros((4, 128), np.uint8))
     again = some_map(3)
     again.places.add(make_place("c", 1, np.eye(4), found, INTRINSICS))
     fresh = VoxelMap(CONFIG, ROOMS)
-    go_on(fresh, again, "a.npz")
+    continue_map(fresh, again, "a.npz")
     assert fresh.frames == 3 and len(fresh.places) == 1
     taken_up = some_map(2)
-    go_on(taken_up, again, "a.npz")  # by a restarted mapper, from what it had saved
+    continue_map(taken_up, again, "a.npz")  # by a restarted mapper, from what it had saved
     assert taken_up.frames == 2
     with pytest.raises(ConfigError, match="go on with the weights"):
-        go_on(VoxelMap(CONFIG, CAMVID11), again, "a.npz")
+        continue_map(VoxelMap(CONFIG, CAMVID11), again, "a.npz")
 
 
 def test_where_worlds_lie_is_noted_for_the_mapper_after_this_one(tmp_path: Path) -> None:
@@ -127,7 +129,7 @@ def test_where_worlds_lie_is_noted_for_the_mapper_after_this_one(tmp_path: Path)
 @pytest.mark.parametrize("case", ["corrected", "damaged", "other settings"])
 def test_map_that_cannot_be_gone_on_with_is_put_aside(tmp_path: Path, case: str) -> None:
     path, folder = tmp_path / "map.npz", tmp_path / "notes"
-    take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))
+    resume_map(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))
     some_map(3).save(path)
     config, why = CONFIG, ""
     if case == "corrected":
@@ -141,18 +143,18 @@ def test_map_that_cannot_be_gone_on_with_is_put_aside(tmp_path: Path, case: str)
         config, why = VoxelMapConfig(voxel_size_m=0.1, initial_blocks=200), "same config"
     saved = path.read_bytes()
     fresh = VoxelMap(config, ROOMS)
-    said = take_up(context(folder, 1), path, fresh)
+    said = resume_map(context(folder, 1), path, fresh)
     assert "began an empty map" in said and why in said and "map-before-restart-1.npz" in said
     assert fresh.frames == 0 and not path.exists()
     assert (tmp_path / "map-before-restart-1.npz").read_bytes() == saved
     again = VoxelMap(config, ROOMS)
-    assert "none had been saved" in take_up(context(folder, 2), path, again)
+    assert "none had been saved" in resume_map(context(folder, 2), path, again)
     assert (tmp_path / "map-before-restart-1.npz").read_bytes() == saved
 
 
 def begin(folder: Path, path: Path, restarts: int) -> str:
     """What a mapper does until its stream begins."""
-    said = take_up(context(folder, restarts), path, VoxelMap(CONFIG, ROOMS))
+    said = resume_map(context(folder, restarts), path, VoxelMap(CONFIG, ROOMS))
     keep_earlier(context(folder, restarts), path)
     return said
 
@@ -181,7 +183,7 @@ def test_earlier_map_is_kept_also_where_the_first_mapper_was_killed_at_once(tmp_
     path, folder = tmp_path / "map.npz", tmp_path / "notes"
     some_map(2).save(path)
     before = path.read_bytes()
-    take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))  # and no stream began
+    resume_map(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))  # and no stream began
     assert "none had been saved" in begin(folder, path, 1)
     (kept,) = tmp_path.glob("earlier-*")
     assert (kept / "map.npz").read_bytes() == before and not path.exists()
@@ -228,7 +230,7 @@ def test_live_launch_into_the_same_folder_keeps_the_map_and_a_replay_replaces_it
     assert list(tmp_path.glob("earlier-*")) == [kept]
 
 
-def test_where_no_note_can_be_written_nodes_go_on(tmp_path: Path) -> None:
+def test_where_no_note_can_be_written_nodes_continue_map(tmp_path: Path) -> None:
     gone = context(tmp_path / "notes", 0)
     (tmp_path / "notes").rmdir()
     assert not forbid(gone, "poses had been corrected")

@@ -15,8 +15,7 @@ from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
-from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.oriented_box import OrientedBox
+from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.replay.exporters.map_files import AXES, ExportRequest, export_map, format_of, parse_up, read_costs
 from semantic_mapper.replay.exporters.rerun_layout import COMPUTED_COLOR, MEASURED_COLOR
 from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file

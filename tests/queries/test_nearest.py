@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semantic_mapper.errors import LabelError, MapError
-from semantic_mapper.queries.lookup import at
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from tests.queries.scene import BALL, BOX, CUP, FLOOR, LABELS, RADIUS, TABLE, surface_of, whole
 

@@ -1,0 +1,328 @@
+"""Questions to the map of a running mapper: what each one has to say, and which type answers it.
+
+Answers are what the functions of this package return. Bytes are the business of ``transport.query_messages``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import CodecError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.correction.pose_correction import CorrectionStatus
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.mapping.worlds import CameraPose
+from semantic_mapper.queries.instances import Instance, OrientedBox
+from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+from semantic_mapper.queries.occupancy import DistanceField
+from semantic_mapper.queries.rays import RayHits
+from semantic_mapper.transport.messages import Count, Finite, Parts, Stamp, Word
+from semantic_mapper.transport.query_messages import Request, decode_request, read_name
+from semantic_mapper.types import Float64, Int32, Int64, UInt8
+
+Point = tuple[Finite, Finite, Finite]
+
+
+@dataclass(frozen=True, slots=True)
+class MapInfo:
+    """What a map is.
+
+    Args:
+        map_id: Another one after the mapper was restarted.
+        version, epoch: ``VoxelMap``'s.
+        blocks: Of 8^3 voxels.
+        voxel_size_m: Edge of a voxel.
+        truncation_voxels: Of the TSDF.
+        label_set: Its classes.
+        scale_known: Whether its lengths are metres.
+    """
+
+    map_id: str
+    version: int
+    epoch: int
+    blocks: int
+    voxel_size_m: float
+    truncation_voxels: float
+    label_set: LabelSet
+    scale_known: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Correction(CorrectionStatus):
+    """Where the corrections of a mapper stand.
+
+    Args:
+        used, left_out: Poses of the request that this answers: with a frame in the history, and without.
+        epoch: Of the map in use: answers of this or a later ``MapInfo.epoch`` are about it.
+    """
+
+    used: int = 0
+    left_out: int = 0
+    epoch: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class WeightsEntry:
+    """Weights that a mapper was started with (version 0) or was offered.
+
+    Args:
+        version: Ascending; 0 = those that it was started with.
+        digest: SHA-256 of the file, hexadecimal.
+        state: What became of them.
+        score, parent_score: Of these, and of those in use then, on the keyframes that judged them.
+        keyframes: That they were learned from.
+        reason: Why they were refused; empty otherwise.
+    """
+
+    version: int
+    digest: str
+    state: Literal["in use", "earlier", "refused", "rolled back"]
+    score: float = 0.0
+    parent_score: float = 0.0
+    keyframes: int = 0
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Which weights a mapper uses, and what became of those that it was offered.
+
+    Args:
+        in_use: Version; 0 = those that it was started with.
+        before: In use before these; None where there were none.
+        wanted: About to be in use; None = nothing changes.
+        taken, refused, rolled_back: How often that has happened.
+        versions: All that it knows of, the oldest first.
+    """
+
+    in_use: int
+    before: int | None
+    wanted: int | None
+    taken: int
+    refused: int
+    rolled_back: int
+    versions: tuple[WeightsEntry, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstanceArrays:
+    """N things as they travel: row n of each array is thing n, and ``voxels`` has those of all, one behind the other.
+
+    Args:
+        label_set: Of the map.
+        id, class_id, confidence, centroid, measured: (N,) and (N, 3), as of ``Instance``.
+        center, size, R_world_box: (N, 3), (N, 3) and (N, 3, 3), as of ``OrientedBox``.
+        voxel_count: (N,) of each thing.
+        voxels: (M, 3) int32.
+        gone_ns: (N,) stamp of the frame at which most of it was gone; -1 = it is there.
+    """
+
+    label_set: LabelSet
+    id: Int64
+    class_id: Int64
+    confidence: Float64
+    centroid: Float64
+    center: Float64
+    size: Float64
+    R_world_box: Float64
+    measured: Float64
+    gone_ns: Int64
+    voxel_count: Int64
+    voxels: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, things: Sequence[Instance], labels: LabelSet) -> Self:
+        """Things of a map with these classes."""
+        count = len(things)
+        return cls(
+            labels,
+            np.array([t.id for t in things], np.int64),
+            np.array([t.class_id for t in things], np.int64),
+            np.array([t.confidence for t in things], np.float64),
+            np.array([t.centroid for t in things], np.float64).reshape(count, 3),
+            np.array([t.box.center for t in things], np.float64).reshape(count, 3),
+            np.array([t.box.size for t in things], np.float64).reshape(count, 3),
+            np.array([t.box.R_world_box for t in things], np.float64).reshape(count, 3, 3),
+            np.array([t.measured for t in things], np.float64),
+            np.array([-1 if t.gone_ns is None else t.gone_ns for t in things], np.int64),
+            np.array([len(t.voxels) for t in things], np.int64),
+            np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
+        )
+
+    def things(self) -> tuple[Instance, ...]:
+        """The things again.
+
+        Raises:
+            CodecError: arrays that do not go together, or a class that the map does not have.
+        """
+        columns = (self.id, self.class_id, self.confidence, self.measured, self.gone_ns, self.voxel_count)
+        arrays = (self.centroid, self.center, self.size, self.R_world_box)
+        fits = len({len(column) for column in (*columns, *arrays)}) == 1 and (self.voxel_count >= 0).all()
+        if not fits or self.voxel_count.sum() != len(self.voxels):
+            raise CodecError("instances: arrays of the answer do not go together")
+        names = dict(zip(self.label_set.ids, self.label_set.names, strict=True))
+        if not np.isin(self.class_id, self.label_set.ids).all():
+            raise CodecError(f"instances: of a class that label set '{self.label_set.name}' does not have")
+        parts: Sequence[Int32] = np.split(self.voxels, np.cumsum(self.voxel_count)[:-1]) if len(self.id) else ()
+        rows = zip(*(column.tolist() for column in columns[:5]), *arrays, parts, strict=True)
+        return tuple(
+            Instance(
+                number,
+                class_id,
+                names[class_id],
+                confidence,
+                centroid,
+                OrientedBox(center, size, R_world_box),
+                voxels,
+                measured,
+                None if gone_ns < 0 else gone_ns,
+            )
+            for number, class_id, confidence, measured, gone_ns, centroid, center, size, R_world_box, voxels in rows
+        )
+
+
+class InfoRequest(Request[MapInfo], frozen=True, kw_only=True):
+    """What the map is."""
+
+
+class AtRequest(Request[PointAnswers], frozen=True, kw_only=True):
+    """What is at points (N, 3); see ``nearest.at``."""
+
+    points: Float64
+    radius_m: Finite | None = None
+
+
+class NearestRequest(Request[NearestSurface | None], frozen=True, kw_only=True):
+    """Where the nearest surface of a class is; see ``nearest.nearest``."""
+
+    class_name: Word
+    point: Point
+    min_confidence: Finite = 0.0
+
+
+class RaysRequest(Request[RayHits], frozen=True, kw_only=True):
+    """What rays meet; see ``rays.cast_rays``."""
+
+    max_m: Finite
+    origins: Float64
+    directions: Float64
+
+
+class BoxRequest(Request[MapPoints], frozen=True, kw_only=True):
+    """Surface points in a box; see ``surface.points_in_box``."""
+
+    takes_long: ClassVar[bool] = True
+    lower: Point
+    upper: Point
+
+
+class InstancesRequest(Request[InstanceArrays], frozen=True, kw_only=True):
+    """Countable things; ``gone``: also those that have gone lately."""
+
+    takes_long: ClassVar[bool] = True
+    up: Point
+    gone: bool = False
+
+
+class OccupancyRequest(Request[UInt8], frozen=True, kw_only=True):
+    """Free, occupied or unknown at points (N, 3); see ``occupancy.occupancy``."""
+
+    points: Float64
+
+
+class DistanceRequest(Request[DistanceField], frozen=True, kw_only=True):
+    """Distances to obstacles in a box; see ``occupancy.distance_field``."""
+
+    takes_long: ClassVar[bool] = True
+    lower: Point
+    upper: Point
+    unknown_is_occupied: bool = False
+
+
+class ChangesRequest(Request[BlockChanges], frozen=True, kw_only=True):
+    """Blocks changed since a version of the map ``map_id``; of another map, all blocks are sent."""
+
+    takes_long: ClassVar[bool] = True
+    since: Count
+    limit: Count = 0  # blocks, see ``VoxelMap.changes``; 0 = all
+    map_id: Word = ""
+
+
+class CorrectPosesRequest(Request[Correction], frozen=True, kw_only=True):
+    """Move the map to corrected poses of its frames.
+
+    ``id`` makes it safe to send it again where an answer was lost: of requests with the same one, the first counts.
+    """
+
+    takes_long: ClassVar[bool] = True
+    about_map: ClassVar[bool] = False
+    id: Word
+    cameras: Annotated[tuple[Word, ...], Meta(min_length=1, max_length=256)]  # ("",) = whichever took the frame
+    until_ns: Stamp | None = None  # see ``MappingPipeline.correct_poses``
+    within_ns: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 0  # how far from a stamp its frame may be
+    stamps_ns: Int64  # (N,)
+    camera: UInt8  # (N,) index of ``cameras``
+    poses: Float64  # (N, 4, 4)
+
+
+class CorrectionRequest(Request[Correction], frozen=True, kw_only=True):
+    """Where corrections stand; of the map itself, which is ahead of its snapshots."""
+
+    about_map: ClassVar[bool] = False
+
+
+class WeightsRequest(Request[Weights], frozen=True, kw_only=True):
+    """Which weights there are; with ``to``, go back to these. To send it twice is as to send it once."""
+
+    about_map: ClassVar[bool] = False
+    to: Count | None = None
+
+
+class PoseRequest(Request[CameraPose | None], frozen=True, kw_only=True):
+    """Where the last frame was taken."""
+
+    about_map: ClassVar[bool] = False
+
+
+class Question(NamedTuple):
+    """One row of the table: the struct of the question, and the type that answers it."""
+
+    request: type[Request[Any]]
+    answer: Any
+
+
+QUESTIONS = {
+    "info": Question(InfoRequest, MapInfo),
+    "at": Question(AtRequest, PointAnswers),
+    "nearest": Question(NearestRequest, NearestSurface | None),
+    "cast_rays": Question(RaysRequest, RayHits),
+    "points_in_box": Question(BoxRequest, MapPoints),
+    "instances": Question(InstancesRequest, InstanceArrays),
+    "occupancy": Question(OccupancyRequest, UInt8),
+    "distance_field": Question(DistanceRequest, DistanceField),
+    "changes": Question(ChangesRequest, BlockChanges),
+    "correct_poses": Question(CorrectPosesRequest, Correction),
+    "correction": Question(CorrectionRequest, Correction),
+    "weights": Question(WeightsRequest, Weights),
+    "pose": Question(PoseRequest, CameraPose | None),
+}
+NAMES = {question.request: name for name, question in QUESTIONS.items()}
+
+
+def decode_question(parts: Parts) -> Request[Any]:
+    """A question of any kind.
+
+    Raises:
+        CodecError: it is none.
+    """
+    name = read_name(parts)
+    if name not in QUESTIONS:
+        raise CodecError(f"unknown question {name!r}; there are {', '.join(QUESTIONS)}")
+    return decode_request(parts, QUESTIONS[name].request)
