@@ -25,8 +25,7 @@ from semantic_mapper.replay.label_folder import (
     read_classes,
 )
 from semantic_mapper.replay.log.sequence import Log
-from semantic_mapper.training.select import Candidate, candidate_from_frame
-from semantic_mapper.training.suggest import Suggestion, suggest_frames
+from semantic_mapper.training.select import Candidate, Suggestion, candidate_from_frame, suggest_frames
 
 MAX_CANDIDATES = 1000  # frames that are looked at, evenly spread over a longer log
 

@@ -26,7 +26,7 @@ from semantic_mapper.config import (
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.segments import Segments
 from semantic_mapper.nodes.fleet.results import ClassRow, EventRow, Findings, SegmentRow
-from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.training.config import FinetuneConfig
 
 if TYPE_CHECKING:
     from semantic_mapper.replay.session import MapSession
