@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
@@ -44,7 +45,7 @@ class PoseEstimate:
     """Where a camera was.
 
     Args:
-        T_world_camera: (4, 4) float64; of sources that tell where a rig is (``tells_of_rig``), T_world_rig.
+        T_world_camera: (4, 4) float64; of sources of a rig's poses (``poses_of_rig``), T_world_rig.
         source: What says so ("odometry", "board", "vio", ...); becomes ``PosedFrame.pose_source``.
         sigma: One-sigma position uncertainty in metres; 0 = not known.
         world: Which world the pose is in, where that begins with the source; becomes ``PosedFrame.world``.
@@ -139,20 +140,40 @@ class Camera(Protocol):
         ...
 
 
-@runtime_checkable
-class PoseSource(Protocol):
-    """Something that knows where a camera was; used as a context manager."""
+class PoseSource:
+    """Base of what knows where a camera was; used as a context manager."""
+
+    def __init__(self) -> None:
+        self._warnings: tuple[str, ...] = ()
+        self._counters: Counter[str] = Counter()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One sentence for each thing that does not work as it should now; any thread may ask."""
+        return self._warnings
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Totals since it was opened, by name; any thread may ask."""
+        return Counter(self._counters)
 
     def __enter__(self) -> Self:
         """Open it."""
-        ...
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Free it."""
-        ...
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose of an image, in the order of capture; None where it is not known (lost, too old): no frame then."""
-        ...
+        raise NotImplementedError
+
+    def correction(self, final: bool = False) -> CorrectedWorld | None:
+        """New poses of past images where a loop was closed, once after each change; to be called after each ``pose``.
+
+        Args:
+            final: No more images will come: finish what is under way.
+        """
+        return None

@@ -9,19 +9,33 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import cv2
 import msgspec
 import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent
 
-from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_json, read_toml
-from semantic_mapper.drivers.calibration_yaml import read_calibration_yaml
+from semantic_mapper.config import (
+    MAX_FILE_BYTES,
+    AtLeastOne,
+    Config,
+    Positive,
+    check_values,
+    convert_config,
+    load_config,
+    read_json,
+    read_toml,
+)
 from semantic_mapper.drivers.lens import lens_intrinsics, rectify_maps
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
-from semantic_mapper.files import write_bytes
+from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float32, Float64, UInt8
 
@@ -32,8 +46,15 @@ _YAML = (".yaml", ".yml")
 GUESSED_VIEW_DEG = 60.0  # horizontal, of a camera that nobody has calibrated
 
 
-class CalibrationFile(Config, frozen=True):
-    """A calibration as it stands on disk."""
+WANTED = (
+    "a calibration has fx fy cx cy width height and distortion (TOML); of YAML, ROS's camera_info (image_width, "
+    "image_height, camera_matrix, distortion_model, distortion_coefficients) and Kalibr's (cam0: camera_model, "
+    "intrinsics, distortion_model, distortion_coeffs, resolution) are read"
+)
+
+
+class LensTable(Config, frozen=True):
+    """A camera as it stands in a file."""
 
     fx: Positive
     fy: Positive
@@ -42,9 +63,40 @@ class CalibrationFile(Config, frozen=True):
     width: AtLeastOne
     height: AtLeastOne
     distortion: tuple[float, ...] = ()
+
+
+class CalibrationFile(LensTable, frozen=True):
+    """A calibration as it stands on disk."""
+
     fisheye: bool = False  # the lens is OpenCV's fisheye model, also called equidistant
     T_rig_camera: Matrix | None = None  # of a camera on a rig
     about: dict[str, Any] = msgspec.field(default_factory=dict)  # when, how, how well: for people
+
+
+class StereoFile(Config, frozen=True):
+    """The calibration of a stereo pair as it stands on disk."""
+
+    left: LensTable
+    right: LensTable
+    T_right_left: Matrix
+    swapped: bool = False
+    about: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoCalibration:
+    """A calibrated pair.
+
+    Args:
+        left, right: With distortion, both of one size.
+        T_right_left: (4, 4) from the left camera to the right one, metres.
+        swapped: The right camera's image is in the left half of what the device gives.
+    """
+
+    left: CameraIntrinsics
+    right: CameraIntrinsics
+    T_right_left: Float64
+    swapped: bool = False
 
 
 def load_calibration(path: Path) -> CameraIntrinsics:
@@ -53,7 +105,7 @@ def load_calibration(path: Path) -> CameraIntrinsics:
     Raises:
         ConfigError: missing, of another form, or with impossible values.
     """
-    k = read_calibration_yaml(path) if path.suffix.lower() in _YAML else _intrinsics(_load_file(path), path)
+    k = _load_yaml(path) if path.suffix.lower() in _YAML else _intrinsics(_load_file(path), path)
     if not (0 < k.cx < k.width and 0 < k.cy < k.height):
         raise ConfigError(
             f"{path}: the principal point ({k.cx:g}, {k.cy:g}) is outside of the {k.width}x{k.height} image"
@@ -99,13 +151,59 @@ def save_calibration(
     Raises:
         OSError: it cannot be written.
     """
-    lines = [f"{name} = {getattr(measured, name)!r}" for name in ("fx", "fy", "cx", "cy", "width", "height")]
-    lines.append(f"distortion = {list(measured.distortion)!r}")
+    lines = _lens_lines(measured)
     if isinstance(measured, FisheyeIntrinsics):
         lines.append("fisheye = true")
     if T_rig_camera is not None:
-        lines += ["T_rig_camera = [", *(f"    {row!r}," for row in T_rig_camera.tolist()), "]"]
-    lines += ["", "[about]", *(f"{name} = {_toml_value(value)}" for name, value in about.items())]
+        lines += _matrix_lines("T_rig_camera", T_rig_camera)
+    _write(path, lines, about)
+
+
+def load_stereo(path: Path) -> StereoCalibration:
+    """Read the file of a stereo pair.
+
+    Raises:
+        ConfigError: missing, the calibration of a single camera, of another form, or with impossible values.
+    """
+    try:
+        file = load_config(path, StereoFile)
+        left, right = (
+            CameraIntrinsics(k.fx, k.fy, k.cx, k.cy, k.width, k.height, k.distortion) for k in (file.left, file.right)
+        )
+    except FrameError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{error}; `semantic-mapper calibrate --stereo` makes the file of a pair") from error
+    if (left.width, left.height) != (right.width, right.height):
+        raise ConfigError(
+            f"{path}: the left images are {left.width}x{left.height}, the right ones {right.width}x{right.height}"
+        )
+    return StereoCalibration(left, right, rigid_matrix(file.T_right_left, f"{path}: T_right_left"), file.swapped)
+
+
+def save_stereo(path: Path, pair: StereoCalibration, about: Mapping[str, str | float]) -> None:
+    """Write the file of a pair, TOML, that reads back to the same numbers.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    lines = [f"swapped = {str(pair.swapped).lower()}", *_matrix_lines("T_right_left", pair.T_right_left)]
+    _write(path, [*lines, "", "[left]", *_lens_lines(pair.left), "", "[right]", *_lens_lines(pair.right)], about)
+
+
+def _lens_lines(lens: CameraIntrinsics) -> list[str]:
+    values = [f"{name} = {getattr(lens, name)!r}" for name in ("fx", "fy", "cx", "cy", "width", "height")]
+    return [*values, f"distortion = {list(lens.distortion)!r}"]
+
+
+def _matrix_lines(name: str, T: Float64) -> list[str]:
+    return [f"{name} = [", *(f"    {row!r}," for row in T.tolist()), "]"]
+
+
+def _write(path: Path, lines: list[str], about: Mapping[str, str | float]) -> None:
+    # A JSON string is a TOML one.
+    values = {name: json.dumps(value) if isinstance(value, str) else repr(value) for name, value in about.items()}
+    lines = [*lines, "", "[about]", *(f"{name} = {value}" for name, value in values.items())]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
@@ -115,7 +213,7 @@ def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraInt
 
     Args:
         path: Of the file; empty = none.
-        uncalibrated: Whether the user has asked for images without one.
+        uncalibrated: Whether the user wants images without one.
         camera: For the message.
 
     Raises:
@@ -176,10 +274,6 @@ class Rectifier:
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _toml_value(value: str | float) -> str:
-    return json.dumps(value) if isinstance(value, str) else repr(value)  # a JSON string is a TOML one
-
-
 def _intrinsics(file: CalibrationFile, path: Path) -> CameraIntrinsics:
     try:
         if not file.fisheye and len(file.distortion) in COEFFICIENTS:
@@ -194,3 +288,116 @@ def _intrinsics(file: CalibrationFile, path: Path) -> CameraIntrinsics:
 def _load_file(path: Path) -> CalibrationFile:
     plain = read_json(path, dict) if path.suffix.lower() == ".json" else read_toml(path)
     return convert_config(plain, CalibrationFile, str(path))
+
+
+# What other programs write as YAML: ROS's camera_info (camera_calibration, ``ros2 topic echo``), the same keys in
+# OpenCV's FileStorage, and Kalibr's camera chain.
+
+_Side = Annotated[int, msgspec.Meta(ge=1, le=1 << 14)]
+_Nine = Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)]
+
+
+class _Nines(msgspec.Struct):
+    data: _Nine
+
+
+class _Numbers(msgspec.Struct):
+    data: list[float]
+
+
+class _CameraInfo(msgspec.Struct):
+    """As ``camera_calibration`` and ``camera_info_manager`` write it."""
+
+    image_width: _Side
+    image_height: _Side
+    camera_matrix: _Nines
+    distortion_coefficients: _Numbers
+    distortion_model: str = ""
+
+
+class _CameraInfoMessage(msgspec.Struct):
+    """As the message is printed."""
+
+    width: _Side
+    height: _Side
+    k: _Nine
+    d: list[float]
+    distortion_model: str = ""
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: dict[str, Any] = {}
+
+
+class _KalibrCamera(msgspec.Struct):
+    camera_model: str
+    intrinsics: list[float]
+    distortion_model: str
+    distortion_coeffs: list[float]
+    resolution: tuple[_Side, _Side]
+
+
+def _load_yaml(path: Path) -> CameraIntrinsics:
+    """Read ROS's or Kalibr's calibration.
+
+    Raises:
+        ConfigError: missing, no YAML, of another form, several cameras, or a lens that is not undone.
+    """
+    plain = _read_yaml(path)
+    try:
+        if "camera_matrix" in plain:
+            info = msgspec.convert(plain, _CameraInfo)
+            K, lens = info.camera_matrix.data, info.distortion_coefficients.data
+            return _from_matrix(K, info.distortion_model, lens, (info.image_width, info.image_height))
+        lowered = {key.lower(): value for key, value in plain.items()}  # ROS 1 writes K and D
+        if "k" in lowered:
+            message = msgspec.convert(lowered, _CameraInfoMessage)
+            if message.binning_x > 1 or message.binning_y > 1 or any(message.roi.values()):
+                raise ConfigError("has binning or a region of interest, which is not read: calibrate it whole")
+            return _from_matrix(message.k, message.distortion_model, message.d, (message.width, message.height))
+        return _kalibr(plain)
+    except (msgspec.ValidationError, ConfigError, FrameError) as error:
+        raise ConfigError(f"{path}: {error}; {WANTED}") from error
+
+
+def _from_matrix(K: list[float], model: str, lens: list[float], size: tuple[int, int]) -> CameraIntrinsics:
+    if any(K[i] for i in (1, 3, 6, 7)):
+        raise ConfigError("the camera matrix has skew, which is not undone; calibrate without it")
+    return lens_intrinsics(model, lens, (K[0], K[4], K[2], K[5]), size)
+
+
+def _kalibr(plain: Mapping[str, Any]) -> CameraIntrinsics:
+    cameras = sorted(name for name, value in plain.items() if isinstance(value, Mapping) and "intrinsics" in value)
+    if len(cameras) > 1:
+        raise ConfigError(f"holds the cameras {', '.join(cameras)}; keep the one that is meant in a file of its own")
+    camera = msgspec.convert(plain[cameras[0]] if cameras else plain, _KalibrCamera)
+    if camera.camera_model != "pinhole":
+        raise ConfigError(
+            f"camera_model '{camera.camera_model}' is not read, only pinhole: calibrate with pinhole-equi"
+        )
+    if len(camera.intrinsics) != 4:
+        raise ConfigError(f"intrinsics has {len(camera.intrinsics)} numbers, not fx fy cx cy")
+    fx, fy, cx, cy = camera.intrinsics
+    return lens_intrinsics(camera.distortion_model, camera.distortion_coeffs, (fx, fy, cx, cy), camera.resolution)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    yaml = YAML(typ="safe", pure=True)
+    try:
+        text = read_regular(path, MAX_FILE_BYTES).decode("utf-8-sig")
+        text, of_opencv = re.subn(r"\A%YAML:1\.0\s*|!!opencv-matrix", "", text)  # as OpenCV's FileStorage writes it
+        if any(isinstance(event, AliasEvent) for event in yaml.parse(text)):  # of these, a short file makes a long one
+            raise ConfigError("has aliases (*), which no calibration needs")
+        documents: list[Any] = [document for document in yaml.load_all(text) if document is not None]
+        if any(document != documents[0] for document in documents):  # `ros2 topic echo` prints many, which are one
+            raise ConfigError("holds several calibrations; keep the one that is meant")
+        plain = documents[0] if documents else None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (YAMLError, ValueError, RecursionError) as error:  # ValueError: ConfigError, UTF-8, endless numbers
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(f"{path}: not valid YAML: {reason}; {WANTED}") from error
+    if not isinstance(plain, dict):
+        raise ConfigError(f"{path}: holds no calibration; {WANTED}")
+    check_values(plain, str(path))
+    values = {str(key): value for key, value in cast("dict[Any, Any]", plain).items()}
+    return {"distortion_model": "opencv", **values} if of_opencv else values

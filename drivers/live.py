@@ -1,7 +1,4 @@
-"""Live cameras that OpenCV reads: one thread owns the device, the newest image wins, a lost device is waited for.
-
-The thread is the only one that touches the device, since a read of a stalled stream may hang for seconds.
-"""
+"""Live cameras, whose device may go away and come back: those that OpenCV reads, and those of an SDK that is polled."""
 
 from __future__ import annotations
 
@@ -24,13 +21,19 @@ FIRST_PAUSE_S = 0.1  # before a lost device is tried again; doubles each time
 MAX_PAUSE_S = 1.0
 FAILURES = 3  # reads in a row that give nothing: the device is opened again
 WAIT_SLICE_S = 0.2
+SLICE_S = 0.1  # how soon a polled camera notices a stop
+RETRY_S = 1.0  # between two attempts to find a polled device that has gone
+FUTURE_NS = 100_000_000  # a stamp further ahead of now is wrong
+MIN_HZ = 1e-3  # of a film or camera: one divided by it is still a time
+DRIFT = 2e-4  # how much faster or slower than ours the sender's clock may run
+LATE_NS = 1_000_000_000  # an image is never so much later than the quickest one: then its clock is none
 CLOSE_S = 1.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
 
 _log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
+class RawImage:
     """One image as the device gave it: (H, W, 3) BGR, and when it was captured on the monotonic clock."""
 
     stamp_ns: int
@@ -60,7 +63,7 @@ class Device(Protocol):
         """What it does other than requested."""
         ...
 
-    def read(self) -> Shot | None:
+    def read(self) -> RawImage | None:
         """The next image, waited for; None where none came or it was damaged.
 
         Raises:
@@ -74,7 +77,9 @@ class Device(Protocol):
 
 
 class LiveCamera:
-    """A ``Camera`` over a device that may go away and come back.
+    """A ``Camera`` that OpenCV reads: one thread owns the device, the newest image wins, a lost device is waited for.
+
+    The thread is the only one that touches the device, since a read of a stalled stream may hang for seconds.
 
     Args:
         camera_id: What its images are called.
@@ -102,32 +107,32 @@ class LiveCamera:
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._changed = threading.Condition()
-        self._newest: tuple[int, Shot] | None = None  # number and image; guarded by _changed
+        self._newest: tuple[int, RawImage] | None = None  # number and image; guarded by _changed
         self._seq = -1  # of the last image; only the thread counts
         self._failures = 0  # to open the device again, in a row
         self._heard = self._read_at = self._last_request = 0.0
         self._lost = ""
-        self._device_troubles: tuple[str, ...] = ()
+        self._device_warnings: tuple[str, ...] = ()
 
     @property
     def info(self) -> StreamInfo:
         """As of ``Camera``."""
         if self._info is None:
-            raise CameraError(f"camera '{self._camera_id}' is not open yet")
+            raise CameraError(f"camera '{self._camera_id}' is not open")
         return self._info
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """As of ``Camera``."""
-        told = list(self._device_troubles)
+        warnings = list(self._device_warnings)
         if self._measured is None:
-            told.append("not calibrated: the intrinsics are a guess, good for calibrating only")
+            warnings.append("not calibrated: the intrinsics are a guess, good for calibrating only")
         silent_s = time.monotonic() - self._heard
         if self._lost:
-            told.append(f"{self._lost}; waited for since {silent_s:.0f} s")
+            warnings.append(f"{self._lost}; waited for since {silent_s:.0f} s")
         elif self._thread is not None and silent_s > self._stall_s:
-            told.append(f"no image for {silent_s:.1f} s: the stream has stalled")
-        return tuple(told)
+            warnings.append(f"no image for {silent_s:.1f} s: the stream has stalled")
+        return tuple(warnings)
 
     @property
     def can_wait(self) -> bool:
@@ -200,11 +205,11 @@ class LiveCamera:
                 f"{device.description}: gives images of {device.size[0]}x{device.size[1]}, but was calibrated at "
                 f"{expected[0]}x{expected[1]}; calibrate for a size that it offers"
             )
-        self._device_troubles = device.warnings
+        self._device_warnings = device.warnings
         return device
 
     def _run(self, device: Device) -> None:
-        """Read until told to stop; open it again when it is lost."""
+        """Read until it is stopped; open it again when it is lost."""
         while True:
             try:
                 lost = self._read_on(device)
@@ -213,7 +218,7 @@ class LiveCamera:
             if self._stopping.is_set():
                 return
             self._lost = lost
-            self._seq += 1  # a gap tells of it, even if nothing else was lost
+            self._seq += 1  # a gap shows it, even if nothing else was lost
             _log.warning("camera_lost", camera=self._camera_id, reason=lost)
             again = self._open_again()
             if again is None:
@@ -231,7 +236,7 @@ class LiveCamera:
                 return str(error)
             now = self._read_at = time.monotonic()
             self._seq += 1
-            self._device_troubles = device.warnings
+            self._device_warnings = device.warnings
             if shot is None:
                 failures += 1
                 if failures >= FAILURES or now - began >= self._stall_s:
@@ -256,3 +261,149 @@ class LiveCamera:
             except CameraError as error:
                 self._lost = str(error)
         return None
+
+
+class StreamEnded(Exception):  # noqa: N818 -- an event, not an error: the camera is gone and may come back
+    """The device has gone, or gives nothing any more; the text says which."""
+
+
+class PolledCamera:
+    """Base of a ``Camera`` over an SDK that is polled; a device that goes away is looked for until it is back.
+
+    Args:
+        camera_id: What its images are called.
+    """
+
+    def __init__(self, camera_id: str) -> None:
+        self._camera_id = camera_id
+        self._stopped = threading.Event()
+        self._connected = False
+        self._info: StreamInfo | None = None
+        self._last_poll_time = 0.0
+
+    @property
+    def info(self) -> StreamInfo:
+        """Name and intrinsics of the device.
+
+        Raises:
+            CameraError: it is not open.
+        """
+        if self._info is None:
+            raise CameraError(f"camera '{self._camera_id}' is not open")
+        return self._info
+
+    @property
+    def can_wait(self) -> bool:
+        """As of ``Camera``."""
+        return False
+
+    @property
+    def last_poll_time(self) -> float:
+        """As of ``Camera``."""
+        return self._last_poll_time
+
+    def __enter__(self) -> Self:
+        """Open the device and wait for its first image.
+
+        Raises:
+            CameraError: it is not there, or cannot do what the config asks for.
+        """
+        self._connect(again=False)
+        self._connected = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Free the device."""
+        self._disconnect()
+
+    def stop(self) -> None:
+        """As of ``Camera``."""
+        self._stopped.set()
+
+    def __iter__(self) -> Iterator[CameraImage]:
+        """Images in the order of capture, until ``stop``; a device that goes away is waited for.
+
+        Raises:
+            CameraError: not open, or what comes is not what was requested.
+        """
+        source = self.info.source
+        while not self._stopped.is_set():
+            self._last_poll_time = time.monotonic()
+            if self._connected:
+                try:
+                    yield from self._images()
+                except StreamEnded as end:
+                    self._connected = False
+                    self._warn_of_device(f"{source}: {end}; it is looked for every {RETRY_S:g} s")
+                    _log.warning("camera_lost", camera=self._camera_id, device=source, reason=str(end))
+                    self._disconnect()
+            elif not self._stopped.wait(RETRY_S):
+                try:
+                    self._connect(again=True)
+                    self._connected = True
+                except CameraError as error:
+                    self._warn_of_device(f"{source} is away: {error}")
+                else:
+                    self._check_after_return()
+
+    def _connect(self, *, again: bool) -> None:
+        """Open the device, start it, and set ``_info``; ``again``: it was away, and is looked for once.
+
+        Raises:
+            CameraError: it does not work, and nothing is left open.
+        """
+        raise NotImplementedError
+
+    def _images(self) -> Iterator[CameraImage]:
+        """Images of one connection.
+
+        Raises:
+            StreamEnded: at its end.
+        """
+        raise NotImplementedError
+
+    def _disconnect(self) -> None:
+        """Free the device; one that has gone already is no error."""
+        raise NotImplementedError
+
+    def _warn_of_device(self, text: str) -> None:
+        """Keep it for ``warnings``, until an image comes."""
+        raise NotImplementedError
+
+    def _check_after_return(self) -> None:
+        """Raise ``CameraError`` where the camera must not continue after its device was away."""
+
+
+def nominal_hz(reported: float) -> float:
+    """A rate as a container or a device reports it; 0 for what cannot be one."""
+    return reported if MIN_HZ <= reported <= 1000 else 0.0
+
+
+class StreamClock:
+    """Stamps images by the sender's clock.
+
+    An image needs at least as long as the quickest one, so the least distance between arrival and the sender's time
+    is the distance of the clocks (plus the way of that quickest image). It may grow by ``DRIFT``.
+    """
+
+    def __init__(self) -> None:
+        self.trustworthy = True
+        self._offset_ns: float | None = None
+        self._last_arrival_ns = 0
+        self._last_sent_ns = 0
+
+    def stamp_ns(self, sent_ns: int, arrived_ns: int) -> int:
+        """When an image was sent, on our clock; when it arrived, from when on the sender's clock is not one."""
+        distance = float(arrived_ns - sent_ns)
+        if self._offset_ns is None:
+            self._offset_ns = distance
+        elif sent_ns <= self._last_sent_ns:
+            self.trustworthy = False
+        else:
+            grown = self._offset_ns + DRIFT * (arrived_ns - self._last_arrival_ns)
+            self._offset_ns = min(distance, grown)
+            self.trustworthy = self.trustworthy and distance - self._offset_ns < LATE_NS
+        self._last_arrival_ns, self._last_sent_ns = arrived_ns, sent_ns
+        return round(sent_ns + self._offset_ns) if self.trustworthy else arrived_ns

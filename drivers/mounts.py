@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from semantic_mapper.drivers.calibration import Matrix, load_mount, rigid_matrix
-from semantic_mapper.drivers.poses.config import PoseConfig, tells_of_rig
+from semantic_mapper.drivers.poses.config import PoseConfig, poses_of_rig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import Float64
 
@@ -21,28 +21,28 @@ class Mount:
 
     Args:
         T_rig_camera: (4, 4); None where nobody has said.
-        asked: Whether the settings name it; a calibration file just has it.
+        requested: Whether the settings name it; a calibration file just has it.
         camera: For messages.
     """
 
     T_rig_camera: Float64 | None
-    asked: bool
+    requested: bool
     camera: str
 
     def for_poses(self, poses: PoseConfig) -> Float64 | None:
         """T_rig_camera where poses are those of the rig; None where they are the camera's own.
 
         Raises:
-            ConfigError: it is needed and not known, or asked for and without effect.
+            ConfigError: it is needed and not known, or requested and without effect.
         """
-        if tells_of_rig(poses):
+        if poses_of_rig(poses):
             if self.T_rig_camera is None:
                 raise ConfigError(
                     f"{self.camera}: its poses are those of a rig, and nothing says where it sits there; give "
                     "T_rig_camera, or a calibration file that has one (`semantic-mapper calibrate` with all cameras)"
                 )
             return self.T_rig_camera
-        if self.asked:
+        if self.requested:
             raise ConfigError(
                 f'{self.camera}: has a T_rig_camera, but its poses (kind "{poses.kind}") are the camera\'s own; of a '
                 'rig they are with T_base_rig (kind "topic") or T_world_rig (kind "fixed")'

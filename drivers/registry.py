@@ -54,7 +54,7 @@ class Driver(Protocol):
         """What is connected now; opens nothing for longer than a question.
 
         Raises:
-            CameraError, DependencyError: nobody can tell.
+            CameraError, DependencyError: it cannot be searched for.
         """
         ...
 
@@ -95,7 +95,7 @@ def open_camera(kind: str, config: Mapping[str, Any], camera_id: str, where: str
 
 
 def find_cameras(kinds: Sequence[str] = KINDS) -> tuple[list[FoundCamera], dict[str, str]]:
-    """All cameras that are connected, and why a kind could not be asked.
+    """All cameras that are connected, and why a kind could not be searched for.
 
     Raises:
         ConfigError: no such kind.

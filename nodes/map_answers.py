@@ -10,7 +10,6 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.tiles import TileManifest
 from semantic_mapper.mapping.map_scale import length_unit, scale_name
 from semantic_mapper.plain_text import counted
 from semantic_mapper.queries.graph import SceneGraph
@@ -48,31 +47,6 @@ def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
         "upper": _rounded(xyz.max(axis=0)) if len(xyz) else None,
         "label_set": labels.name,
         "classes": counts,
-    }
-
-
-def describe_tiles(manifest: TileManifest) -> dict[str, Any]:
-    """The same of a map in tiles, of which none is read."""
-    labels, size = manifest.label_set, manifest.config.voxel_size_m
-    rows = [row.surface for row in manifest.tiles]
-    voxels, measured = sum(row.voxels for row in rows), sum(row.measured for row in rows)
-    lower = [row.lower for row in rows if row.lower is not None]
-    upper = [row.upper for row in rows if row.upper is not None]
-    extents = {name: [row.classes[name].voxels for row in rows if name in row.classes] for name in labels.names}
-    return {
-        "question": "info",
-        "frames": manifest.frames,
-        "scale": manifest.scale,
-        "voxel_size_m" if manifest.scale_known else "voxel_size": size,
-        "blocks": manifest.blocks,
-        "surface_voxels": voxels,
-        "computed": round(1 - measured / voxels, DIGITS) if voxels else None,
-        "without_class": sum(row.without_class for row in rows),
-        "lower": _rounded(np.min(lower, axis=0) * size) if lower else None,
-        "upper": _rounded(np.max(upper, axis=0) * size) if upper else None,
-        "label_set": labels.name,
-        "classes": {name: sum(counts) for name, counts in extents.items()},
-        "tiles": len(manifest.tiles),
     }
 
 

@@ -257,7 +257,7 @@ def _settings(request: AutolabelRequest) -> str:
 
 
 def _writer(reader: LogReader, path: Path, label_set: LabelSet | None, name: str) -> AbstractContextManager[LogWriter]:
-    """A new log, or part of one, with what the old one keeps beside its messages."""
+    """A new log, or part of one, with what the old one keeps next to its messages."""
     kept = [a for a in reader.attachments().values() if a.name not in (PART_ATTACHMENT, AUTOLABEL_ATTACHMENT)]
     if (part := read_part(reader)) is not None:
         kept.append(Part(f"{part.recording[:64]}-{name}", part.part).attachment())
@@ -310,7 +310,7 @@ class _Labeller:
     Args:
         bundle: What renders.
         label_set: Of the labels to write; None = no labels are written.
-        request: What was asked for.
+        request: What is requested.
     """
 
     def __init__(self, bundle: Mapper, label_set: LabelSet | None, request: AutolabelRequest) -> None:

@@ -261,10 +261,10 @@ def _each_once(
             kept.append(box)
         else:
             more.append((number, box.id, f"id {box.id} is that of box {first}; give it another"))
-    told = [
+    sentences = [
         f"box {n}{'' if i is None else f' (id {i})'}: {problem}" for n, i, problem in sorted(more, key=lambda b: b[0])
     ]
-    return tuple(kept), tuple(told)
+    return tuple(kept), tuple(sentences)
 
 
 def _merged(boxes: BoxFile, label_set: LabelSet) -> BoxFile:

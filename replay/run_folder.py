@@ -16,9 +16,7 @@ from semantic_mapper.log_events import get_logger
 MAP_NAME = "map.npz"
 MAP_SUFFIX = ".npz"
 LOG_SUFFIX = ".mcap"
-TILES_NAME = "tiles.json"
 STORE_MARK = "fleet.json"
-SOCKETS = ("ipc", "inproc", "tcp")  # schemes of running mappers
 
 _log = get_logger(__name__)
 
@@ -121,11 +119,9 @@ def map_path(path: Path) -> Path:
 
 def _instead_of_map(folder: Path) -> str:
     """What to do about a folder without a map, from what is in it."""
-    if holds_tiles(str(folder)):
-        return "it holds a map in tiles, which `query` and `export` read"
     maps = sorted(file.name for file in folder.glob(f"*{MAP_SUFFIX}"))
     if (folder / STORE_MARK).is_file():
-        return "a fleet's store, and no merge into it has finished; run `fleet merge` again, or name a map in results/"
+        return "a fleet's store: `fleet merge` fuses its maps; or name one of them in files/"
     if maps:
         return f"name the map itself, such as {folder / maps[0]}"
     results = sorted(file.parent.name for file in folder.glob(f"*/{MAP_NAME}"))
@@ -134,13 +130,6 @@ def _instead_of_map(folder: Path) -> str:
     if is_log(folder):
         return f"its logs hold frames: `semantic-mapper replay {folder} --out FOLDER` makes a map of them"
     return "give a saved map or a folder that `replay` has written"
-
-
-def holds_tiles(source: str) -> bool:
-    """Whether a map in tiles is meant, as `fleet merge` writes it: a folder with their manifest, this, or a URL."""
-    scheme, found, _ = source.partition("://")
-    path = Path(source)
-    return scheme not in SOCKETS if scheme and found else path.name == TILES_NAME or (path / TILES_NAME).is_file()
 
 
 def refuse_overwriting(out: Path, *sources: Path) -> None:

@@ -199,7 +199,7 @@ class KeyframeConfig(Config, frozen=True):
 class VoxelMapConfig(Config, frozen=True):
     """The fused map."""
 
-    voxel_size_m: Annotated[float, msgspec.Meta(ge=1e-4, le=10)] = 0.02
+    voxel_size_m: Annotated[float, msgspec.Meta(ge=1e-4, le=10)] = 0.02  # edge of a voxel
     truncation_voxels: Annotated[float, msgspec.Meta(gt=0, le=64)] = 4.0
     depth_max_m: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 5.0
     max_weight: Positive = 255.0  # cap of the TSDF weight, so that the map stays able to change
@@ -298,8 +298,8 @@ DepthSource = Literal["auto", "sensor", "computed", "off"]
 class DepthConfig(Config, frozen=True):
     """Where the depth of frames comes from."""
 
-    # "auto": the sensor's, and computed from the pictures where a frame has none; "computed": always from the pictures;
-    # "sensor": the sensor's, and rendered by the field where a frame has none; "off": always rendered by the field
+    # "auto": the sensor's, and computed from the pictures where a frame has none; "computed": always computed;
+    # "sensor", "off": rendered by the field where a frame has none, or always
     source: DepthSource = "auto"
     from_motion: DepthFromMotionConfig = DepthFromMotionConfig()
     # Whether given poses are made to fit the pictures where depth is computed from these; without, poses that are some
@@ -343,8 +343,8 @@ class MapperConfig(Config, frozen=True):
     virtual: VirtualViewConfig = VirtualViewConfig()
     moving: MovingConfig = MovingConfig()
     render: RenderConfig = RenderConfig()
-    quality: Quality = "custom"  # any other sets samples and rays; see ``with_quality``
-    seed: int = 0
+    quality: Quality = "custom"  # "fast", "balanced", "reference": few, some or all rays and samples; else as set
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0  # of everything that is drawn at random
 
 
 def with_quality(config: MapperConfig) -> MapperConfig:

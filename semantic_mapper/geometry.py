@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import cv2  # SciPy has slerp, too, but a machine that only trains and renders lacks it
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
@@ -123,6 +123,28 @@ def invert_pose(T_a_b: Float64) -> Float64:
     T_b_a[..., :3, 3] = -(R_b_a @ T_a_b[..., :3, 3:])[..., 0]
     T_b_a[..., 3, 3] = 1
     return T_b_a
+
+
+def make_pose(turn: ArrayLike, position: ArrayLike) -> Float64:
+    """The pose (4, 4) of a rotation vector and a position, three numbers each."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.asarray(turn, np.float64))[0]
+    T[:3, 3] = np.ravel(position)
+    return T
+
+
+def nearest_pose(T: Float64) -> Float64:
+    """The rigid transform nearest to a (4, 4) whose rotation is inexact, such as by rounding errors that add up."""
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    exact = T.copy()
+    exact[:3, :3] = u @ vt
+    return exact
+
+
+def pose_distance(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]:
+    """Metres and radians between two poses (4, 4)."""
+    T_a_b = invert_pose(T_world_a) @ T_world_b
+    return float(np.linalg.norm(T_a_b[:3, 3])), float(np.linalg.norm(rotation_vector(T_a_b)))
 
 
 def look_at(eye: Float64, target: Float64, up: Float64) -> Float64:

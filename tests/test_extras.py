@@ -66,7 +66,6 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh
             for arguments in (
                 ["fleet", "run", "replay", __file__, "--out", "none"],
                 ["fleet", "table", "none"],
-                ["train", "--out", "none", "--ray", "local"],
             )
         ),
     ],

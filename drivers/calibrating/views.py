@@ -1,4 +1,4 @@
-"""Views of a board: found in images, and those kept that say something new."""
+"""Views of a board: found in images, those kept that say something new, and what they still lack, in words."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.coverage import area_counts, shortfalls, tilt_degrees
 from semantic_mapper.drivers.calibration import guess_intrinsics
 from semantic_mapper.drivers.poses.board import BoardFinder, board_poses, pose_of_vector
 from semantic_mapper.drivers.poses.config import BoardPoses
@@ -18,6 +18,15 @@ from semantic_mapper.errors import CameraError
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 NEW = 0.08  # least distance of a view from those kept; see ``_signature``
+MIN_CORNERS = 8  # seen, for an image to be used
+MAX_VIEWS = 60  # those beyond say nothing new
+MIN_TILT_DEG = 15.0  # the board leans so far at least once, both up or down and to a side
+STEADY_PX = 1.5  # streams: further than this a corner moves only while the board is not held still
+MAX_APART_NS = 20_000_000  # images of two cameras so far apart in time count as taken at once
+CELLS = 6  # a side; the image is divided into this many cells
+REGIONS = ("top left", "top", "top right", "left", "middle", "right", "bottom left", "bottom", "bottom right")
+_ACROSS = 3  # regions a side
+_SEEN_CELLS = 2  # of the four of a region that must have corners in them
 FLAT = 0.05  # corners whose spread across their main line is below this fraction of it are on a line
 
 
@@ -82,11 +91,11 @@ class ViewGatherer:
         self.images += 1
         points, pixels = self._finder.find(image.rgb)
         before, self._last = self._last, None
-        if len(points) < self._config.min_corners or _on_a_line(pixels):
+        if len(points) < MIN_CORNERS or _on_a_line(pixels):
             return False
         self.seen += 1
         view = self._last = BoardView(name or f"image {image.seq}", image.stamp_ns, points, pixels)
-        if self._stream and self._config.steady_px and not _stands_still(before, view, self._config.steady_px):
+        if self._stream and not _stands_still(before, view):
             return False
         self.steady.append(view)
         return self._keep(view, size)
@@ -99,7 +108,7 @@ class ViewGatherer:
         return shortfalls(self._config, len(self.kept), area_counts([v.pixels for v in self.kept], self.size), tilts)
 
     def _keep(self, view: BoardView, size: tuple[int, int]) -> bool:
-        if len(self.kept) >= self._config.max_views:
+        if len(self.kept) >= MAX_VIEWS:
             return False
         found = _signature(view, size)
         if found is None:
@@ -113,21 +122,71 @@ class ViewGatherer:
         return True
 
 
-def simultaneous(views: Mapping[str, Sequence[BoardView]], config: CalibrationConfig) -> list[dict[str, BoardView]]:
+def simultaneous(views: Mapping[str, Sequence[BoardView]]) -> list[dict[str, BoardView]]:
     """Views of several cameras, grouped by when they were taken: at least two cameras each, evenly thinned out."""
-    apart_ns = round(config.max_apart_s * 1e9)
     events = sorted(((v.stamp_ns, name, v) for name, own in views.items() for v in own), key=lambda e: e[:2])
     groups: list[dict[str, BoardView]] = []
     began_ns = 0
     for stamp_ns, name, view in events:
-        if not groups or stamp_ns - began_ns > apart_ns or name in groups[-1]:
+        if not groups or stamp_ns - began_ns > MAX_APART_NS or name in groups[-1]:
             groups.append({})
             began_ns = stamp_ns
         groups[-1][name] = view
     shared = [group for group in groups if len(group) > 1]
-    if len(shared) <= config.max_views:
+    if len(shared) <= MAX_VIEWS:
         return shared
-    return [shared[int(i)] for i in np.linspace(0, len(shared) - 1, config.max_views).round()]
+    return [shared[int(i)] for i in np.linspace(0, len(shared) - 1, MAX_VIEWS).round()]
+
+
+def area_counts(pixels: Sequence[Float64], size: tuple[int, int]) -> NDArray[np.int64]:
+    """Corners in each cell of the image, (CELLS, CELLS)."""
+    counts = np.zeros((CELLS, CELLS), np.int64)
+    for corners in pixels:
+        cells = np.clip(((corners + 0.5) / size * CELLS).astype(int), 0, CELLS - 1)
+        np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
+    return counts
+
+
+def missing_regions(counts: NDArray[np.int64]) -> tuple[str, ...]:
+    """Names of the ninths of the image in which the board was not seen, or hardly."""
+    side = CELLS // _ACROSS
+    seen = (counts > 0).reshape(_ACROSS, side, _ACROSS, side).sum(axis=(1, 3)).ravel()
+    return tuple(name for name, cells in zip(REGIONS, seen, strict=True) if cells < _SEEN_CELLS)
+
+
+def tilt_degrees(T_camera_board: Float64) -> Float64:
+    """How far the board leans, (2,): up or down, and to a side; (0, 0) where it is seen head on."""
+    x, y, z = T_camera_board[:3, 2]
+    return np.degrees(np.array((np.arctan2(y, z), np.arctan2(x, z))))
+
+
+def shortfalls(
+    config: CalibrationConfig, views: int, counts: NDArray[np.int64], tilts: Float64 | None
+) -> tuple[str, ...]:
+    """What is missing for a calibration that can be believed, as sentences that say what to do.
+
+    Args:
+        config: What is requested.
+        views: How many there are.
+        counts: See ``area_counts``.
+        tilts: (N, 2) degrees; None where they are not known yet.
+    """
+    lacks: list[str] = []
+    if views < config.min_views:
+        lacks.append(f"{views} views that differ from each other, {config.min_views} are needed: move the board about")
+    missing = missing_regions(counts)
+    if missing:
+        lacks.append(f"the board was not seen in these parts of the image: {', '.join(missing)}; hold it there, too")
+    if tilts is None:
+        return tuple(lacks)
+    steepest = np.abs(tilts).max(axis=0) if len(tilts) else np.zeros(2)
+    for name, most in zip(("up or down", "to the left or right"), steepest, strict=True):
+        if most < MIN_TILT_DEG:
+            lacks.append(
+                f"the board never leaned {name} by {MIN_TILT_DEG:g} degrees (at most {most:.0f}); without that "
+                "the focal length cannot be distinguished from the distance"
+            )
+    return tuple(lacks)
 
 
 def _on_a_line(pixels: Float64) -> bool:
@@ -135,7 +194,7 @@ def _on_a_line(pixels: Float64) -> bool:
     return bool(spread[1] < FLAT * spread[0])
 
 
-def _stands_still(before: BoardView | None, view: BoardView, limit_px: float) -> bool:
+def _stands_still(before: BoardView | None, view: BoardView) -> bool:
     """Whether the corners that both show are where they were."""
     if before is None:
         return False
@@ -145,7 +204,7 @@ def _stands_still(before: BoardView | None, view: BoardView, limit_px: float) ->
         for point, pixel in zip(view.points.tolist(), view.pixels, strict=True)
         if tuple(point) in known
     ]
-    return bool(moves) and float(np.median(moves)) <= limit_px
+    return bool(moves) and float(np.median(moves)) <= STEADY_PX
 
 
 def _signature(view: BoardView, size: tuple[int, int]) -> tuple[Float64, Float64] | None:

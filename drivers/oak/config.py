@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 import semantic_mapper.config
-from semantic_mapper.config import AtLeastOne, Fraction, Positive
+from semantic_mapper.config import Fraction
 
 Socket = Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D", "CAM_E", "CAM_F"]
 Preset = Literal["default", "face", "high_detail", "robotics", "accuracy", "density", "fast_accuracy", "fast_density"]
@@ -18,7 +18,7 @@ Height = Annotated[int, msgspec.Meta(ge=48, multiple_of=2)]
 class Config(semantic_mapper.config.Config, frozen=True):
     """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is requested."""
 
-    # Its id (MXID), its IP address (PoE), or its USB path, as ``semantic-mapper cameras`` shows them. Empty = the only
+    # Its id (MXID), its IP address (PoE), or its USB path, as ``doctor --cameras`` shows them. Empty = the only
     # one that is connected.
     device: str = ""
     rgb: Socket = "CAM_A"  # the camera that gives the images; depth and intrinsics are its
@@ -37,18 +37,12 @@ class Config(semantic_mapper.config.Config, frozen=True):
     # Visual-inertial odometry (DepthAI's Basalt, on this machine; needs the stereo pair and an IMU) as the images' own
     # pose.
     odometry: bool = False
-    odometry_wait_s: Positive = 0.3  # how long an image waits for its pose; then it goes without
     # Where a camera with odometry was away, and its poses begin in another world: give them as they are, and the mapper
     # finds the camera in its map before it goes on; go on with images that have no pose; or end the node, so that the
     # program that watches over the launch starts it again with a new map.
     on_tracking_reset: Literal["relocalize", "no-poses", "exit"] = "relocalize"
     # JSON file (as DepthAI writes it) in place of the calibration that is stored on the device.
     calibration: str = ""
-    search_s: Positive = 2.0  # how long the device is looked for before it counts as missing
-    start_s: Positive = 20.0  # how long the first image may take after the device has been opened
-    stall_s: Positive = 3.0  # without images for so long, the device is closed and opened again
-    retry_s: Positive = 1.0  # between two attempts to find a device that has gone
-    queue: AtLeastOne = 4  # images that wait where the reader is slow; the oldest gives way, which is a gap
 
     def __post_init__(self) -> None:
         if self.odometry and not self.depth:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.drivers.oak.config import Config
-from semantic_mapper.drivers.oak.devices import find_device
-from semantic_mapper.drivers.oak.library import load_depthai
+from semantic_mapper.drivers.oak.devices import find_device, load_depthai
 from semantic_mapper.drivers.oak.stream import OdometryPorts, Sources
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import Float64
@@ -21,18 +20,19 @@ IMU_BATCH = 10  # reports that may wait on the device; each is sent as soon as i
 _SLOW_USB = ("LOW", "FULL", "HIGH")
 
 
-def connect_device(config: Config, on_state: Callable[[str], None]) -> Sources:
+def connect_device(config: Config, on_state: Callable[[str], None], search_s: float) -> Sources:
     """Open the device and build its part of the pipeline.
 
     Args:
         config: Of the camera.
-        on_state: Told each change of the device's state, in words, from a thread of DepthAI's: it must not raise.
+        on_state: Called with each new state of the device, by a thread of DepthAI's: it must not raise.
+        search_s: How long the device is looked for before it counts as missing.
 
     Raises:
         CameraError: no such device, or it cannot do what the config asks for.
     """
     dai = load_depthai()
-    info = find_device(config.device, config.search_s)
+    info = find_device(config.device, search_s)
     try:
         device = dai.Device(info)
     except RuntimeError as error:
@@ -89,7 +89,7 @@ def rgb_to_left(calibration: Any, config: Config) -> Float64:
 def _sources(device: Any, config: Config, on_state: Callable[[str], None]) -> Sources:
     """Raises RuntimeError, too: DepthAI's."""
     dai = load_depthai()
-    device.setMaxReconnectionAttempts(0)  # the camera does that itself, and can be told to stop
+    device.setMaxReconnectionAttempts(0)  # the camera does that itself, and can be stopped
     _check_abilities(device, config)
     calibration = load_calibration(device, config.calibration)
     pipeline = dai.Pipeline(device)

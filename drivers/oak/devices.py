@@ -1,16 +1,17 @@
-"""Which OAK cameras are connected, and why one cannot be had."""
+"""DepthAI, which OAK cameras are connected, and why one cannot be had."""
 
 from __future__ import annotations
 
+import functools
+import importlib
 import os
 import re
 import time
 from pathlib import Path
 from typing import Any
 
-from semantic_mapper.drivers.oak.library import load_depthai
 from semantic_mapper.drivers.registry import FoundCamera
-from semantic_mapper.errors import CameraError
+from semantic_mapper.errors import CameraError, DependencyError
 
 USB_VENDOR = "03e7"
 SYSFS_USB = Path("/sys/bus/usb/devices")
@@ -22,6 +23,29 @@ UDEV_RULE = (
 _BUSY = ("X_LINK_BOOTED", "X_LINK_GATE_BOOTED")
 _IP = re.compile(r"\d{1,3}(\.\d{1,3}){3}\Z")
 _SEARCH_STEP_S = 0.2
+
+
+@functools.cache
+def load_depthai() -> Any:
+    """Import DepthAI once and return the module.
+
+    Raises:
+        DependencyError: it cannot be loaded, and how to get it.
+    """
+    # Its handler of signals would end the process where writing to a full disk is an error (SIGXFSZ), and
+    # print a trace of its own in the place of Python's. Who wants it sets the variable to 1.
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
+    # A robot does not report to its maker unless it is instructed to, and leaves no files for that in its working
+    # folder.
+    os.environ.setdefault("DEPTHAI_TELEMETRY", "0")
+    os.environ.setdefault("DEPTHAI_DISABLE_STARTUP_NOTIFICATIONS", "1")
+    try:
+        return importlib.import_module("depthai")
+    except (ImportError, OSError) as error:
+        raise DependencyError(
+            f"DepthAI cannot be loaded: {error}. Run `make setup`, or install it yourself: "
+            "pip install 'depthai>=3.12,<4'"
+        ) from error
 
 
 def list_devices() -> list[FoundCamera]:
@@ -45,7 +69,7 @@ def find_device(address: str, search_s: float) -> Any:
         DepthAI's ``DeviceInfo``.
 
     Raises:
-        CameraError: there is none, several where one should be, or another process has it; and how to mend it.
+        CameraError: there is none, several where one should be, or another process has it; and how to fix it.
     """
     deadline = time.monotonic() + search_s
     while True:
@@ -61,7 +85,7 @@ def find_device(address: str, search_s: float) -> Any:
 
 
 def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> str:
-    """Why no OAK can be found, as far as this machine can tell, and how to mend it.
+    """Why no OAK can be found, as far as this machine knows, and how to fix it.
 
     Args:
         address: What was looked for; empty = any.
@@ -81,7 +105,7 @@ def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> s
     if boards:
         return (
             f"{what}, though there is one on USB ({', '.join(map(str, boards))}): plug it in again, with its own "
-            "cable, into a USB 3 port; `semantic-mapper cameras` shows the names of those that answer"
+            "cable, into a USB 3 port; `semantic-mapper doctor --cameras` shows the names of those that answer"
         )
     return (
         f"{what}: check its cable and power (USB: a USB 3 port, and `lsusb | grep {USB_VENDOR}` shows it; PoE: "
@@ -130,7 +154,7 @@ def _describe(info: Any) -> FoundCamera:
         notes.append("another process has it")
     if "PERMISSION" in info.status.name:
         notes.append(f"no permission: {UDEV_RULE}")
-    name = info.getDeviceId() or info.name  # not every state tells the id
+    name = info.getDeviceId() or info.name  # not every state gives the id
     return FoundCamera(kind="oak", name=name, address=name, note=", ".join(notes))
 
 

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage
-from semantic_mapper.drivers.oak.library import load_depthai
+from semantic_mapper.drivers.live import FUTURE_NS
+from semantic_mapper.drivers.oak.devices import load_depthai
 from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 DEPTH_UNIT_M = 1e-3  # the stereo node's default
 NO_DEPTH = 65535  # beyond what 16 bits hold
-FUTURE_NS = 100_000_000  # a stamp further ahead of now is wrong: the device's clock is not in step yet
 ALIGNED_PX = 1.0  # within which intrinsics of depth and colour are the same
 MAX_DAMAGED = 30  # images in a row: then it is no accident of the cable
 _CLOCK_READINGS = 5
@@ -170,7 +170,7 @@ class ImageMaker:
             None for one that is not later than the one before, that claims to be of the future, or that is damaged.
 
         Raises:
-            CameraError: it is not what was asked of the device, or one of many in a row that are damaged.
+            CameraError: it is not what was requested of the device, or one of many in a row that are damaged.
         """
         stamp_ns = capture_ns(rgb, self._clock_ns)
         if stamp_ns > time.monotonic_ns() + FUTURE_NS or (self._last is not None and stamp_ns <= self._last[1]):

@@ -1,6 +1,6 @@
 """Feeds the stereo pair to the odometry node, one at a time, and stamps the poses that come back.
 
-DepthAI's poses carry no time. With one pair under way there is no doubt which one a pose is of, and where this machine
+DepthAI's poses carry no time. With one pair under way it is certain which one a pose is of, and where this machine
 is too slow, pairs are left out instead of queueing up.
 """
 
@@ -14,16 +14,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.base import PoseEstimate
+from semantic_mapper.drivers.live import SLICE_S, StreamEnded
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.oak.images import capture_ns, clock_offset_ns
-from semantic_mapper.drivers.oak.stream import Sources, StreamEnded, synced_queue, take
+from semantic_mapper.drivers.oak.stream import Sources, synced_queue, take
 from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, PoseError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.types import Float64
 
 ANSWER_S = 2.0  # a pair without a pose for so long will have none
-_SLICE_S = 0.1
 SOURCE = "vio"
 KEPT = 200  # poses: some seconds
 GAP_NS = 200_000_000  # nothing is interpolated across a longer silence
@@ -91,8 +91,7 @@ class Odometry:
     def reaches(self, stamp_ns: int) -> bool:
         """Whether the poses go as far as this moment: waiting longer brings nothing new for it."""
         with self._lock:
-            newest_ns = self._track.newest_ns
-        return newest_ns is not None and newest_ns >= stamp_ns
+            return self._track.newest_ns >= stamp_ns
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Pose of the colour camera at a moment between two poses; None where there are none round it."""
@@ -124,7 +123,7 @@ class Odometry:
     def _run(self) -> None:
         try:
             while not self._closed.is_set():
-                pair = take(self._pairs, _SLICE_S)
+                pair = take(self._pairs, SLICE_S)
                 if pair is not None:
                     self._track_pair(pair)
         except StreamEnded:  # the reader of the images says so
@@ -139,7 +138,7 @@ class Odometry:
             port.send(pair[name])
         deadline = time.monotonic() + ANSWER_S
         while not self._closed.is_set():
-            pose = take(self._poses, _SLICE_S)
+            pose = take(self._poses, SLICE_S)
             if pose is not None:
                 self._add(stamp_ns, pose)
                 return

@@ -1,4 +1,4 @@
-"""Everything behind the sources of one connection: what is synced, waited for, and told when it ends.
+"""Everything behind the sources of one connection: what is synced, waited for, and how it ends.
 
 A pipeline has two parts. The sources are the device's (``device.py``), or files and nodes of the host (tests); what is
 here is the same for both. No Python runs in DepthAI's own threads, where an exception would end the process.
@@ -14,16 +14,14 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any
 
+from semantic_mapper.drivers.live import SLICE_S, StreamEnded
 from semantic_mapper.drivers.oak.config import Config
-from semantic_mapper.drivers.oak.library import load_depthai
+from semantic_mapper.drivers.oak.devices import load_depthai
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import Float64
 
-_SLICE_S = 0.1  # how soon a stop is noticed
-
-
-class StreamEnded(Exception):  # noqa: N818 -- an event, not an error: the camera is gone and may come back
-    """The device has gone, or gives nothing any more; the text says which."""
+START_S, STALL_S = 20.0, 3.0  # without an image for so long after opening, later: it has stalled
+QUEUE = 4  # images that wait where the reader is slow; the oldest gives way, which is a gap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +54,7 @@ class Sources:
         calibration: ``dai.CalibrationHandler`` of the device.
         name: What people call it; ``address``: by which it is found again.
         metadata: For the stream's information.
-        notes: What does not work as it should, as far as one can tell at once.
+        notes: What does not work as it should, as far as one knows at once.
         odometry: None without.
     """
 
@@ -91,10 +89,9 @@ class Stream:
 
     def __init__(self, sources: Sources, config: Config) -> None:
         self.sources = sources
-        self._stall_s = config.stall_s
-        self._patience_s = config.start_s
+        self._patience_s = START_S
         outputs = {"rgb": sources.rgb} if sources.depth is None else {"rgb": sources.rgb, "depth": sources.depth}
-        self._groups = synced_queue(sources.pipeline, outputs, 0.5 / config.fps, config.queue)
+        self._groups = synced_queue(sources.pipeline, outputs, 0.5 / config.fps, QUEUE)
         self._first: tuple[Any, Any | None] | None = None
         self._heard = time.monotonic()
 
@@ -119,14 +116,14 @@ class Stream:
             StreamEnded: as ``read``.
         """
         while self._first is None and not stopped.is_set():
-            self._first = self.read(_SLICE_S)
+            self._first = self.read(SLICE_S)
         return self._first
 
     def read(self, timeout_s: float) -> tuple[Any, Any | None] | None:
         """The next colour message and its depth; None where there is none within the time.
 
         Raises:
-            StreamEnded: the device has gone, or has given nothing for ``stall_s`` (``start_s`` before the first).
+            StreamEnded: the device has gone, or has given nothing for ``STALL_S`` (``START_S`` before the first).
         """
         if self._first is not None:
             messages, self._first = self._first, None
@@ -134,7 +131,7 @@ class Stream:
         group = take(self._groups, timeout_s)
         now = time.monotonic()
         if group is not None:
-            self._heard, self._patience_s = now, self._stall_s
+            self._heard, self._patience_s = now, STALL_S
             return group["rgb"], None if self.sources.depth is None else group["depth"]
         if not self.sources.pipeline.isRunning():
             raise StreamEnded("it has gone (unplugged, without power, or its firmware has crashed)")

@@ -17,7 +17,7 @@ class Config(config.Config, frozen=True):
     # A file. Its images are stamped with the time within it; "recorded" gives them in that rhythm, "fast" at once.
     pace: Literal["recorded", "fast"] = "recorded"
     start_ns: NotNegative = 0  # stamp of its first image, where poses are stamped otherwise
-    # A stream. "container": by the sender's clock, whose distance to ours the quickest images tell; "arrival": as the
+    # A stream. "container": by the sender's clock, whose distance to ours the quickest images give; "arrival": as the
     # images come in. Neither knows how long the quickest one was on its way: that is `latency_s`.
     stamps: Literal["container", "arrival"] = "container"
     latency_s: AtLeastZero = 0.0

@@ -1,1 +1,1 @@
-"""Where a camera was: told by itself, a topic, a board, its own depth or pictures; or it never moves."""
+"""Where a camera was: from itself, a topic, a board, its own depth or pictures; or it never moves."""

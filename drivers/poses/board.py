@@ -1,25 +1,32 @@
-"""The camera's pose from a printed board that it sees: ChArUco, or a grid of AprilTags."""
+"""The camera's pose from a printed board that it sees: ChArUco, or a grid of AprilTags; and the board to be printed."""
 
 from __future__ import annotations
 
-from collections import Counter
-from types import TracebackType
-from typing import Any, Self
+import io
+from typing import Any
 
 import cv2
 import numpy as np
+from PIL import Image
 
-from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import BoardPoses, matrix
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.geometry import camera_matrix, invert_pose
+from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
+PIXELS_A_METRE = 11811  # of the board to be printed: 300 dots an inch, about
+MARGIN_M = 0.005  # white, all round; the words stand in the lower one
+LARGEST_PX = 30_000  # a side
 MIN_CORNER_SIGMA_PX = 0.2  # corners are found no better than this, however well a few of them happen to fit
+MIN_CORNERS = 6  # seen, for a pose; a single tag has 4
+MAX_ERROR_PX = 1.5  # RMS reprojection error of a pose that is used
+MAX_SIGMA_M = 0.05  # of the camera's position
+MIN_FLIP_RATIO = 1.5  # a flat board's mirrored pose must fit so much worse
 
 
 def make_board(config: BoardPoses) -> Any:
-    """The cv2.aruco board that a config tells of; ``generateImage`` of it is what to print.
+    """The cv2.aruco board of a config; ``generateImage`` of it is what to print.
 
     Raises:
         ConfigError: OpenCV has no such dictionary, or it holds too few markers.
@@ -34,11 +41,60 @@ def make_board(config: BoardPoses) -> Any:
     if needed > len(dictionary.bytesList):
         raise ConfigError(f"dictionary: {name} has {len(dictionary.bytesList)} markers, the board needs {needed}")
     if config.pattern == "charuco":
-        board: Any = cv2.aruco.CharucoBoard(size, config.square_m, config.marker_m, dictionary)
-        board.setLegacyPattern(config.legacy)
-        return board
+        return cv2.aruco.CharucoBoard(size, config.square_m, config.marker_m, dictionary)
     gap_m = config.square_m - config.marker_m if config.columns * config.rows > 1 else config.marker_m
     return cv2.aruco.GridBoard(size, config.marker_m, gap_m, dictionary)
+
+
+def draw_sheet(config: BoardPoses) -> tuple[UInt8, int]:
+    """The board with its margin, (H, W) uint8, and how many pixels of it are a metre.
+
+    Squares have a whole number of pixels, so that all are alike.
+
+    Raises:
+        ConfigError: a board that cannot be, or too large to be drawn.
+    """
+    square_px = max(8, round(config.square_m * PIXELS_A_METRE))
+    a_metre = square_px / config.square_m
+    gap_px = 0 if config.pattern == "charuco" else round((config.square_m - config.marker_m) * a_metre)
+    width, height = config.columns * square_px - gap_px, config.rows * square_px - gap_px
+    margin = round(MARGIN_M * a_metre)
+    if max(width, height) + 2 * margin > LARGEST_PX:
+        raise ConfigError(
+            f"a board of {width / a_metre:.2f} x {height / a_metre:.2f} m is too large to be drawn at {a_metre:.0f} "
+            "pixels a metre; have it printed from a drawing of your own"
+        )
+    board: Any = make_board(config)
+    sheet = np.full((height + 2 * margin, width + 2 * margin), 255, np.uint8)
+    sheet[margin : margin + height, margin : margin + width] = board.generateImage((width, height), marginSize=0)
+    words = (
+        f"{config.pattern} {config.columns} x {config.rows}, {1000 * config.square_m:g} mm a square, marker "
+        f"{1000 * config.marker_m:g} mm. Print at 100 %, then measure a square."
+    )
+    scale = 0.6 * margin / 32  # Hershey letters are about 32 pixels high at 1
+    cv2.putText(
+        sheet,
+        words,
+        (margin, height + 2 * margin - round(0.25 * margin)),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        scale,
+        90,
+        max(1, round(2 * scale)),
+        cv2.LINE_AA,
+    )
+    return sheet, round(a_metre)
+
+
+def sheet_png(config: BoardPoses) -> bytes:
+    """The sheet as a PNG file that says how large it is.
+
+    Raises:
+        ConfigError: see ``draw_sheet``.
+    """
+    sheet, a_metre = draw_sheet(config)
+    data, dpi = io.BytesIO(), 0.0254 * a_metre
+    Image.fromarray(sheet).save(data, "PNG", dpi=(dpi, dpi))
+    return data.getvalue()
 
 
 class BoardFinder:
@@ -77,11 +133,11 @@ class BoardFinder:
         return np.asarray(points, np.float64).reshape(-1, 3), np.asarray(pixels, np.float64).reshape(-1, 2)
 
 
-class BoardPoseSource:
+class BoardPoseSource(PoseSource):
     """Finds the board in every image.
 
     Args:
-        config: The board, where it is, and what a pose must be like to be used.
+        config: The board, and where it is.
 
     Attributes:
         counters: Images without a pose: "no_board" (too few corners seen), "inexact" (reprojection error), "ambiguous"
@@ -93,48 +149,34 @@ class BoardPoseSource:
     """
 
     def __init__(self, config: BoardPoses) -> None:
-        self._config = config
+        super().__init__()
         self._finder = BoardFinder(config)
+        self._min_corners = min(MIN_CORNERS, 4 * config.columns * config.rows)
         self._T_world_board = matrix(config.T_world_board)
-        self._warnings: tuple[str, ...] = ()
-        self.counters: Counter[str] = Counter()
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Why the last image had no pose."""
-        return self._warnings
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose of a rectified image; None where the board is not seen well enough, see ``counters``."""
         points, pixels = self._finder.find(image.rgb)
-        if len(points) < self._config.min_corners:
-            return self._refuse("no_board", f"{len(points)} corners of it are seen, {self._config.min_corners} needed")
+        if len(points) < self._min_corners:
+            return self._refuse("no_board", f"{len(points)} corners of it are seen, {self._min_corners} needed")
         solutions = board_poses(points, pixels, image.intrinsics)
         if not solutions:
             return self._refuse("no_board", "its corners allow no pose")
         (error_px, pose), others = solutions[0], solutions[1:]
-        if error_px > self._config.max_error_px:
-            return self._refuse(
-                "inexact", f"its corners are off by {error_px:.1f} px; check its sizes and the camera's"
-            )
-        if others and others[0][0] < self._config.min_flip_ratio * max(error_px, MIN_CORNER_SIGMA_PX):
+        if error_px > MAX_ERROR_PX:
+            detail = f"its corners are off by {error_px:.1f} px; check its sizes and the camera's"
+            return self._refuse("inexact", detail)
+        corner_px = max(error_px, MIN_CORNER_SIGMA_PX)
+        if others and others[0][0] < MIN_FLIP_RATIO * corner_px:
             return self._refuse("ambiguous", "its mirrored pose fits as well; show it larger, or from the side")
-        sigma = _position_sigma(points, pose, image.intrinsics, max(error_px, MIN_CORNER_SIGMA_PX))
-        if sigma > self._config.max_sigma_m:
-            return self._refuse("uncertain", f"it tells the camera's place to {sigma:.2f} m only; show it larger")
+        sigma = _position_sigma(points, pose, image.intrinsics, corner_px)
+        if sigma > MAX_SIGMA_M:
+            return self._refuse("uncertain", f"it gives the camera's place to {sigma:.2f} m only; show it larger")
         self._warnings = ()
         return PoseEstimate(self._T_world_board @ invert_pose(pose_of_vector(pose)), "board", sigma)
 
     def _refuse(self, reason: str, detail: str) -> None:
-        self.counters[reason] += 1
+        self._counters[reason] += 1
         self._warnings = (f"the board gives no pose: {detail}",)
 
 
@@ -160,10 +202,7 @@ def board_poses(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) 
 
 def pose_of_vector(pose: Float64) -> Float64:
     """(4, 4) of a rotation vector and a position (6,)."""
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(pose[:3])[0]
-    T[:3, 3] = pose[3:]
-    return T
+    return make_pose(pose[:3], pose[3:])
 
 
 def _position_sigma(points: Float64, pose: Float64, intrinsics: CameraIntrinsics, corner_px: float) -> float:
@@ -172,9 +211,10 @@ def _position_sigma(points: Float64, pose: Float64, intrinsics: CameraIntrinsics
     by_pose = np.asarray(jacobian, np.float64)[:, :6]  # (2N, 6)
     covariance = corner_px**2 * np.linalg.pinv(by_pose.T @ by_pose)
     step = 1e-6
-    columns = [
-        (invert_pose(pose_of_vector(pose + d))[:3, 3] - invert_pose(pose_of_vector(pose - d))[:3, 3]) / (2 * step)
-        for d in step * np.eye(6)
-    ]
+
+    def position(pose: Float64) -> Float64:
+        return invert_pose(pose_of_vector(pose))[:3, 3]
+
+    columns = [(position(pose + d) - position(pose - d)) / (2 * step) for d in step * np.eye(6)]
     by_position = np.stack(columns, axis=1)  # (3, 6)
     return float(np.sqrt(np.trace(by_position @ covariance @ by_position.T) / 3))

@@ -27,7 +27,7 @@ class StampedPose:
 
 
 class PoseTrack:
-    """The last poses of something that moves, asked for at any time in between. Not for several threads at once.
+    """The last poses of something that moves, at any time in between. Not for several threads at once.
 
     Args:
         keep: Samples kept.
@@ -40,10 +40,13 @@ class PoseTrack:
         self._max_gap_ns = max_gap_ns
         self._max_ahead_ns = max_ahead_ns
 
+    def __len__(self) -> int:
+        return len(self._samples)
+
     @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the last sample; None without any."""
-        return self._samples[-1].stamp_ns if self._samples else None
+    def newest_ns(self) -> int:
+        """Stamp of the last sample; -1 without any."""
+        return self._samples[-1].stamp_ns if self._samples else -1
 
     def add(self, sample: StampedPose) -> bool:
         """Append a sample; False, and nothing done, where it is not later than the last one."""
@@ -84,7 +87,7 @@ class PoseTrack:
         if stamp_ns - last.stamp_ns > self._max_ahead_ns:
             return "stale"
         if len(self._samples) < 2 or last.stamp_ns - self._samples[-2].stamp_ns > self._max_gap_ns:
-            return "stale"  # one pose alone tells no motion
+            return "stale"  # one pose alone shows no motion
         # From poses that are not close together: of two that are, the noise would be taken for motion.
         earlier = [s for s in self._samples if last.stamp_ns - s.stamp_ns <= self._max_gap_ns][:-1]
         before = next((s for s in reversed(earlier) if last.stamp_ns - s.stamp_ns >= _BASELINE_NS), earlier[0])

@@ -1,10 +1,10 @@
 """RGB-D odometry: where a camera with depth went, from its images alone.
 
 Each view is aligned to keyframes, not to the view before, so that errors add up from keyframe to keyframe only. Where
-the camera comes back to old ones, a pose graph takes the errors back (``loop_closure``). The first guess goes on with
+the camera comes back to old ones, a pose graph takes the errors back (``loop_closure``). The first guess continues
 the last motion; where that leads nowhere, corners that view and keyframe share give another. Where these fail too, or
 lead off the last motion, the shift of the picture since the last view gives more, and the best fit counts. Directions
-that the points tell nothing of (along a wall that fills the picture) go on with the motion and the corners, and the
+of which the points show nothing (along a wall that fills the picture) follow the motion and the corners, and the
 uncertainty grows. A view that lies on no keyframe is lost: no pose, until its corners are found in a keyframe again. A
 camera that stays lost begins a new world, in which no loops are closed: the map is of the first one.
 
@@ -13,47 +13,69 @@ Same images, same poses and corrections, bit for bit.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
 
-from semantic_mapper.drivers.base import CameraImage, CorrectedWorld, PoseEstimate
-from semantic_mapper.drivers.poses.alignment import Fit, Target, align, fit, flat_directions
-from semantic_mapper.drivers.poses.config import OdometryPoses, can_be_found, matrix
-from semantic_mapper.drivers.poses.depth_view import Level, make_levels, thin_depth, thinned
-from semantic_mapper.drivers.poses.image_turn import find_turn
-from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
+from semantic_mapper.drivers.base import CameraImage, CorrectedWorld, PoseEstimate, PoseSource
+from semantic_mapper.drivers.poses.config import WAYS_OUT, OdometryPoses, can_be_found, matrix
+from semantic_mapper.drivers.poses.keyframe_map import (
+    DRIFT,
+    MIN_MATCHES,
+    MIN_OVERLAP,
+    KeyframeMap,
+    OdometryKeyframe,
+    PoseTrail,
+    apart,
+    lies_on,
+)
 from semantic_mapper.drivers.poses.loop_closure import PLACE_FEATURES, LoopCloser
 from semantic_mapper.drivers.poses.motion import StampedPose
-from semantic_mapper.drivers.poses.pose_graph import between
-from semantic_mapper.drivers.poses.still import WAYS_OUT
-from semantic_mapper.drivers.poses.trail import PoseTrail
 from semantic_mapper.errors import CameraError
-from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
+from semantic_mapper.geometry import interpolate_pose, invert_pose, make_pose, rotation_vector
+from semantic_mapper.localization.depth_alignment import (
+    NOISE_M,
+    POINTS_A_VOTE,
+    Fit,
+    Level,
+    Target,
+    align,
+    fit,
+    flat_directions,
+    make_levels,
+    thin_depth,
+    thin_intrinsics,
+)
 from semantic_mapper.localization.features import Features, find_features, find_place_features, pose_from_features
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
+WIDTH = 320  # images are thinned out to about this
+DEPTH_MAX_M = 4.0
+NEIGHBOURS = 3  # keyframes that a frame is aligned to
+KEYFRAME_M = 0.35  # a new one when moved this far from the nearest, or ...
+KEYFRAME_DEG = 20.0  # ... turned this far, or ...
+KEYFRAME_OVERLAP = 0.55  # ... seeing less than this in common with it
+MAX_STEP_M, MAX_STEP_DEG = 0.25, 15.0  # a result further from its first guess is wrong
+FEATURES = 500  # ORB corners an image, for first guesses and for finding back
+RELOCALISE_KEYFRAMES = 20  # tried for each image while lost, in turn
 _LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
-_POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
 _JUMP_M = 0.06  # from where the last motion leads, where another keyframe is nearest than for the last image
 _JUMP_DEG = 4.0
 _WORSE = 2.5  # times the noise of the fits before: a view that has left the last motion lies on nothing then
 _LEAST_NOISE_M = 0.002
 _NOISE_GAIN = 0.1
-_GUESSED = 0.5  # of a step along what no point tells of: how far it may be wrong
+_GUESSED = 0.5  # of a step along what no point shows: how far it may be wrong
 _LEVER_M = 0.3  # a radian of such a turn is as much as this shift
 _STANDING_M = 0.005  # as much for a step by corners, or a camera that seems to stand: it is not lost for that
 _UNSURE_M = 0.15  # an image that may be further off by such steps has no pose
 _AWAY_NS = 2_000_000_000  # a camera that gave no image for so long may be anywhere
 _LOST_NS = 5_000_000_000  # lost for so long, it begins a new world ...
 _YOUNG = 5  # ... and at once in a world of fewer images: the first views may have shown too little
+_LEAST_RESPONSE = 0.05  # of the peak, 1 = the same picture; those that overlap well give 0.1 to 0.7
 _PAUSE_NS = 2_000_000_000  # between two corrections: each is work for the map
 
 _log = get_logger(__name__)
@@ -61,7 +83,7 @@ _log = get_logger(__name__)
 
 @dataclass(slots=True, eq=False)
 class _View:
-    """An image, thinned out; its corners are found when somebody asks."""
+    """An image, thinned out; its corners are found when they are needed."""
 
     stamp_ns: int
     rgb: UInt8
@@ -70,9 +92,10 @@ class _View:
     levels: tuple[Level, ...]
     found: Features | None = None
 
-    def features(self, count: int) -> Features:
+    @property
+    def features(self) -> Features:
         if self.found is None:
-            self.found = find_features(self.rgb, self.depth_m, count)
+            self.found = find_features(self.rgb, self.depth_m, FEATURES)
         return self.found
 
 
@@ -87,7 +110,7 @@ class _Found:
         T_world_camera: (4, 4).
         nearest: The keyframe that it was aligned to first.
         fits: To the keyframes that it was aligned to.
-        unsure_m: How far it may be off along what no point tells of.
+        unsure_m: How far it may be off along what no point shows.
     """
 
     T_world_camera: Float64
@@ -96,7 +119,7 @@ class _Found:
     unsure_m: float
 
 
-class OdometryPoseSource:
+class OdometryPoseSource(PoseSource):
     """Follows one RGB-D camera. Not for several threads at once, but any may read ``counters`` and ``warnings``.
 
     Args:
@@ -108,14 +131,14 @@ class OdometryPoseSource:
     """
 
     def __init__(self, config: OdometryPoses) -> None:
+        super().__init__()
         self._config = config
-        self._map = KeyframeMap(config.max_keyframes)
+        self._map = KeyframeMap()
         self._camera: tuple[str, CameraIntrinsics] | None = None
         self._past: list[StampedPose] = []  # the last two poses
         self._lost_ns: int | None = None  # since when it is lost
         self._next_try = 0  # keyframe that is tried next while lost
-        self._warnings: tuple[str, ...] = ()
-        self._closer = LoopCloser(config) if config.loop_closure else None
+        self._closer = LoopCloser(self._counters) if config.loop_closure else None
         self._trail = PoseTrail()  # stays empty where no loops are closed: nothing moves then
         self._world = 0
         self._images = 0  # with a pose in this world
@@ -124,31 +147,7 @@ class OdometryPoseSource:
         self._nearest = -1  # keyframe that the last image was aligned to first
         self._newest: tuple[_View, Float64] | None = None  # the last image with a pose
         self._noise_m = 0.0  # mean of the last fits
-        self._unsure_m = 0.0  # how far the last pose may be off along what no point tells of
-        self._counts: Counter[str] = Counter()
-
-    @property
-    def counters(self) -> Counter[str]:
-        """Totals; see the class."""
-        return Counter(self._counts) if self._closer is None else self._counts + self._closer.counters
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """One sentence while the camera is lost."""
-        return self._warnings
-
-    @property
-    def keyframe_poses(self) -> list[Float64]:
-        """T_world_camera (4, 4) of the keyframes that are kept, in the order they were made."""
-        return [k.target.T_world_camera for k in self._map.frames]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
+        self._unsure_m = 0.0  # how far the last pose may be off along what no point shows
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose of the next image; None while lost.
@@ -161,7 +160,7 @@ class OdometryPoseSource:
         view = self._view(image)
         if view is None:
             self._lose(image, "it has hardly any depth")
-            self._lost_ns = image.stamp_ns  # such images do not tell that the place is another one
+            self._lost_ns = image.stamp_ns  # such images do not mean that the place is another one
             return None
         if not len(self._map):
             return self._begin(view)
@@ -169,37 +168,31 @@ class OdometryPoseSource:
             self._lost_ns = image.stamp_ns
             _log.warning("odometry_lost", reason=f"no image came for more than {_AWAY_NS // 10**9} s")
         guesses = self._guesses_while_lost(view) if self._lost else self._guesses(view)
-        found = self._first_fit(view, guesses)
-        if found is None or self._leaves_motion(view, found):
+        found = next((found for guess in guesses if (found := self._try(view, *guess)) is not None), None)
+        # A result that is not where the last motion leads may be wrong.
+        if found is None or not (self._lost or _is_close(self._expected(view.stamp_ns), found.T_world_camera)):
             found = self._second_look(view, found, [guess for guess, _ in guesses])
         if found is None:
             return self._lose_or_begin(view, "it lies on no keyframe")
         if found.unsure_m > _UNSURE_M:
             self._unsure_m = found.unsure_m  # until it sees more
-            return self._lose_or_begin(view, "it sees nothing that tells where along a surface it is")
+            return self._lose_or_begin(view, "it sees nothing that shows where along a surface it is")
         return self._accept(view, found)
 
     @property
     def _lost(self) -> bool:
         return self._lost_ns is not None
 
-    def _first_fit(self, view: _View, guesses: list[_Guess]) -> _Found | None:
-        return next((found for guess in guesses if (found := self._try(view, *guess)) is not None), None)
-
-    def _leaves_motion(self, view: _View, found: _Found) -> bool:
-        """Whether a result is not where the last motion leads: another one may be right."""
-        return not self._lost and not _is_close(self._expected(view.stamp_ns), found.T_world_camera)
-
     def _second_look(self, view: _View, found: _Found | None, expected: list[Float64]) -> _Found | None:
         """The best fit among what was found and what the image before says; None where it is a bad one.
 
         The motion has changed at once, or the view lies on nothing. Sliding along a surface shows in a fit that is
-        worse than those before; a pattern that repeats itself, in a motion that neither corners nor picture tell of.
+        worse than those before; a pattern that repeats itself, in a motion that neither corners nor picture show.
 
         Args:
             view: The image.
             found: Where it was found so far.
-            expected: Poses that corners and the last motion tell.
+            expected: Poses by corners and the last motion.
         """
         results = [] if found is None else [found]
         if self._newest is not None and view.stamp_ns - self._past[-1].stamp_ns < _RECENT_NS:
@@ -210,7 +203,7 @@ class OdometryPoseSource:
                 if motion is None:
                     continue
                 guess = T_world_before @ motion
-                for keyframes in (self._map.near(guess, self._config.neighbours), last):
+                for keyframes in (self._map.near(guess, NEIGHBOURS), last):
                     result = self._try(view, guess, keyframes) if keyframes else None
                     results += [] if result is None else [result]
             expected = expected if corners is None else [T_world_before @ corners]
@@ -222,28 +215,22 @@ class OdometryPoseSource:
                 or (turned is not None and _is_close(turned, r.T_world_camera, 2 * _JUMP_M))
             ]
         best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
-        noise_m = max(self._noise_m or self._config.noise_m, _LEAST_NOISE_M)
+        noise_m = max(self._noise_m or NOISE_M, _LEAST_NOISE_M)
         return None if best is None or best.fits[0].noise_m > _WORSE * noise_m else best
 
     def _corner_motion(self, view: _View) -> Float64 | None:
         """T_before_camera (4, 4) from the last image that had a pose, by the corners of both; None without enough."""
         if self._newest is None:
             return None
-        count = self._config.features
-        before = self._newest[0].features(count)
-        match = pose_from_features(view.features(count), before, view.intrinsics, self._config.min_matches)
+        match = pose_from_features(view.features, self._newest[0].features, view.intrinsics, MIN_MATCHES)
         return None if match is None else match[0]
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
-        """New poses of past images since loops were closed, or None; to be asked for after each ``pose``.
-
-        Args:
-            final: No more images will come: finish what is under way.
-        """
+        """New poses of past images since loops were closed, or None."""
         while final and self._closer is not None and self._closer.busy:
             self._close_loops(None)
         if final:
-            self._corrected = self._trail.correction(self._keyframe_poses(), final) or self._corrected
+            self._corrected = self._trail.correction(self._map.poses, final) or self._corrected
         corrected, self._corrected = self._corrected, None
         return corrected
 
@@ -260,10 +247,7 @@ class OdometryPoseSource:
         if self._newest is not None:
             self._newest = self._newest[0], self._moved(self._newest[1], poses)
         self._map.move(poses)
-        self._corrected = self._trail.correction(self._keyframe_poses(), final=False) or self._corrected
-
-    def _keyframe_poses(self) -> dict[int, Float64]:
-        return {k.number: k.target.T_world_camera for k in self._map.frames}
+        self._corrected = self._trail.correction(self._map.poses, final=False) or self._corrected
 
     def _moved(self, T_world_camera: Float64, poses: Mapping[int, Float64]) -> Float64:
         nearest = self._map.near(T_world_camera, 1)[0]
@@ -287,16 +271,16 @@ class OdometryPoseSource:
 
     def _view(self, image: CameraImage) -> _View | None:
         """None without enough depth."""
-        stride = max(1, round(image.intrinsics.width / self._config.width))
+        stride = max(1, round(image.intrinsics.width / WIDTH))
         if image.depth_m is None:
             return None
-        intrinsics = thinned(image.intrinsics, stride, stride // 2)
-        depth = thin_depth(image.depth_m, stride, self._config.depth_max_m)
+        intrinsics = thin_intrinsics(image.intrinsics, stride, stride // 2)
+        depth = thin_depth(image.depth_m, stride, DEPTH_MAX_M)
         if float((depth > 0).mean()) < _LEAST_DEPTH:
             return None
         size = (intrinsics.width, intrinsics.height)
         rgb = np.asarray(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        levels = make_levels(depth, intrinsics, len(self._config.iterations))
+        levels = make_levels(depth, intrinsics)
         return _View(image.stamp_ns, rgb, depth, intrinsics, levels)
 
     def _begin(self, view: _View) -> PoseEstimate:
@@ -304,15 +288,15 @@ class OdometryPoseSource:
         self._add_keyframe(view, pose, 0.0, None)
         self._past, self._newest = [StampedPose(view.stamp_ns, pose)], (view, pose)
         self._images = 1
-        self._counts["tracked"] += 1
+        self._counters["tracked"] += 1
         return PoseEstimate(pose, "odometry", 0.0, self._world)
 
     def _guesses(self, view: _View) -> list[_Guess]:
-        """The last motion gone on with, and what corners say; that first which lies better on the nearest keyframe."""
+        """The last motion continued, and what corners say; that first which lies better on the nearest keyframe."""
         guess = self._expected(view.stamp_ns)
-        near = self._map.near(guess, self._config.neighbours)
+        near = self._map.near(guess, NEIGHBOURS)
         guesses = [(guess, near), *self._guesses_of_features(view, near)]
-        return sorted(guesses, key=lambda g: fit(self._config, view.levels, g[1][0].target, g[0]).cost_m)
+        return sorted(guesses, key=lambda g: fit(view.levels, g[1][0].target, g[0]).cost_m)
 
     def _expected(self, stamp_ns: int) -> Float64:
         """Where the last motion leads."""
@@ -324,55 +308,54 @@ class OdometryPoseSource:
     def _guesses_while_lost(self, view: _View) -> list[_Guess]:
         """What corners say of keyframes near the last pose, then of the others, this many an image in turn."""
         last = self._past[-1]
-        near = self._map.near(last.T, self._config.neighbours)
+        near = self._map.near(last.T, NEIGHBOURS)
         guesses: list[_Guess] = []
         if view.stamp_ns - last.stamp_ns < _RECENT_NS:
             guesses.append((last.T, near))
-        count = min(len(self._map), self._config.relocalise_keyframes)
+        count = min(len(self._map), RELOCALISE_KEYFRAMES)
         turn = [self._map.frames[(self._next_try + i) % len(self._map)] for i in range(count)]
         self._next_try = (self._next_try + count) % len(self._map)
         return guesses + self._guesses_of_features(view, near + [k for k in turn if k not in near])
 
     def _guesses_of_features(self, view: _View, keyframes: list[OdometryKeyframe]) -> list[_Guess]:
         """Those with the most corners in agreement first."""
-        features = view.features(self._config.features)
+        features = view.features
         found: list[tuple[int, Float64, OdometryKeyframe]] = []
         for keyframe in keyframes:
-            match = pose_from_features(features, keyframe.features, view.intrinsics, self._config.min_matches)
+            match = pose_from_features(features, keyframe.features, view.intrinsics, MIN_MATCHES)
             if match is not None:
                 found.append((match[1], keyframe.target.T_world_camera @ match[0], keyframe))
         found.sort(key=lambda item: -item[0])
-        return [(pose, self._map.near(pose, self._config.neighbours)) for _, pose, _ in found]
+        return [(pose, self._map.near(pose, NEIGHBOURS)) for _, pose, _ in found]
 
     def _try(self, view: _View, guess: Float64, keyframes: list[OdometryKeyframe]) -> _Found | None:
         """Align a view to keyframes; None where the result cannot be believed."""
-        fits = [fit(self._config, view.levels, k.target, guess) for k in keyframes]
-        used = [
-            k
-            for number, (k, f) in enumerate(zip(keyframes, fits, strict=True))
-            if number == 0 or f.overlap >= self._config.min_overlap
-        ]
+        others = [k for k in keyframes[1:] if fit(view.levels, k.target, guess).overlap >= MIN_OVERLAP]
+        used = [keyframes[0], *others]
         targets = [k.target for k in used]
-        pose = align(self._config, view.levels, targets, guess)
-        if pose is None or not self._is_near(guess, pose):
+        pose = align(view.levels, targets, guess)
+        if pose is None:
             return None
-        fits = [fit(self._config, view.levels, t, pose) for t in targets]
+        moved_m, turned_deg = apart(guess, pose)
+        if moved_m > MAX_STEP_M or turned_deg > MAX_STEP_DEG:
+            return None
+        fits = [fit(view.levels, t, pose) for t in targets]
         unsure_m = min(k.unsure_m for k in used)
         flat = flat_directions([f.normal_matrix for f in fits])
         if flat is not None:
             pose, unsure_m = self._go_on(view, pose, flat, guess)
-            fits = [fit(self._config, view.levels, t, pose) for t in targets]
-        return _Found(pose, used[0], fits, unsure_m) if self._lies_on(fits[0]) else None
+            fits = [fit(view.levels, t, pose) for t in targets]
+        return _Found(pose, used[0], fits, unsure_m) if lies_on(fits[0]) else None
 
     def _go_on(
         self, view: _View, pose: Float64, flat: tuple[Float64, Float64], guess: Float64
     ) -> tuple[Float64, float]:
-        """Where the points tell nothing: turn and position there as corners of the last image say, else as guessed.
+        """Where the points show nothing: turn and position there as corners of the last image say, else as guessed.
 
         Args:
             view: The image.
             pose: As aligned.
-            flat: Projections on turns and shifts of the camera, in its own axes, that no point tells of.
+            flat: Projections on turns and shifts of the camera, in its own axes, of which no point shows anything.
             guess: What the alignment began with.
 
         Returns:
@@ -380,9 +363,7 @@ class OdometryPoseSource:
         """
         corners = None if self._lost else self._corner_motion(view)
         wanted = guess if self._newest is None or corners is None else self._newest[1] @ corners
-        turn = np.asarray(cv2.Rodrigues(flat[0] @ rotation_vector(invert_pose(pose) @ wanted))[0])
-        moved = pose.copy()
-        moved[:3, :3] = pose[:3, :3] @ turn
+        moved = pose @ make_pose(flat[0] @ rotation_vector(invert_pose(pose) @ wanted), np.zeros(3))
         shifts = pose[:3, :3] @ flat[1] @ pose[:3, :3].T
         moved[:3, 3] += shifts @ (wanted[:3, 3] - pose[:3, 3])
         last = self._past[-1].T
@@ -392,50 +373,37 @@ class OdometryPoseSource:
             return moved, self._unsure_m + _GUESSED * step_m
         return moved, max(self._unsure_m, min(self._unsure_m + _STANDING_M, _UNSURE_M))
 
-    def _is_near(self, guess: Float64, pose: Float64) -> bool:
-        moved = float(np.linalg.norm(pose[:3, 3] - guess[:3, 3]))
-        turned = float(np.rad2deg(np.linalg.norm(rotation_vector(invert_pose(guess) @ pose))))
-        return moved <= self._config.max_step_m and turned <= self._config.max_step_deg
-
-    def _lies_on(self, found: Fit) -> bool:
-        return (
-            found.overlap >= self._config.min_overlap
-            and found.fitness >= self._config.min_fitness
-            and found.rmse_m <= self._config.max_rmse_m
-        )
-
     def _accept(self, view: _View, found: _Found) -> PoseEstimate:
         pose, nearest, fits = found.T_world_camera, found.nearest, found.fits
         if self._lost:
-            self._counts["relocalised"] += 1
+            self._counters["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
             self._past = []
         jumped = self._jump(view, nearest, pose)
         self._lost_ns, self._warnings = None, ()
         self._images += 1
-        self._counts["tracked"] += 1
+        self._counters["tracked"] += 1
         self._newest, self._unsure_m = (view, pose), found.unsure_m
         self._noise_m += _NOISE_GAIN * (fits[0].noise_m - self._noise_m) if self._noise_m else fits[0].noise_m
         self._past = [*self._past[-1:], StampedPose(view.stamp_ns, pose)]
         way, turn = self._map.distances(pose)
-        reach = np.maximum(way / self._config.keyframe_m, np.rad2deg(turn) / self._config.keyframe_deg)
+        reach = np.maximum(way / KEYFRAME_M, np.rad2deg(turn) / KEYFRAME_DEG)
         way_m = float(min(k.way_m + d for k, d in zip(self._map.frames, way, strict=True)))
-        if reach.min() > 1 or fits[0].overlap < self._config.keyframe_overlap or jumped is not None:
+        if reach.min() > 1 or fits[0].overlap < KEYFRAME_OVERLAP or jumped is not None:
             self._add_keyframe(view, pose, way_m, nearest.number, jumped)
-        else:
-            if self._closer is not None:
-                self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
-        sigma = _sigma(fits, float(np.hypot(self._config.drift * way_m, found.unsure_m)))
+        elif self._closer is not None:
+            self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
+        sigma = _sigma(fits, float(np.hypot(DRIFT * way_m, found.unsure_m)))
         return PoseEstimate(pose, "odometry", sigma, self._world)
 
     def _jump(self, view: _View, nearest: OdometryKeyframe, pose: Float64) -> tuple[int, Float64] | None:
         """Where another keyframe has taken the camera off its way: the one before, and the way expected from it."""
         before, self._nearest = self._nearest, nearest.number
-        known = self._keyframe_poses()
+        known = self._map.poses
         if self._closer is None or self._lost or before == nearest.number or before not in known or not self._past:
             return None
         expected = self._expected(view.stamp_ns)
-        if between(expected, pose)[0] < _JUMP_M:
+        if apart(expected, pose)[0] < _JUMP_M:
             return None
         return before, invert_pose(known[before]) @ expected
 
@@ -447,19 +415,19 @@ class OdometryPoseSource:
         parent: int | None,
         before: tuple[int, Float64] | None = None,
     ) -> None:
-        count = self._config.features
-        places = PLACE_FEATURES if self._closer is not None else 0
-        place = find_place_features(view.rgb, view.depth_m, places) if places else view.features(count)
-        number = self._counts["keyframes"]
-        self._counts["keyframes"] += 1
-        target = Target(view.levels, pose)
-        keyframe = OdometryKeyframe(number, target, view.features(count), place, way_m, self._unsure_m)
+        number = self._counters["keyframes"]
+        self._counters["keyframes"] += 1
+        place = view.features
         if self._closer is not None:
-            self._closer.add(keyframe, parent, before)
-            self._trail.add(view.stamp_ns, number, pose, pose)
-        known = self._keyframe_poses()
+            place = find_place_features(view.rgb, view.depth_m, PLACE_FEATURES)
+        keyframe = OdometryKeyframe(number, Target(view.levels, pose), view.features, place, way_m, self._unsure_m)
+        known = self._map.poses
         gone = self._map.add(keyframe)
-        if gone is not None and self._closer is not None:
+        if self._closer is None:
+            return
+        self._closer.add(keyframe, parent, before)
+        self._trail.add(view.stamp_ns, number, pose, pose)
+        if gone is not None:
             self._trail.hand_over(*gone, invert_pose(known[gone[1]]) @ known[gone[0]])
             self._closer.remove(*gone)
 
@@ -468,32 +436,25 @@ class OdometryPoseSource:
             self._lost_ns = image.stamp_ns
             _log.warning("odometry_lost", reason=reason)
         ways_on = "show the camera a place that it has seen before"
-        if self._begins_worlds:
+        if can_be_found(self._config):
             ways_on += f"; after {_LOST_NS // 10**9} s it begins a new world, which the mapper finds in its map"
         self._warnings = (f"the odometry is lost ({reason}); {ways_on}",)
-        self._counts["lost"] += 1
-
-    @property
-    def _begins_worlds(self) -> bool:
-        """Whether another world can be found in the map."""
-        return can_be_found(self._config)
+        self._counters["lost"] += 1
 
     def _lose_or_begin(self, view: _View, reason: str) -> PoseEstimate | None:
         """No pose, or the first one of a new world."""
         lost_ns = 0 if self._lost_ns is None else view.stamp_ns - self._lost_ns
-        if not self._begins_worlds or (self._images >= _YOUNG and lost_ns < _LOST_NS):
+        if not can_be_found(self._config) or (self._images >= _YOUNG and lost_ns < _LOST_NS):
             return self._lose(view, reason)
-        self._counts["new_worlds"] += 1
-        if is_power_of_two(self._counts["new_worlds"]):
+        self._counters["new_worlds"] += 1
+        if is_power_of_two(self._counters["new_worlds"]):
             _log.warning("odometry_begins_new_world", reason=reason, images=self._images, keyframes=len(self._map))
-        if self._closer is not None:
-            self._counts += self._closer.counters
         if self._images >= _YOUNG:  # the map is of the world before: it would take no corrections of this one
-            self._corrected = self._trail.correction(self._keyframe_poses(), final=True) or self._corrected
+            self._corrected = self._trail.correction(self._map.poses, final=True) or self._corrected
             self._closer = None
         elif self._closer is not None:
-            self._closer = LoopCloser(self._config)
-        self._map, self._trail = KeyframeMap(self._config.max_keyframes), PoseTrail()
+            self._closer = LoopCloser(self._counters)
+        self._map, self._trail = KeyframeMap(), PoseTrail()
         self._lost_ns, self._warnings = None, ()
         self._noise_m = self._unsure_m = 0.0
         self._nearest, self._images, self._next_try = -1, 0, 0
@@ -501,13 +462,39 @@ class OdometryPoseSource:
         return self._begin(view)
 
 
+def find_turn(rgb: UInt8, before: UInt8, intrinsics: CameraIntrinsics) -> Float64 | None:
+    """How far a camera has turned between two images: T_before_camera (4, 4), about its x and y axes.
+
+    Phase correlation: brightness and contrast do not count. A first guess only: what lies near shifts by more where the
+    camera moves, too.
+
+    Args:
+        rgb: (H, W, 3) of this image.
+        before: (H, W, 3) of the earlier one.
+        intrinsics: Of both.
+
+    Returns:
+        None where the pictures share too little.
+    """
+    earlier, now = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (before, rgb))
+    window = cv2.createHanningWindow((intrinsics.width, intrinsics.height), cv2.CV_32F)
+    (right, down), response = cv2.phaseCorrelate(earlier, now, window)
+    if response < _LEAST_RESPONSE:
+        return None
+    ahead = np.array((-right / intrinsics.fx, -down / intrinsics.fy, 1.0))  # its view, in the earlier axes
+    ahead /= np.linalg.norm(ahead)
+    axis = np.cross((0.0, 0.0, 1.0), ahead)
+    sine = float(np.linalg.norm(axis))
+    return make_pose(axis / max(sine, 1e-12) * np.arctan2(sine, ahead[2]), np.zeros(3))
+
+
 def _is_close(T_a: Float64, T_b: Float64, within_m: float = _JUMP_M) -> bool:
-    moved_m, turned_deg = between(T_a, T_b)
+    moved_m, turned_deg = apart(T_a, T_b)
     return moved_m < within_m and turned_deg < _JUMP_DEG
 
 
 def _sigma(fits: list[Fit], drift_m: float) -> float:
     """One-sigma uncertainty of the position in metres: of the points' noise, and of the keyframes' own poses."""
-    total = sum((f.normal_matrix / max(f.noise_m, 1e-3) ** 2 for f in fits), np.zeros((6, 6))) / _POINTS_A_VOTE
+    total = sum((f.normal_matrix / max(f.noise_m, 1e-3) ** 2 for f in fits), np.zeros((6, 6))) / POINTS_A_VOTE
     covariance = np.linalg.pinv(total)[3:, 3:]
     return float(np.hypot(np.sqrt(max(np.trace(covariance), 0.0) / 3), drift_m))

@@ -5,51 +5,31 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Protocol, Self, runtime_checkable
+from typing import Self
 
 import msgspec
 import numpy as np
 
 from semantic_mapper.drivers.base import Camera, CameraImage, CorrectedWorld, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import PoseChecks
-from semantic_mapper.drivers.poses.outlier_filter import FilterResult, PoseOutlierFilter
+from semantic_mapper.drivers.poses.motion import StampedPose
 from semantic_mapper.errors import PoseError, ShapeError
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.geometry import check_pose, pose_distance
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64, PosedFrame
 
 _DEFAULTS = PoseChecks()
-EXACT = ("fixed",)  # sources whose poses come from the settings: the first one is not doubted
+EXACT = ("fixed",)  # sources whose poses come from the settings: the first one is believed at once
 REASONS = ("no_pose", "stale", "not_rotation", "outliers", "uninitialized")
+MAX_TURN_DEG_S = 360.0  # faster than this between two images is a jump
+SLACK_M, SLACK_DEG = 0.05, 3.0  # a pose may be off by so much at any rate
+FAR = 2.0  # times what is allowed: a jump, whatever comes after it
+HELD = 3  # times ``init_consensus``: this many frames are held back at most while the first poses do not agree
 
 _log = get_logger(__name__)
-
-
-@runtime_checkable
-class DiagnosticPoseSource(PoseSource, Protocol):
-    """A pose source that tells what is the matter; all of ``semantic_mapper.drivers.poses`` do."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """One sentence for each thing that does not work as it should now; any thread may ask."""
-        ...
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """Totals since it was opened, by name."""
-        ...
-
-
-@runtime_checkable
-class CorrectingPoseSource(PoseSource, Protocol):
-    """A pose source that closes loops."""
-
-    def correction(self, final: bool = False) -> CorrectedWorld | None:
-        """New poses of past images, once after each change; ``final``: no more images will come."""
-        ...
 
 
 class PosedCamera:
@@ -91,7 +71,7 @@ class PosedCamera:
         self._checks = checks
         self._T_rig_camera = T_rig_camera
         self._counts: Counter[str] = Counter()
-        self._gates: dict[str, PoseOutlierFilter] = {}
+        self._filters: dict[str, PoseOutlierFilter] = {}
         self._last_ns: dict[str, int] = {}
         self._trouble = ""
         self._corrected: CorrectedWorld | None = None
@@ -108,15 +88,12 @@ class PosedCamera:
     def counters(self) -> dict[str, int]:
         """Frames given and left out; see the class."""
         own = {name: self._counts[name] for name in ("frames", *REASONS)}
-        if not isinstance(self._poses, DiagnosticPoseSource):
-            return own
-        return own | {f"pose_{name}": count for name, count in dict(self._poses.counters).items()}
+        return own | {f"pose_{name}": count for name, count in self._poses.counters.items()}
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Those of the camera and of the pose source, and why the last pose was refused."""
-        told = self._poses.warnings if isinstance(self._poses, DiagnosticPoseSource) else ()
-        return (*self._camera.warnings, *told, *((self._trouble,) if self._trouble else ()))
+        return (*self._camera.warnings, *self._poses.warnings, *((self._trouble,) if self._trouble else ()))
 
     @property
     def can_wait(self) -> bool:
@@ -150,13 +127,7 @@ class PosedCamera:
         self._camera.stop()
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
-        """Better poses of past frames, since the pose source has closed a loop; None where nothing has changed.
-
-        To be asked for after each frame, which then is of the corrected world.
-
-        Args:
-            final: No more frames are wanted.
-        """
+        """As of ``PoseSource``, with poses of the camera; frames given from then on are of the corrected world."""
         if final:
             self._follow_correction(final=True)
         corrected, self._corrected = self._corrected, None
@@ -169,28 +140,27 @@ class PosedCamera:
             CameraError: the camera is gone, or it cannot have poses from this source.
         """
         for image in self._camera:
+            camera_id = image.camera_id
             estimate = self._checked_pose(image)
             self._follow_correction()
-            if estimate is not None:
-                if self._worlds.setdefault(image.camera_id, estimate.world) != estimate.world:
-                    self._worlds[image.camera_id] = estimate.world
-                    if (old := self._gates.pop(image.camera_id, None)) is not None:
-                        yield from self._passed(old.abandon(), image.camera_id)
-                gate = self._gates.setdefault(
-                    image.camera_id, PoseOutlierFilter(self._checks, exact=estimate.source in EXACT)
-                )
-                yield from self._passed(gate.take(_frame(image, estimate)), image.camera_id)
-        for camera_id, gate in self._gates.items():
-            yield from self._passed(gate.end(), camera_id)
+            if estimate is None:
+                continue
+            if self._worlds.setdefault(camera_id, estimate.world) != estimate.world:
+                self._worlds[camera_id] = estimate.world
+                if (old := self._filters.pop(camera_id, None)) is not None:
+                    yield from self._passed(old.abandon(), camera_id)
+            if camera_id not in self._filters:
+                self._filters[camera_id] = PoseOutlierFilter(self._checks, exact=estimate.source in EXACT)
+            yield from self._passed(self._filters[camera_id].take(_frame(image, estimate)), camera_id)
+        for camera_id, outlier_filter in self._filters.items():
+            yield from self._passed(outlier_filter.end(), camera_id)
 
     def _follow_correction(self, final: bool = False) -> None:
-        if not isinstance(self._poses, CorrectingPoseSource):
-            return
         corrected = self._poses.correction(final)
         if corrected is None:
             return
-        for gate in self._gates.values():
-            gate.follow(corrected.motion)
+        for outlier_filter in self._filters.values():
+            outlier_filter.follow(corrected.motion)
         if self._T_rig_camera is not None:
             cameras = {stamp_ns: pose @ self._T_rig_camera for stamp_ns, pose in corrected.poses.items()}
             corrected = replace(corrected, poses=cameras)
@@ -203,7 +173,7 @@ class PosedCamera:
         estimate = self._poses.pose(image)
         if estimate is None:
             self._counts["no_pose"] += 1
-            self._trouble = ""  # the source tells why
+            self._trouble = ""  # the source says why
             return None
         estimate = replace(estimate, world=self._world + estimate.world)
         if self._T_rig_camera is not None:
@@ -216,21 +186,21 @@ class PosedCamera:
             return self._refuse(image, "not_rotation", f"its pose has an uncertainty of {estimate.sigma} m")
         return estimate
 
-    def _passed(self, verdict: FilterResult, camera_id: str) -> Iterator[PosedFrame]:
-        for frame, why in verdict.outliers:
+    def _passed(self, result: FilterResult, camera_id: str) -> Iterator[PosedFrame]:
+        for frame, why in result.outliers:
             self._refuse(frame, "outliers", why)
-        for frame, why in verdict.uninitialized:
+        for frame, why in result.uninitialized:
             self._refuse(frame, "uninitialized", why)
-        if verdict.waiting:
-            self._trouble = f"frames of '{camera_id}' are held back: {verdict.waiting}"
-        elif verdict.passed:
+        if result.waiting:
+            self._trouble = f"frames of '{camera_id}' are held back: {result.waiting}"
+        elif result.passed:
             self._trouble = ""
-        for frame in verdict.passed:
+        for frame in result.passed:
             self._counts["frames"] += 1
             yield frame
 
     def _refuse(self, image: CameraImage | PosedFrame, reason: str, detail: str) -> None:
-        """Count it; tell of it at each power of two."""
+        """Count it; log it at each power of two."""
         self._counts[reason] += 1
         count = self._counts[reason]
         self._trouble = f"image {image.seq} of '{image.camera_id}' was left out ({reason}): {detail}"
@@ -239,7 +209,6 @@ class PosedCamera:
 
 
 def _frame(image: CameraImage, estimate: PoseEstimate) -> PosedFrame:
-    T_world_camera: Float64 = np.asarray(estimate.T_world_camera, np.float64)
     return PosedFrame(
         stamp_ns=image.stamp_ns,
         seq=image.seq,
@@ -248,8 +217,175 @@ def _frame(image: CameraImage, estimate: PoseEstimate) -> PosedFrame:
         depth_m=image.depth_m,
         label=None,
         intrinsics=image.intrinsics,
-        T_world_camera=T_world_camera,
+        T_world_camera=np.asarray(estimate.T_world_camera, np.float64),
         pose_source=estimate.source,
         pose_sigma=float(estimate.sigma),
         world=estimate.world,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilterResult:
+    """What becomes of a frame, and of those that were held back before it.
+
+    Args:
+        passed: Frames to give, in the order of capture.
+        outliers, uninitialized: Frames to leave out, each with why: it cannot have been reached from poses that are
+            believed; or no poses are believed yet, and it did not agree with those around it.
+        waiting: Why frames are held back though they contradict each other; empty where they do not.
+    """
+
+    passed: tuple[PosedFrame, ...] = ()
+    outliers: tuple[tuple[PosedFrame, str], ...] = ()
+    uninitialized: tuple[tuple[PosedFrame, str], ...] = ()
+    waiting: str = ""
+
+
+class PoseOutlierFilter:
+    """Which poses of one camera are believed: the first ones once some agree, then those that can have been reached.
+
+    First frames stand in chains, in each of which a pose can be reached from the one before. A chain is believed when
+    it is ahead of every other by ``init_consensus``: a wrong first pose loses against what follows it, and of two
+    worlds that take turns none is believed. From there, what is within reach grows with the time since the last pose
+    that passed. A source that has jumped far and continues from there must not pass because of that; one that jumps
+    back may.
+
+    Args:
+        checks: The limits.
+        exact: The first pose is right.
+    """
+
+    def __init__(self, checks: PoseChecks, exact: bool = False) -> None:
+        self._checks = checks
+        self._agree = 1 if exact else checks.init_consensus
+        self._chains: list[list[PosedFrame]] = []  # the one that was last added to is the last
+        self._last: StampedPose | None = None  # that was believed; None while first frames are held back
+        self._elsewhere: StampedPose | None = None  # the last refused pose, and ...
+        self._agreeing = 0  # ... how many in a row agree with it, and ...
+        self._far = False  # ... whether the first of them was so far that no quick movement explains it
+
+    def take(self, frame: PosedFrame) -> FilterResult:
+        """Judge the next frame."""
+        sample = _sample(frame)
+        if self._last is None:
+            return self._take_first(frame, sample)
+        reason = self._refusal(self._last, sample)
+        return FilterResult(outliers=((frame, reason),)) if reason else FilterResult((frame,))
+
+    def follow(self, motion: Float64) -> None:
+        """The world of the poses to come is another one: ``motion`` (4, 4) takes the last pose there."""
+        if self._last is not None:
+            self._last = replace(self._last, T=motion @ self._last.T)
+        if self._elsewhere is not None:
+            self._elsewhere = replace(self._elsewhere, T=motion @ self._elsewhere.T)
+
+    def abandon(self) -> FilterResult:
+        """The world of the poses has ended: what is held back is left out."""
+        why = "the camera began another world before its first poses were sure"
+        return FilterResult() if self._last is not None else self._give_up(why)
+
+    def end(self) -> FilterResult:
+        """No more will come: what is held back passes where no pose has contradicted it."""
+        if self._last is None and len(self._chains) == 1:
+            return FilterResult(tuple(self._chains[0]))
+        return FilterResult() if self._last is not None else self._give_up(self._contradiction())
+
+    def _take_first(self, frame: PosedFrame, sample: StampedPose) -> FilterResult:
+        """The frames of the chain that is believed now, or none."""
+        # The chain that the frame follows most closely; not the longest: what is within reach of a chain grows while
+        # another one grows.
+        fractions = [(_reach(self._checks, _sample(chain[-1]), sample), chain) for chain in self._chains]
+        fraction, chain = min(fractions, key=lambda found: found[0], default=(np.inf, []))
+        chain = chain if fraction <= 1 else []
+        chain.append(frame)
+        others = [c for c in self._chains if c is not chain]
+        self._chains = [*others, chain]
+        if len(chain) - max((len(c) for c in others), default=0) >= self._agree:
+            why = f"its pose does not agree with {len(chain)} others that agree with each other"
+            self._last = sample
+            return FilterResult(tuple(chain), outliers=tuple((f, why) for f in _in_order(others)))
+        waiting = self._contradiction()
+        if sum(len(c) for c in self._chains) < HELD * self._agree:
+            return FilterResult(waiting=waiting)
+        return self._give_up(waiting)
+
+    def _give_up(self, why: str) -> FilterResult:
+        held, self._chains = _in_order(self._chains), []
+        return FilterResult(uninitialized=tuple((f, why) for f in held), waiting=why)
+
+    def _contradiction(self) -> str:
+        if len(self._chains) < 2:
+            return ""
+        before, after = sorted((_sample(chain[-1]) for chain in self._chains[-2:]), key=lambda s: s.stamp_ns)
+        return (
+            f"the first poses do not agree with each other ({_jump(self._checks, before, after)}); "
+            f"none is believed before {self._agree} agree (init_consensus)"
+        )
+
+    def _refusal(self, last: StampedPose, sample: StampedPose) -> str:
+        """Why a pose is refused; empty where it passes."""
+        reason = _jump(self._checks, last, sample)
+        follows = self._elsewhere is not None and not _jump(self._checks, self._elsewhere, sample)
+        needed = self._checks.relocalize_after
+        if follows and self._far:
+            moved_m, turned_deg, seconds = _way(last, sample)
+            way_out = (
+                f"after {needed} of them that agree with each other they are believed (relocalize_after)"
+                if needed
+                else "if they are right now, start the launch again, or set checks = { relocalize_after = N } in the "
+                "table `poses`: after a jump, N poses in a row that agree with each other are believed then, such as "
+                "N = 30"
+            )
+            reason = (
+                f"the poses have jumped and continue from there, now {moved_m:.2f} m and {turned_deg:.0f} degrees from "
+                f"the last one that was believed, {seconds:.1f} s ago; they are left out, since those of another world "
+                f"would spoil the map; {way_out}"
+            )
+        if reason:
+            self._agreeing = self._agreeing + 1 if follows else 1
+            if not follows:
+                self._far = bool(_jump(self._checks, last, sample, FAR))
+            self._elsewhere = sample
+            if not 0 < needed < self._agreeing:
+                return reason
+            _log.warning("jump_accepted", reason=reason, agreeing=self._agreeing)
+        self._last, self._elsewhere, self._agreeing = sample, None, 0
+        return ""
+
+
+def _sample(frame: PosedFrame) -> StampedPose:
+    return StampedPose(frame.stamp_ns, frame.T_world_camera)
+
+
+def _way(a: StampedPose, b: StampedPose) -> tuple[float, float, float]:
+    """Metres, degrees and seconds from a to b."""
+    moved_m, turned = pose_distance(a.T, b.T)
+    return moved_m, float(np.rad2deg(turned)), (b.stamp_ns - a.stamp_ns) / 1e9
+
+
+def _in_order(chains: list[list[PosedFrame]]) -> list[PosedFrame]:
+    return sorted((frame for chain in chains for frame in chain), key=lambda f: f.stamp_ns)
+
+
+def _allowed(checks: PoseChecks, seconds: float) -> tuple[float, float]:
+    """Metres and degrees that are believed in that time."""
+    return SLACK_M + checks.max_speed_m_s * seconds, SLACK_DEG + MAX_TURN_DEG_S * seconds
+
+
+def _reach(checks: PoseChecks, a: StampedPose, b: StampedPose) -> float:
+    """The way from a to b by what is allowed in that time; above 1 it is a jump."""
+    moved_m, turned_deg, seconds = _way(a, b)
+    allowed_m, allowed_deg = _allowed(checks, seconds)
+    return max(moved_m / allowed_m, turned_deg / allowed_deg)
+
+
+def _jump(checks: PoseChecks, a: StampedPose, b: StampedPose, times: float = 1.0) -> str:
+    """Why b cannot have been reached from a, with this many times the limits; empty where it can."""
+    if _reach(checks, a, b) <= times:
+        return ""
+    moved_m, turned_deg, seconds = _way(a, b)
+    allowed_m, allowed_deg = (times * limit for limit in _allowed(checks, seconds))
+    return (
+        f"the pose jumps by {moved_m:.2f} m and {turned_deg:.0f} degrees in {seconds:.3f} s; at most "
+        f"{allowed_m:.2f} m and {allowed_deg:.0f} degrees are believed (max_speed_m_s)"
     )

@@ -1,8 +1,8 @@
-"""Visual odometry as a pose source: a single camera without depth, its scale from whatever tells one."""
+"""Visual odometry as a pose source: a single camera without depth, its scale from whatever gives one."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
 from types import TracebackType
 from typing import Self
 
@@ -11,15 +11,16 @@ import numpy as np
 from semantic_mapper.bundle.odometry import VisualOdometry
 from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.scale import ScaleEstimator
-from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.config import PoseRefinerConfig
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import VisualPoses, gives_metres, matrix
-from semantic_mapper.drivers.poses.posed_camera import DiagnosticPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 _LEVEL = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))  # looking along x, z up
-_AWAITED_FLOOR = "the scale is not known yet: move the camera on, and let it see the floor"
+_TRACKING = PoseRefinerConfig(window=10)
+_DRIFT = 0.03  # of the way: what ``sigma`` grows by
 _GAIN = 0.3  # of the way to a new scale that a keyframe goes
 _UNKNOWN = (
     "scale: unknown: poses are up to scale, and nothing in the map is in metres; give the robot's odometry "
@@ -30,7 +31,7 @@ _UNKNOWN = (
 _log = get_logger(__name__)
 
 
-class VisualPoseSource:
+class VisualPoseSource(PoseSource):
     """Follows one camera by its pictures. Not for several threads at once, but any may read ``counters``, ``warnings``.
 
     Args:
@@ -42,7 +43,8 @@ class VisualPoseSource:
             yet; what ``PictureChecker`` counts; with "scale_" before them, those of the reference.
     """
 
-    def __init__(self, config: VisualPoses, reference: DiagnosticPoseSource | None = None) -> None:
+    def __init__(self, config: VisualPoses, reference: PoseSource | None = None) -> None:
+        super().__init__()
         self._config = config
         self._reference = reference
         self._camera: tuple[str, CameraIntrinsics] | None = None
@@ -71,11 +73,11 @@ class VisualPoseSource:
         return (*((self._trouble,) if self._trouble else ()), *unknown, *self._checks.warnings, *reference)
 
     @property
-    def counters(self) -> dict[str, int]:
+    def counters(self) -> Counter[str]:
         """Totals; see the class."""
-        counted: Mapping[str, int] = {} if self._odometry is None else dict(self._odometry.counters)
-        scale = {} if self._reference is None else {f"scale_{n}": c for n, c in dict(self._reference.counters).items()}
-        return {**counted, "without_scale": self._without_scale, **dict(self._checks.counters), **scale}
+        counted = {} if self._odometry is None else dict(self._odometry.counters)
+        scale = {} if self._reference is None else {f"scale_{n}": c for n, c in self._reference.counters.items()}
+        return Counter({**counted, "without_scale": self._without_scale, **dict(self._checks.counters), **scale})
 
     def __enter__(self) -> Self:
         if self._reference is not None:
@@ -109,21 +111,20 @@ class VisualPoseSource:
         pose = self._scaled(odometry, pose, None if reference is None else reference.T_world_camera)
         if self.scale == "awaited":
             self._without_scale += 1
-            self._trouble = (
-                _AWAITED_FLOOR if self._config.camera_height_m else "the scale is not known yet: move the camera on"
-            )
+            floor = ", and let it see the floor" if self._config.camera_height_m else ""
+            self._trouble = f"the scale is not known yet: move the camera on{floor}"
             return None
         self._trouble = ""
         if self._last is not None:
             self._way += float(np.linalg.norm(pose[:3, 3] - self._last[:3, 3]))
         self._last = pose
-        return PoseEstimate(pose, "visual", self._config.drift * self._way)
+        return PoseEstimate(pose, "visual", _DRIFT * self._way)
 
     def _follow(self, image: CameraImage) -> VisualOdometry:
         camera = (image.camera_id, image.intrinsics)
         if self._odometry is None:
             self._camera = camera
-            self._odometry = VisualOdometry(image.intrinsics, self._config.tracking)
+            self._odometry = VisualOdometry(image.intrinsics, _TRACKING)
         if camera != self._camera:
             raise CameraError(
                 f"visual odometry follows one camera at one size; an image of '{image.camera_id}' at "

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 import semantic_mapper.config
-from semantic_mapper.config import AtLeastOne, Positive
+from semantic_mapper.config import AtLeastOne
 
 Preset = Literal["as-is", "default", "hand", "high_accuracy", "high_density", "medium_density"]
 
@@ -15,7 +15,9 @@ Preset = Literal["as-is", "default", "hand", "high_accuracy", "high_density", "m
 class Config(semantic_mapper.config.Config, frozen=True):
     """A RealSense: one colour camera, and depth aligned to it. It has no odometry: poses come from elsewhere."""
 
-    device: str = ""  # serial number, as `semantic-mapper cameras` shows it; empty = the only one that is connected
+    device: str = (
+        ""  # serial number, as `semantic-mapper doctor --cameras` shows it; empty = the only one that is connected
+    )
     width: AtLeastOne = 640  # of the colour images; sizes and rates are those that the device offers
     height: AtLeastOne = 480
     fps: Annotated[int, msgspec.Meta(ge=1, le=300)] = 30
@@ -25,7 +27,3 @@ class Config(semantic_mapper.config.Config, frozen=True):
     # The stereo matcher's preset. This one would rather leave a pixel without depth than guess: a map has other views.
     preset: Preset = "high_accuracy"
     ir_dots: bool = True  # the dot projector: depth on bare walls
-    search_s: Positive = 2.0  # how long the device is looked for before it counts as missing
-    start_s: Positive = 10.0  # how long the first image may take after the device has been opened
-    stall_s: Positive = 3.0  # without images for so long, the device is closed and opened again
-    retry_s: Positive = 1.0  # between two attempts to find a device that has gone

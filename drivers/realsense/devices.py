@@ -1,22 +1,44 @@
-"""Which RealSense cameras are connected, and why one cannot be had."""
+"""The RealSense SDK, which cameras are connected, and why one cannot be had."""
 
 from __future__ import annotations
 
+import functools
+import importlib
+import sys
 import time
+from pathlib import Path
 from typing import Any
 
-from semantic_mapper.drivers.realsense.library import load_realsense
 from semantic_mapper.drivers.registry import FoundCamera
-from semantic_mapper.errors import CameraError
+from semantic_mapper.errors import CameraError, DependencyError
+from semantic_mapper.mapping.open3d_loader import preload_folder, preload_libusb
 
 USB_VENDOR = "8086"
 UDEV_RULE = f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{USB_VENDOR}", MODE="0666"'
 _SEARCH_STEP_S = 0.2
-_MEND = (
+_FIX = (
     "check its cable (a USB 3 port, `lsusb` shows it as Intel or RealSense); without permission it does not show "
     f"either: echo '{UDEV_RULE}' | sudo tee /etc/udev/rules.d/99-realsense.rules && sudo udevadm control "
     "--reload-rules && sudo udevadm trigger, then plug it in again"
 )
+
+
+@functools.cache
+def load_realsense() -> Any:
+    """Import ``pyrealsense2`` once and return the module.
+
+    Raises:
+        DependencyError: it cannot be loaded, and how to get it.
+    """
+    notes = preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")  # the wheel links libusb, and has none
+    try:
+        return importlib.import_module("pyrealsense2")
+    except (ImportError, OSError) as error:
+        raise DependencyError(
+            f"the RealSense SDK cannot be loaded: {error}. Install it: pip install 'semantic-mapper[realsense]' (there "
+            "are wheels for Linux on x86-64; elsewhere build librealsense with its Python wrapper)"
+            + "".join(f" [{note}]" for note in notes)
+        ) from error
 
 
 def list_devices() -> list[FoundCamera]:
@@ -49,7 +71,7 @@ def find_device(serial: str, search_s: float) -> Any:
         The SDK's ``device``.
 
     Raises:
-        CameraError: there is none, or several where one should be; and how to mend it.
+        CameraError: there is none, or several where one should be; and how to fix it.
     """
     rs = load_realsense()
     deadline = time.monotonic() + search_s
@@ -63,7 +85,7 @@ def find_device(serial: str, search_s: float) -> Any:
         if time.monotonic() > deadline:
             what = f"the RealSense '{serial}' is not connected" if serial else "no RealSense camera is connected"
             there = f" (there is {', '.join(devices)})" if devices else ""
-            raise CameraError(f"{what}{there}: {_MEND}")
+            raise CameraError(f"{what}{there}: {_FIX}")
         time.sleep(_SEARCH_STEP_S)
 
 

@@ -10,12 +10,12 @@ from typing import Any, Self
 
 import msgspec
 
+from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.base import Camera, CameraImage
-from semantic_mapper.drivers.registry import open_camera
-from semantic_mapper.drivers.stereo.calibration import load_stereo
+from semantic_mapper.drivers.calibration import load_stereo
 from semantic_mapper.drivers.stereo.config import Config
 from semantic_mapper.drivers.stereo.depth import StereoDepth
-from semantic_mapper.drivers.v4l2 import paths
+from semantic_mapper.drivers.v4l2 import devices
 from semantic_mapper.errors import CameraError
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import UInt8
@@ -38,7 +38,7 @@ class StereoCamera:
     def __init__(self, config: Config, camera_id: str) -> None:
         if not config.device:
             raise CameraError(
-                f"camera '{camera_id}': no device is named; `semantic-mapper cameras --kind stereo` lists what may be "
+                f"camera '{camera_id}': no device is named; `doctor --cameras --kind stereo` lists what may be "
                 'one; give its address as device = "/dev/v4l/by-id/..."'
             )
         if not config.calibration:
@@ -59,14 +59,14 @@ class StereoCamera:
         kind, settings = source_of(config.device, *self._size)
         # Its own rectification is off: that of one lens would be wrong for both.
         settings |= {**config.source, "uncalibrated": True}
-        self._source: Camera = open_camera(kind, settings, camera_id, f"stereo pair at {config.device}")
+        self._source: Camera = registry.open_camera(kind, settings, camera_id, f"stereo pair at {config.device}")
         self._info: StreamInfo | None = None
 
     @property
     def info(self) -> StreamInfo:
         """As of ``Camera``."""
         if self._info is None:
-            raise CameraError(f"camera '{self._camera_id}' is not open yet")
+            raise CameraError(f"camera '{self._camera_id}' is not open")
         return self._info
 
     @property
@@ -91,21 +91,21 @@ class StereoCamera:
             CameraError: it is not there, or its images have another size than both of the calibration side by side.
         """
         self._source.__enter__()
-        told = self._source.info
-        (given,) = told.cameras.values()
+        source = self._source.info
+        (given,) = source.cameras.values()
         if (given.width, given.height) != self._size:
             self._source.__exit__(None, None, None)
             raise CameraError(
-                f"{told.source}: gives images of {given.width}x{given.height}, and the pair was calibrated at "
+                f"{source.source}: gives images of {given.width}x{given.height}, and the pair was calibrated at "
                 f"{self._size[0] // 2}x{self._size[1]}, side by side {self._size[0]}x{self._size[1]}; calibrate for a "
                 "size that it offers"
             )
         self._info = msgspec.structs.replace(
-            told,
-            source=f"stereo {told.source}",
+            source,
+            source=f"stereo {source.source}",
             cameras={self._camera_id: self._depth.intrinsics},
             metadata={
-                **told.metadata,
+                **source.metadata,
                 "driver": "stereo",
                 "baseline_m": f"{self._depth.baseline_m:.4f}",
                 "disparities": str(self._depth.disparities),
@@ -144,6 +144,15 @@ def source_of(device: str, width: int = 0, height: int = 0) -> tuple[str, dict[s
         device: A V4L2 device, a video file, or a URL.
         width, height: To ask of it; 0 = as it is.
     """
-    if Path(device).is_relative_to(paths.DEVICES):
+    if Path(device).is_relative_to(devices.DEVICES):
         return "v4l2", {"device": device, "width": width, "height": height}
     return "opencv", {"source": device}
+
+
+def open_camera(config: Config, camera_id: str) -> StereoCamera:
+    """The camera of a config, opened when it is entered; see ``drivers/registry.py``.
+
+    Raises:
+        CameraError, ConfigError: see ``StereoCamera``.
+    """
+    return StereoCamera(config, camera_id)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from semantic_mapper.drivers.stereo.calibration import StereoCalibration
+from semantic_mapper.drivers.calibration import StereoCalibration
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
@@ -51,7 +51,7 @@ class StereoDepth:
         self.baseline_m = float(np.linalg.norm(offset))
         if self.baseline_m <= 0 or offset[0] >= 0 or np.abs(offset[1:]).max() > MOST_ASIDE * self.baseline_m:
             raise ConfigError(
-                f"the right camera is not beside the left one (T_right_left moves by {offset.round(4).tolist()} m, its "
+                f"the right camera is not next to the left one (T_right_left moves {offset.round(4).tolist()} m, its "
                 "x must be negative); calibrate again"
             )
         lenses = [(camera_matrix(k), np.array(k.distortion or (0.0,) * 5)) for k in (left, right)]

@@ -2,6 +2,6 @@
 
 from semantic_mapper.drivers.v4l2.camera import open_camera
 from semantic_mapper.drivers.v4l2.config import Config
-from semantic_mapper.drivers.v4l2.listing import list_devices
+from semantic_mapper.drivers.v4l2.devices import list_devices
 
 __all__ = ["Config", "list_devices", "open_camera"]

@@ -16,12 +16,12 @@ _MAX_EXPOSURE_MS = HIGHEST // 10  # the control counts tenths of a millisecond
 class Config(config.Config, frozen=True):
     """One camera. The size of its images is that of its calibration."""
 
-    device: str = ""  # /dev/v4l/by-id/..., as `semantic-mapper cameras` lists it; has to be given
+    device: str = ""  # /dev/v4l/by-id/..., as `semantic-mapper doctor --cameras` lists it; has to be given
     calibration: str = ""  # file; see drivers/calibration.py
     uncalibrated: bool = False  # images as the lens gives them, for calibrating only
     width: NotNegative = 0  # uncalibrated: of the requested images; 0 = as the device has it
     height: NotNegative = 0
-    fps: Annotated[float, msgspec.Meta(ge=0.01, le=1000)] = 30.0  # asked for; what the device gives instead is reported
+    fps: Annotated[float, msgspec.Meta(ge=0.01, le=1000)] = 30.0  # requested; what the device gives instead is reported
     # Pixel requested format, four letters. MJPG passes through USB at full rate; YUYV is without artefacts. Empty = as
     # the device has it.
     fourcc: Annotated[str, msgspec.Meta(pattern=r"^(.{4}|)\Z")] = "MJPG"

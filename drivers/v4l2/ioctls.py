@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from semantic_mapper.errors import CameraError
-
 EXPOSURE_AUTO = 0x009A0901
 EXPOSURE_ABSOLUTE = 0x009A0902  # in 100 microseconds
 AUTO_WHITE_BALANCE = 0x0098090C
@@ -26,7 +24,7 @@ AUTOGAIN = 0x00980912
 GAIN = 0x00980913
 EXPOSURE_MANUAL = 1  # of EXPOSURE_AUTO
 
-LOWEST, HIGHEST = -(2**31), 2**31 - 1  # value of a control
+LOWEST, HIGHEST = -(2**31), 2**31 - 1  # value of a control; ctypes would pass on what is left of a larger one
 
 _CAP_VIDEO_CAPTURE = 0x00000001
 _CAP_DEVICE_CAPS = 0x80000000
@@ -128,7 +126,7 @@ class Control:
 
 @contextmanager
 def opened(path: Path) -> Iterator[int]:
-    """A file descriptor of a device, for questions and controls beside whoever streams.
+    """A file descriptor of a device, for questions and controls while another one streams.
 
     Raises:
         OSError: it cannot be opened.
@@ -146,10 +144,10 @@ def query_capability(fd: int) -> Capability:
     Raises:
         OSError: no video device.
     """
-    told = _Capability()
-    fcntl.ioctl(fd, QUERYCAP, told)
-    of_node = told.device_caps if told.capabilities & _CAP_DEVICE_CAPS else told.capabilities
-    return Capability(_text(told.card), _text(told.driver), _text(told.bus_info), bool(of_node & _CAP_VIDEO_CAPTURE))
+    row = _Capability()
+    fcntl.ioctl(fd, QUERYCAP, row)
+    of_node = row.device_caps if row.capabilities & _CAP_DEVICE_CAPS else row.capabilities
+    return Capability(_text(row.card), _text(row.driver), _text(row.bus_info), bool(of_node & _CAP_VIDEO_CAPTURE))
 
 
 def list_formats(fd: int) -> tuple[str, ...]:
@@ -170,20 +168,20 @@ def list_sizes(fd: int) -> tuple[tuple[int, int], ...]:
     found: set[tuple[int, int]] = set()
     for code in _format_codes(fd):
         for index in range(_MAX_ROWS):
-            told = _FrameSize(index=index, pixelformat=code)
-            if not _ask(fd, ENUM_FRAMESIZES, told) or told.type != _FRAMESIZE_DISCRETE:
+            row = _FrameSize(index=index, pixelformat=code)
+            if not _fetch(fd, ENUM_FRAMESIZES, row) or row.type != _FRAMESIZE_DISCRETE:
                 break
-            found.add((told.size[0], told.size[1]))
+            found.add((row.size[0], row.size[1]))
     return tuple(sorted(found, reverse=True))
 
 
 def _format_codes(fd: int) -> list[int]:
     found: list[int] = []
     for index in range(_MAX_ROWS):
-        told = _Format(index=index, type=_BUF_TYPE_VIDEO_CAPTURE)
-        if not _ask(fd, ENUM_FMT, told):
+        row = _Format(index=index, type=_BUF_TYPE_VIDEO_CAPTURE)
+        if not _fetch(fd, ENUM_FMT, row):
             break
-        found.append(told.pixelformat)
+        found.append(row.pixelformat)
     return found
 
 
@@ -196,32 +194,29 @@ def list_controls(fd: int) -> dict[str, Control]:
     found: dict[str, Control] = {}
     last = 0
     for _ in range(_MAX_ROWS):
-        told = _QueryControl(id=last | _CTRL_FLAG_NEXT)
-        if not _ask(fd, QUERYCTRL, told):
+        row = _QueryControl(id=last | _CTRL_FLAG_NEXT)
+        if not _fetch(fd, QUERYCTRL, row):
             break
-        last = told.id
-        name = re.sub(r"[^a-z0-9]+", "_", _text(told.name).lower()).strip("_")
-        if not told.flags & _CTRL_FLAG_DISABLED:
-            found[name] = Control(told.id, name, told.minimum, told.maximum, told.default_value)
+        last = row.id
+        name = re.sub(r"[^a-z0-9]+", "_", _text(row.name).lower()).strip("_")
+        if not row.flags & _CTRL_FLAG_DISABLED:
+            found[name] = Control(row.id, name, row.minimum, row.maximum, row.default_value)
     return found
 
 
 def get_control(fd: int, control: int) -> int:
     """Value of a control. Raises ``OSError`` where it cannot be read."""
-    told = _ControlValue(id=control)
-    fcntl.ioctl(fd, G_CTRL, told)
-    return told.value
+    row = _ControlValue(id=control)
+    fcntl.ioctl(fd, G_CTRL, row)
+    return row.value
 
 
 def set_control(fd: int, control: int, value: int) -> None:
     """Set a control.
 
     Raises:
-        CameraError: more than the kernel's 32 bits hold; ctypes would pass on what is left of it.
         OSError: the device refuses.
     """
-    if not LOWEST <= value <= HIGHEST:
-        raise CameraError(f"control {control:#x} = {value}: a control's value must be from {LOWEST} to {HIGHEST}")
     fcntl.ioctl(fd, S_CTRL, _ControlValue(id=control, value=value))
 
 
@@ -232,10 +227,10 @@ def fourcc_text(code: int) -> str:
     return f"{text}-BE" if code & _FOURCC_BIG_ENDIAN else text
 
 
-def _ask(fd: int, request: int, told: Any) -> bool:
+def _fetch(fd: int, request: int, row: Any) -> bool:
     """Whether there is such a row of a list."""
     try:
-        fcntl.ioctl(fd, request, told)
+        fcntl.ioctl(fd, request, row)
     except OSError as error:
         if error.errno in (errno.EINVAL, errno.ENOTTY):
             return False

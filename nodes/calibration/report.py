@@ -1,4 +1,4 @@
-"""What a calibration tells people and programs, and the files it writes."""
+"""What a calibration reports to people and programs, and the files it writes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,12 @@ from rich.table import Table
 
 from semantic_mapper import __version__
 from semantic_mapper.config import Config
+from semantic_mapper.drivers.calibrating.camera import COEFFICIENT_NAMES, CameraCalibration, draw_calibration
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.coverage import CELLS, missing_regions
-from semantic_mapper.drivers.calibrating.intrinsics import COEFFICIENT_NAMES, CameraCalibration
-from semantic_mapper.drivers.calibrating.picture import draw_calibration
-from semantic_mapper.drivers.calibrating.solve import Calibration
-from semantic_mapper.drivers.calibrating.views import ViewGatherer
-from semantic_mapper.drivers.calibration import save_calibration
+from semantic_mapper.drivers.calibrating.rig import Calibration
+from semantic_mapper.drivers.calibrating.views import CELLS, ViewGatherer, missing_regions
+from semantic_mapper.drivers.calibration import StereoCalibration, save_calibration, save_stereo
 from semantic_mapper.drivers.poses.config import BoardPoses
-from semantic_mapper.drivers.stereo.calibration import StereoCalibration, save_stereo
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import invert_pose, rotation_vector
@@ -55,8 +52,7 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
         with _explained(out / f"{name}.toml"):
             save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
         picture = out / f"{name}.png"
-        drawn = draw_calibration(name, camera, settings.calibration)
-        write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
+        _write_picture(picture, name, camera)
         written += [out / f"{name}.toml", picture]
     return written
 
@@ -94,8 +90,7 @@ def write_stereo(out: Path, name: str, found: Calibration, settings: Calibration
     written = [file]
     for side, camera in zip(SIDES, (left, right), strict=True):
         picture = out / f"{name}-{side}.png"
-        drawn = draw_calibration(f"{name} {side}", camera, settings.calibration)
-        write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
+        _write_picture(picture, f"{name} {side}", camera)
         written.append(picture)
     return written
 
@@ -107,6 +102,11 @@ def _about(settings: CalibrationSettings) -> dict[str, str | float]:
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "board": f"{b.pattern} {b.columns}x{b.rows}, {1000 * b.square_m:g} mm",
     }
+
+
+def _write_picture(path: Path, name: str, camera: CameraCalibration) -> None:
+    drawn = draw_calibration(name, camera)
+    write_whole(path, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -185,7 +185,7 @@ def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, wor
     order = sorted(zip(camera.errors_px, camera.views, strict=True), key=lambda pair: -pair[0])
     table.add_row("worst images", ", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst]))
     if not camera.estimated:
-        table.add_row("intrinsics", "as the source tells them")
+        table.add_row("intrinsics", "as the source gives them")
     for key, value in _values(camera).items():
         sigma = f" +- {camera.sigmas[key]:.2g}" if key in camera.sigmas else ""
         table.add_row(key, f"{value:.2f}{sigma}" if key in ("fx", "fy", "cx", "cy") else f"{value:.5f}{sigma}")

@@ -1,29 +1,43 @@
-"""Where the images of a calibration come from, as the command line names it."""
+"""Views of the board from all sources, as the command line names them: recorded ones in turn, live ones at once."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
+import cv2
+import numpy as np
 import structlog
 
-from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.rig import MIN_INSTANTS
+from semantic_mapper.drivers.calibrating.views import ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibration import guess_intrinsics
+from semantic_mapper.drivers.poses.config import BoardPoses
+from semantic_mapper.drivers.registry import open_camera
+from semantic_mapper.drivers.stereo.camera import halves
+from semantic_mapper.errors import CameraError, ConfigError, SemanticMapperError
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.options import SOURCE_PATTERN
-
-if TYPE_CHECKING:
-    from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.log.sequence import open_log
 
 SIDES = ("left", "right")  # of a stereo pair, as its cameras are called
+REPORT_S = 2.0
+SPARE_INSTANTS = 4  # live rigs: beyond those needed
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _ADDRESSES = {
     "v4l2": "device",
     "opencv": "source",
     "oak": "device",
     "realsense": "device",
-}  # key of the driver's config
+}  # in the driver's config
 _KEEPS_INTRINSICS = ("oak", "realsense")  # rectifies with what its maker has measured
 
 _log = structlog.get_logger(__name__)
@@ -34,7 +48,7 @@ class Source(Protocol):
 
     live: bool
     stream: bool  # images follow each other closely
-    known: bool  # the intrinsics that it tells are right
+    known: bool  # the intrinsics that it gives are right
 
     def images(self) -> Iterator[tuple[str, CameraImage]]:
         """Images with what to call each, to the end; a live camera's until ``stop``."""
@@ -46,7 +60,7 @@ class Source(Protocol):
 
 
 def check_places(texts: Sequence[str]) -> None:
-    """Check that files and folders among the sources are there, before the packages that read them are loaded.
+    """Check that files and folders among the sources are there.
 
     Raises:
         ConfigError: one is not, or has no name for a camera.
@@ -57,7 +71,7 @@ def check_places(texts: Sequence[str]) -> None:
         if not (colon and kind in _ADDRESSES) and not Path(place).is_file() and not Path(place).is_dir():
             raise ConfigError(
                 f"{place}: neither a folder of pictures, a log (.mcap) or video that is there, nor a camera as "
-                f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper cameras` lists them)"
+                f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper doctor --cameras` lists them)"
             )
 
 
@@ -122,8 +136,6 @@ def _split(text: str, *, alone: bool) -> tuple[str, str]:
 
 
 def _camera_source(name: str, place: str, size: str) -> Source:
-    from semantic_mapper.drivers.registry import open_camera
-
     kind, colon, address = place.partition(":")
     if colon and kind in _ADDRESSES:
         config: dict[str, Any] = {_ADDRESSES[kind]: address}
@@ -162,12 +174,6 @@ class _Folder:
     known: bool = False
 
     def images(self) -> Iterator[tuple[str, CameraImage]]:
-        import cv2
-        import numpy as np
-
-        from semantic_mapper.drivers.base import CameraImage
-        from semantic_mapper.drivers.calibration import guess_intrinsics
-
         pictures = _pictures(self.folder)
         if not pictures:
             raise CameraError(f"{self.folder}: no pictures in it ({', '.join(PICTURES)})")
@@ -212,10 +218,6 @@ class _Halves:
         self.known = False
 
     def images(self) -> Iterator[tuple[str, CameraImage]]:
-        from semantic_mapper.drivers.base import CameraImage
-        from semantic_mapper.drivers.calibration import guess_intrinsics
-        from semantic_mapper.drivers.stereo.camera import halves
-
         for name, image in self._source.images():
             for side, rgb in zip(SIDES, halves(image.rgb), strict=True):
                 plain = guess_intrinsics(rgb.shape[1], rgb.shape[0])
@@ -235,13 +237,8 @@ class _Log:
     known: bool = False
 
     def images(self) -> Iterator[tuple[str, CameraImage]]:
-        from semantic_mapper.drivers.base import CameraImage
-        from semantic_mapper.replay.log.sequence import open_log
-
         # What comes of it is right for the log's images; the camera's own are another matter.
-        _log.warning(
-            "log_is_rectified", log=str(self.path), mend="calibrate the lens from the camera itself or a video"
-        )
+        _log.warning("log_is_rectified", log=str(self.path), fix="calibrate the lens from the camera itself or a video")
         with open_log(self.path) as log:
             for frame in log:
                 image = CameraImage(frame.stamp_ns, frame.seq, frame.camera_id, frame.rgb, None, frame.intrinsics)
@@ -249,3 +246,93 @@ class _Log:
 
     def stop(self) -> None:
         pass
+
+
+class Gathering:
+    """The views of all cameras.
+
+    Args:
+        board, config: See ``ViewGatherer``.
+
+    Attributes:
+        cameras: By name, in the order in which they came; ``known``: those whose intrinsics are right as given.
+    """
+
+    def __init__(self, board: BoardPoses, config: CalibrationConfig) -> None:
+        self.cameras: dict[str, ViewGatherer] = {}
+        self.known: set[str] = set()
+        self._board = board
+        self._config = config
+        self._mutex = threading.Lock()
+
+    def run(self, sources: Sequence[Source], stop: StopRequest, seconds: float, *, rig: bool) -> None:
+        """Take in all images; of live cameras, until there is enough of them, the time is over, or a stop request.
+
+        Raises:
+            CameraError, LogError: a source fails.
+        """
+        for source in sources:
+            if not source.live:
+                with frame_progress("looked at", None, "images") as bar:
+                    self._take_all(source, bar.advance, stop)
+        live = [source for source in sources if source.live]
+        if live and not stop:
+            self._listen(live, stop, seconds, rig=rig)
+
+    def lacks(self, *, rig: bool) -> list[str]:
+        """What is still missing, as sentences with the camera's name."""
+        lacks_text = [f"{name}: {lack}" for name, views in list(self.cameras.items()) for lack in views.lacks()]
+        if rig:
+            shared = len(simultaneous({n: list(v.steady) for n, v in list(self.cameras.items())}))
+            needed = MIN_INSTANTS + SPARE_INSTANTS
+            if shared < needed:
+                lacks_text.append(
+                    f"{shared} moments at which several cameras saw the board held still; {needed} are awaited"
+                )
+        return lacks_text
+
+    def _take_all(self, source: Source, advance: Callable[[], None], stop: StopRequest) -> None:
+        for name, image in source.images():
+            self._camera(image.camera_id, source).take(image, name)
+            advance()
+            if stop:
+                return
+
+    def _camera(self, camera_id: str, source: Source) -> ViewGatherer:
+        with self._mutex:
+            if camera_id not in self.cameras:
+                self.cameras[camera_id] = ViewGatherer(self._board, self._config, stream=source.stream)
+                if source.known:
+                    self.known.add(camera_id)
+            return self.cameras[camera_id]
+
+    def _listen(self, sources: Sequence[Source], stop: StopRequest, seconds: float, *, rig: bool) -> None:
+        """Raises: CameraError: a camera cannot be opened or fails."""
+        errors: list[SemanticMapperError] = []
+
+        def work(source: Source) -> None:
+            try:
+                self._take_all(source, lambda: None, stop)
+            except SemanticMapperError as error:
+                errors.append(error)
+
+        threads = [threading.Thread(target=work, args=(s,), name="calibration", daemon=True) for s in sources]
+        for thread in threads:
+            thread.start()
+        deadline, last_sent = time.monotonic() + seconds, 0.0
+        while not stop and not errors and time.monotonic() < deadline and any(t.is_alive() for t in threads):
+            time.sleep(0.1)
+            if time.monotonic() - last_sent < REPORT_S:
+                continue
+            last_sent = time.monotonic()
+            lacks = self.lacks(rig=rig) if len(self.cameras) >= len(sources) else ["waiting for images"]
+            kept = {name: len(views.kept) for name, views in list(self.cameras.items())}
+            _log.info("views", **kept, lacking="; ".join(lacks) or "nothing")
+            if not lacks:
+                break
+        for source in sources:
+            source.stop()
+        for thread in threads:
+            thread.join(5.0)
+        if errors:
+            raise CameraError(str(errors[0])) from errors[0]

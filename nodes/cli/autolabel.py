@@ -7,10 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
-from semantic_mapper.nodes.cli.replay import MaxFramesOption
-from semantic_mapper.nodes.cli.verb import must_be_there, verb
+from semantic_mapper.config import load_mapper_config
+from semantic_mapper.nodes.cli.info import autolabel_rows
+from semantic_mapper.nodes.cli.options import MaxFramesOption
+from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.run_folder import prepare_file
 
 LISTED = 10  # frames without a label, and damages, that are shown one by one
 
@@ -45,7 +48,7 @@ def autolabel(
         ),
     ] = None,
     max_frames: MaxFramesOption = 0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
+    json: JsonOption = False,
 ) -> int:
     """Label every frame of a log with weights, into a new log.
 
@@ -60,10 +63,7 @@ def autolabel(
     must_be_there(*log)
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.config import load_mapper_config
-    from semantic_mapper.nodes.cli.log_info import autolabel_rows
     from semantic_mapper.replay.jobs import OFFLINE, AutolabelRequest, autolabel_log
-    from semantic_mapper.replay.run_folder import prepare_file
 
     prepare_file(out)
     config = load_mapper_config(None, defaults=OFFLINE)

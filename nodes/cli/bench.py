@@ -8,23 +8,19 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.replay import ConfigOption, QualityOption, VoxelSizeOption, WeightsOption
+from semantic_mapper.nodes.cli.options import MapperSettings, WeightsOption
 from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.replay.log.demo import demo_log
 
 
 @verb
 def bench(
+    mapper: MapperSettings,
     part: Annotated[Literal["fusion", "pipeline"], typer.Argument(help="What to measure.")] = "pipeline",
     log: Annotated[Path | None, typer.Option(help="Log with depth to measure on; without it that of `demo`.")] = None,
     frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 20,
     weights: WeightsOption = None,
-    config: ConfigOption = None,
-    quality: QualityOption = None,
-    voxel_size: VoxelSizeOption = None,
-    depth: Annotated[
-        Literal["sensor", "computed"], typer.Option(help="Depth of the frames: measured, or computed from pictures.")
-    ] = "sensor",
     json: JsonOption = False,
 ) -> None:
     """Measure speed on this machine, on frames of 640x480.
@@ -35,12 +31,10 @@ def bench(
     Example: semantic-mapper bench pipeline --frames 30 --quality fast
     Example: semantic-mapper bench fusion --json
     """
-    must_be_there(*(path for path in (log, config) if path is not None))
+    must_be_there(*(path for path in (log, mapper.path) if path is not None))
     output = Output.guarded()
-    from semantic_mapper.config import load_mapper_config
     from semantic_mapper.replay.artifacts import versions
     from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
-    from semantic_mapper.replay.log.demo import demo_log
 
     output.quiet = json
     log = log or demo_log()
@@ -53,13 +47,7 @@ def bench(
             f"with 40 ({found['ratio_40']} times)"
         )
     else:
-        given = {
-            "voxel_map.voxel_size_m": voxel_size,
-            "quality": quality,
-            "depth.source": None if depth == "sensor" else depth,
-        }
-        settings = load_mapper_config(config, given)
-        found = bench_pipeline(log, weights, settings, frames)
+        found = bench_pipeline(log, weights, mapper.load(), frames)
         stages = ", ".join(f"{name} {value}" for name, value in found["stages_ms"].items())
         score = "" if found["miou"] is None else f"mIoU {found['miou'] * 100:.1f} %; "
         output.print(

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from semantic_mapper.config import load_config
+from semantic_mapper.drivers.calibrating.rig import Calibration, solve
+from semantic_mapper.drivers.poses.board import sheet_png
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.nodes.calibration.report import (
+    CalibrationSettings,
+    report,
+    report_json,
+    write_files,
+    write_stereo,
+    write_whole,
+)
+from semantic_mapper.nodes.calibration.sources import Gathering, check_places, parse_sources, parse_stereo
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
-
-if TYPE_CHECKING:
-    from semantic_mapper.drivers.calibrating.solve import Calibration
-    from semantic_mapper.nodes.calibration.run import Gathering
+from semantic_mapper.replay.run_folder import folder_for_results, prepare_file
 
 _WORST = 3  # views named in the report
 
@@ -64,11 +73,8 @@ def calibrate(
     Example: semantic-mapper calibrate left=pictures/left right=pictures/right
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.calibration.sources import check_places
-    from semantic_mapper.replay.run_folder import folder_for_results
 
     check_places(sources or ())
-    from semantic_mapper.nodes.calibration.report import report, report_json, write_files, write_stereo
 
     settings = board_settings(config, square_mm)
     if board is not None:
@@ -101,9 +107,6 @@ def board_settings(path: Path | None, square_mm: float) -> Any:
     """
     import msgspec
 
-    from semantic_mapper.config import load_config
-    from semantic_mapper.nodes.calibration.report import CalibrationSettings
-
     settings = load_config(path, CalibrationSettings) if path else CalibrationSettings()
     if square_mm < 0:
         raise ConfigError(f"--square-mm {square_mm:g}: is the side of a square in millimetres")
@@ -117,9 +120,6 @@ def board_settings(path: Path | None, square_mm: float) -> Any:
 
 
 def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
-    from semantic_mapper.drivers.calibrating.sheet import sheet_png
-    from semantic_mapper.nodes.calibration.report import write_whole
-    from semantic_mapper.replay.run_folder import prepare_file
 
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: the board is written as a PNG picture; give a name that ends with .png")
@@ -136,9 +136,6 @@ def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
 def _calibrate(
     sources: list[str], settings: Any, size: str, *, known: bool, rig: bool, seconds: float
 ) -> tuple[Calibration, Gathering]:
-    from semantic_mapper.drivers.calibrating.solve import solve
-    from semantic_mapper.nodes.calibration.run import Gathering
-    from semantic_mapper.nodes.calibration.sources import parse_sources
 
     places = parse_sources(sources, size)
     gathered = Gathering(settings.board, settings.calibration)
@@ -155,9 +152,6 @@ def _calibrate(
 def _calibrate_stereo(
     sources: list[str], settings: Any, size: str, seconds: float
 ) -> tuple[str, Calibration, Gathering]:
-    from semantic_mapper.drivers.calibrating.solve import solve
-    from semantic_mapper.nodes.calibration.run import Gathering
-    from semantic_mapper.nodes.calibration.sources import parse_stereo
 
     name, source = parse_stereo(sources, size)
     gathered = Gathering(settings.board, settings.calibration)

@@ -11,6 +11,8 @@ import typer
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.nodes.cli.verb import show_error, verb
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.replay.compare import Difference, Tolerances, compare_runs, map_file, read_run
+from semantic_mapper.replay.run_folder import is_log
 
 EXIT_DIFFERS = 1
 EXIT_TROUBLE = 2
@@ -34,7 +36,7 @@ def compare(
     exact: Annotated[bool, typer.Option("--exact", help="The maps must be the same, byte for byte.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
-    """Compare two runs of one log: counts of frames, scores, and how far the maps are apart.
+    """Compare two runs of one log: counts, scores, and how far the maps are apart.
 
     Exit codes: 0 equal, 1 different, 2 wrong usage, or something that cannot be read.
 
@@ -42,9 +44,6 @@ def compare(
     Example: semantic-mapper compare runs/before runs/after --labels 0.05
     Example: semantic-mapper compare a/map.npz b/map.npz --exact --json
     """
-    from semantic_mapper.replay.compare import Difference, Tolerances, compare_runs, map_file, read_run
-    from semantic_mapper.replay.run_folder import is_log
-
     output = Output.guarded()
     given = {"score": score, "surface_m": surface_m, "labels": labels}
     tolerances = Tolerances(**{name: value for name, value in given.items() if value is not None})

@@ -8,17 +8,20 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.nodes.cli.replay import VoxelSizeOption, WeightsOption
+from semantic_mapper.nodes.cli.options import MapperSettings, WeightsOption
+from semantic_mapper.nodes.cli.replay import show_replay
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.run_folder import prepare_folder
 
 
 @verb
 def demo(
+    mapper: MapperSettings,
     out: Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")] = Path("runs/demo"),
     weights: WeightsOption = None,
-    voxel_size: VoxelSizeOption = None,
 ) -> int:
     """Map a recorded log that comes with the package: a depth camera in a furnished room.
 
@@ -27,23 +30,16 @@ def demo(
     Example: semantic-mapper demo --out runs/demo
     """
     output = Output.guarded()
-    from semantic_mapper.config import load_mapper_config
     from semantic_mapper.replay.jobs import ReplayRequest, replay_log
-    from semantic_mapper.replay.log.demo import demo_log
-    from semantic_mapper.replay.run_folder import prepare_folder
-    from semantic_mapper.replay.summary import notes, result_lines, summary_table
 
     began = time.monotonic()
     prepare_folder(out)
     with StopRequest() as stop:
-        request = ReplayRequest(
-            demo_log(), out, weights, load_mapper_config(None, {"voxel_map.voxel_size_m": voxel_size})
-        )
+        request = ReplayRequest(demo_log(), out, weights, mapper.load())
         with frame_progress("map", None, stop=stop) as bar:
             summary = replay_log(request, bar).summary
-        output.print(summary_table({"demo": summary}))
-        for line in (*notes(summary), *result_lines(out), f"  {demo_log()}  (the log it was made from)"):
-            output.print(line)
+        show_replay(output, summary, out)
+        output.print(f"  {demo_log()}  (the log it was made from)")
         ended = "stopped after" if stop else "done in"
         stderr_console().print(f"{ended} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`")
         return stop.exit_code

@@ -11,9 +11,11 @@ from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import write_json
-from semantic_mapper.nodes.cli.replay import ConfigOption, MaxFramesOption
+from semantic_mapper.nodes.cli.options import MapperSettings, MaxFramesOption
 from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, results_file, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
+from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
 from semantic_mapper.replay.run_folder import MAP_SUFFIX, is_log, prepare_file
 from semantic_mapper.replay.summary import notes, read_summary, result_lines, summary_table
 
@@ -50,11 +52,11 @@ InstancesOption = Annotated[
 SecondsOption = Annotated[
     float | None, typer.Option(min=0, help="--baselines: training time of the U-Net.  [default: 300]")
 ]
-SeedOption = Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.  [default: 0]")]
 
 
 @verb
 def evaluate(
+    mapper: MapperSettings,
     targets: TargetsArgument = None,
     weights: WeightsOption = None,
     baselines: BaselinesOption = False,
@@ -62,8 +64,6 @@ def evaluate(
     mesh: MeshOption = None,
     instances: InstancesOption = None,
     max_frames: MaxFramesOption = 0,
-    config: ConfigOption = None,
-    seed: SeedOption = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> int:
@@ -103,20 +103,16 @@ def evaluate(
         stderr_console().print(note, soft_wrap=True)
     found: dict[str, Any] = {"replays": print_results(output, folders), "logs": {}}
     if mesh is not None:
-        from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
-
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
             output.print(f"{name}: {_surface_line(figures)}")
-    from semantic_mapper.config import load_mapper_config
-    from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
     from semantic_mapper.replay.jobs import EvaluateRequest, evaluate_log
 
-    mapper = load_mapper_config(config, {"seed": seed})
+    settings = mapper.load()
     baseline_s = (BASELINE_SECONDS if seconds is None else seconds) if baselines else 0.0
     tables: dict[str, Table] = {}
     for log in logs:
-        request = EvaluateRequest(log, weights, mapper, max_frames, baseline_s, instances)
+        request = EvaluateRequest(log, weights, settings, max_frames, baseline_s, instances)
         with frame_progress("score", None) as bar:
             scores = evaluate_log(request, bar).scores
         found["logs"][str(log)] = scores

@@ -1,26 +1,40 @@
-"""Verbs about saved maps: ``export`` (also of logs), ``merge``."""
+"""The verbs ``export`` (of maps and logs) and ``merge``."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.mapping.files.merge import count_empty
+from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
+from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.verb import verb
-from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.exporters import LogExportRequest, export_log, log_format_of
+from semantic_mapper.replay.exporters.map_files import ExportRequest, export_map, format_of, parse_transform, parse_up
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.run_folder import (
+    is_log,
+    map_path,
+    prepare_file,
+    prepare_folder,
+    refuse_overwriting,
+)
 
-if TYPE_CHECKING:
-    from semantic_mapper.replay.exporters.map_files import ExportRequest
+LISTED = 10  # frames left out that are shown one by one
 
 
 @verb
 def export(
     source: Annotated[
         Path,
-        typer.Argument(metavar="MAP|LOG", help="Saved map, log, or a folder: of results, tiles, or parts of a log."),
+        typer.Argument(metavar="MAP|LOG", help="Saved map, log, or a folder: of results, or of parts of a log."),
     ],
     out: Annotated[Path, typer.Option("--out", help="File to write; its ending says the format.")],
     format: Annotated[  # noqa: A002 - the name of the option
@@ -69,17 +83,12 @@ def export(
     Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.export_log import export_recording
-    from semantic_mapper.replay.run_folder import is_log
-
     if is_log(source):
         given = {"--color": color, "--height": height, "--resolution": resolution, "--floor": floor}
         given |= {"--costs": costs}
         given |= {"--up": up != "auto", "--min-weight": min_weight is not None, "--min-confidence": min_confidence > 0}
         map_options = [name for name, value in given.items() if value]
         return export_recording(output, source, out, format, camera, max_frames, map_options)
-    from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
-    from semantic_mapper.replay.exporters.map_files import ExportRequest, format_of, parse_up
 
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
@@ -90,20 +99,11 @@ def export(
 
 
 def _export_map(output: Output, folder_or_map: Path, out: Path, request: ExportRequest) -> None:
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.queries.tiles import TiledMap
-    from semantic_mapper.replay.exporters.map_files import export_map
-    from semantic_mapper.replay.run_folder import holds_tiles, map_path, prepare_file, refuse_overwriting
 
-    if holds_tiles(str(folder_or_map)):
-        prepare_file(out)
-        voxel_map = TiledMap.open(folder_or_map).load()
-    else:
-        source = map_path(folder_or_map)
-        refuse_overwriting(out, source)
-        prepare_file(out)
-        voxel_map = VoxelMap.load(source)
-    report = export_map(voxel_map, out, request)
+    source = map_path(folder_or_map)
+    refuse_overwriting(out, source)
+    prepare_file(out)
+    report = export_map(VoxelMap.load(source), out, request)
     output.print(f"{' and '.join(map(str, report.files))}: {report.content}")
     for line in report.found:
         output.print(f"  {line}")
@@ -131,11 +131,6 @@ def merge(
     Example: semantic-mapper merge runs/east runs/west --transform "3.2 0 0 90" --out house.npz
     """
     output = Output.guarded()
-    from semantic_mapper.mapping.files.merge import count_empty
-    from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.replay.exporters.map_files import parse_transform
-    from semantic_mapper.replay.run_folder import map_path, prepare_file, refuse_overwriting
 
     T_a_b = None if transform == "find" else parse_transform(transform)
     sources = map_path(a), map_path(b)
@@ -159,3 +154,44 @@ def merge(
     if empty:
         blocks += f"; {empty} empty blocks of the two, in which nothing was measured, are left out"
     output.print(f"{out}: {counted(joined.frames, 'frame')}; {blocks}")
+
+
+def export_recording(
+    output: Output,
+    source: Path,
+    out: Path,
+    format_name: str | None,
+    camera: str,
+    max_frames: int,
+    map_options: Sequence[str],
+) -> None:
+    """Write a log in the format of another program, and say what was left out.
+
+    Args:
+        output: For people.
+        source: Log, or a folder with the parts of one.
+        out: File or folder to make.
+        format_name: None = by the ending.
+        camera: Empty = all.
+        max_frames: 0 = all.
+        map_options: Options given that mean something for maps only.
+
+    Raises:
+        ConfigError: options that do not go together.
+        LogError: the log cannot be read, or the result not be written.
+    """
+    if map_options:
+        raise ConfigError(f"{', '.join(map_options)}: for saved maps only; {source} is a log")
+    request = LogExportRequest(log_format_of(out, format_name), camera, max_frames)
+    prepare_folder(out.parent)
+    with open_log(source) as log, frame_progress("export", min(len(log), max_frames or len(log))) as bar:
+        report = export_log(log, out, request, bar.advance)
+        damage, notices = [str(e) for e in log.errors], list(log.notices)
+    output.print(f"{out}: {counted(report.frames, 'frame')} ({request.format})")
+    for notice in (*notices, *report.notices):
+        output.print(f"  note: {notice}")
+    lost = [*damage, *report.left_out]
+    for line in lost[:LISTED]:
+        output.print(f"  left out: {line}")
+    if len(lost) > LISTED:
+        output.print(f"  and {len(lost) - LISTED} more")

@@ -4,113 +4,127 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.mapping.map_scale import length_unit
+from semantic_mapper.nodes.cli.calibrate import board_settings
+from semantic_mapper.nodes.cli.options import DataOptions
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
 from semantic_mapper.plain_text import counted
-
-if TYPE_CHECKING:
-    from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport
+from semantic_mapper.plots import new_figure, rendered
+from semantic_mapper.replay.importers import is_recording
+from semantic_mapper.replay.page import Section, picture, table_of, write_page
+from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
+from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
+from semantic_mapper.replay.sfm.scale import ScaleHint, parse_distance
 
 LISTED = 30  # stretches of the film that are left out
 
-CalibrationOption = Annotated[
-    Path | None, typer.Option("--calibration", help="Film: file of the camera, from `calibrate`. Without: found.")
-]
-FocalPriorOption = Annotated[
-    float, typer.Option("--focal-prior", min=0, help="Film: focal length in its pixels, about. 0 = guessed.")
-]
-ScaleOption = Annotated[
-    float,
-    typer.Option(
-        "--scale",
-        min=0,
-        help="Film, transforms, colmap, opensfm: metres per unit of its map without scale. 0 = by GPS, if any.",
-    ),
-]
-DistanceOption = Annotated[
-    str,
-    typer.Option("--distance", help='Film: two marked points: "SECONDS:U,V SECONDS:U,V METRES" (pixels of the film).'),
-]
-SquareOption = Annotated[
-    float, typer.Option("--square-mm", min=0, help="Film: side of a square of the printed board that is seen in it.")
-]
-BoardOption = Annotated[
-    Path | None, typer.Option("--board", help="Film: TOML file with [board], of another board than `calibrate` prints.")
-]
-HeightOption = Annotated[
-    float, typer.Option("--camera-height", min=0, help="Film: median height of the camera over the floor, metres.")
+RotateOption = Annotated[
+    Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by this many degrees.")
 ]
 
 
-def film_options(
-    calibration: Path | None,
-    focal_prior: float,
-    scale: float,
-    distance: str,
-    square_mm: float,
-    board: Path | None,
-    camera_height: float,
-    quarters: int = 0,
-) -> FilmOptions:
-    """Options of a film as the command line gives them; 0 and "" = not given.
+@dataclass(frozen=True)
+class FilmFlags(DataOptions):
+    """Options of films, and of recordings whose unit of length is not known."""
 
-    Raises:
-        typer.BadParameter: options that exclude each other.
-        ConfigError: values that cannot be.
-    """
-    sources = {
-        "--scale": scale,
-        "--distance": distance,
-        "--square-mm": square_mm,
-        "--board": board,
-        "--camera-height": camera_height,
-    }
-    given = [name for name, value in sources.items() if value]
-    if len(given) > 1 and given != ["--square-mm", "--board"]:
-        raise typer.BadParameter(f"{' and '.join(given)}: the scale comes from one source only; leave out all but one")
-    if calibration is not None and focal_prior:
-        raise typer.BadParameter("--calibration and --focal-prior: the focal length is given or guessed, not both")
-    from semantic_mapper.nodes.cli.calibrate import board_settings
-    from semantic_mapper.replay.sfm.reconstruct import FilmOptions
-    from semantic_mapper.replay.sfm.scale import ScaleHint, parse_distance
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="Film: file of the camera, from `calibrate`. Without: found.")
+    ] = None
+    focal_prior: Annotated[
+        float,
+        typer.Option("--focal-prior", min=0, hidden=True, help="Film: focal length in its pixels, about. 0 = guessed."),
+    ] = 0.0
+    scale: Annotated[
+        float,
+        typer.Option(
+            "--scale",
+            min=0,
+            hidden=True,
+            help="Film, transforms, colmap, opensfm: metres per unit of its map without scale. 0 = by GPS, if any.",
+        ),
+    ] = 0.0
+    distance: Annotated[
+        str,
+        typer.Option(
+            "--distance",
+            hidden=True,
+            help='Film: two marked points: "SECONDS:U,V SECONDS:U,V METRES" (pixels of the film).',
+        ),
+    ] = ""
+    square_mm: Annotated[
+        float,
+        typer.Option(
+            "--square-mm", min=0, hidden=True, help="Film: side of a square of the printed board that is seen in it."
+        ),
+    ] = 0.0
+    board: Annotated[
+        Path | None,
+        typer.Option(
+            "--board", hidden=True, help="Film: TOML file with [board], of another board than `calibrate` prints."
+        ),
+    ] = None
+    camera_height: Annotated[
+        float, typer.Option("--camera-height", min=0, help="Film: median height of the camera over the floor, metres.")
+    ] = 0.0
 
-    hint = ScaleHint(
-        factor=scale or None,
-        distance=parse_distance(distance) if distance else None,
-        board=board_settings(board, square_mm).board if board is not None or square_mm else None,
-        camera_height_m=camera_height or None,
-    )
-    return FilmOptions(calibration, focal_prior or None, hint, quarters)
+    def given(self) -> bool:
+        """Whether any of them is."""
+        return self != FilmFlags()
 
+    def film_options(self, quarters: int) -> FilmOptions:
+        """As the import of films takes them.
 
-def recording_scale(options: FilmOptions) -> float | None:
-    """Metres per unit, of a recording that has poses.
+        Raises:
+            typer.BadParameter: options that exclude each other.
+            ConfigError: values that cannot be.
+        """
+        sources = {
+            "--scale": self.scale,
+            "--distance": self.distance,
+            "--square-mm": self.square_mm,
+            "--board": self.board,
+            "--camera-height": self.camera_height,
+        }
+        given = [name for name, value in sources.items() if value]
+        if len(given) > 1 and given != ["--square-mm", "--board"]:
+            raise typer.BadParameter(
+                f"{' and '.join(given)}: the scale comes from one source only; leave out all but one"
+            )
+        if self.calibration is not None and self.focal_prior:
+            raise typer.BadParameter("--calibration and --focal-prior: the focal length is given or guessed, not both")
 
-    Raises:
-        typer.BadParameter: options were given that are for films alone.
-    """
-    hint = options.scale
-    if any(
-        value is not None
-        for value in (options.calibration, options.focal_prior_px, hint.distance, hint.board, hint.camera_height_m)
-    ):
-        raise typer.BadParameter(
-            "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, --square-mm, "
-            "--board and --camera-height are for films"
+        board = board_settings(self.board, self.square_mm).board if self.board or self.square_mm else None
+        hint = ScaleHint(
+            factor=self.scale or None,
+            distance=parse_distance(self.distance) if self.distance else None,
+            board=board,
+            camera_height_m=self.camera_height or None,
         )
-    return hint.factor
+        return FilmOptions(self.calibration, self.focal_prior or None, hint, quarters)
+
+    def recording_scale(self) -> float | None:
+        """Metres per unit, of a recording that has poses.
+
+        Raises:
+            typer.BadParameter: options were given that are for films alone.
+        """
+        if replace(self, scale=0.0).given():
+            raise typer.BadParameter(
+                "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, "
+                "--square-mm, --board and --camera-height are for films"
+            )
+        return self.scale or None
 
 
 def is_film(source: Path) -> bool:
     """Whether poses have to be found: of a film, or of a folder of pictures that is no recording of a known format."""
-    from semantic_mapper.replay.importers import is_recording
-    from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
-
     if source.is_file():
         return source.suffix.lower() in FILM_SUFFIXES
     return source.is_dir() and not is_recording(source) and bool(pictures_of(source))
@@ -125,8 +139,6 @@ def import_film_log(source: Path, log: Path, options: FilmOptions, *, overwrite:
     Raises:
         SemanticMapperError: see ``import_film``.
     """
-    from semantic_mapper.replay.sfm.reconstruct import import_film
-
     page = log.with_suffix(".html")
     if page.exists() and not overwrite:
         raise ConfigError(f"{page}: exists already; choose another name, or --overwrite it")
@@ -153,8 +165,6 @@ def write_film_report(report: FilmReport, path: Path) -> None:
     Raises:
         ConfigError: it cannot be written.
     """
-    from semantic_mapper.replay.page import Section, picture, table_of, write_page
-
     spans = [(f"{p.start_s:.2f}", f"{p.end_s:.2f}", str(p.frames), p.reason) for p in report.left_out[:LISTED]]
     counts = [(reason, str(count)) for reason, count in report.left_out_counts.items()]
     sections = [
@@ -177,7 +187,6 @@ def write_film_report(report: FilmReport, path: Path) -> None:
 
 
 def _figures(report: FilmReport) -> Mapping[str, str]:
-    from semantic_mapper.mapping.map_scale import length_unit
 
     unit = length_unit(bool(report.scale))
     lens = ", ".join(f"{value:.4f}" for value in report.distortion)
@@ -199,8 +208,6 @@ def _figures(report: FilmReport) -> Mapping[str, str]:
 def _draw_plan(report: FilmReport) -> Any:
     """The path and the points from above, as a picture (H, W, 3)."""
     import numpy as np
-
-    from semantic_mapper.plots import new_figure, rendered
 
     @rendered
     def draw() -> Any:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from semantic_mapper.config import DepthSource, assign, convert_config, load_mapper_config, parse_assignments, read_toml
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.label import frame_numbers
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
@@ -17,15 +18,6 @@ from semantic_mapper.replay.summary import percent
 
 if TYPE_CHECKING:
     from semantic_mapper.replay.jobs import FinetuneRequest, FinetuneResult
-
-FinetuneDepthOption = Annotated[
-    Literal["auto", "sensor", "computed", "off"] | None,
-    typer.Option(
-        "--depth",
-        help="auto: the sensor's, and computed from the pictures where the log has none; computed: always; off: none.  "
-        "[default: sensor]",
-    ),
-]
 
 
 @verb
@@ -41,12 +33,17 @@ def finetune(
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random [0].")] = None,
     config: Annotated[
-        Path | None, typer.Option(help="TOML file with a FinetuneConfig; options here go before it.")
+        Path | None, typer.Option(help="TOML file with settings of the training; options here go before it.")
+    ] = None,
+    set: Annotated[  # noqa: A002 - the name of the option
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; may be repeated.")
     ] = None,
     weights: Annotated[
         Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
     ] = None,
-    from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
+    from_scratch: Annotated[
+        bool, typer.Option("--from-scratch", hidden=True, help="Start from random weights.")
+    ] = False,
     kind: Annotated[
         str | None,
         typer.Option(
@@ -55,18 +52,22 @@ def finetune(
         ),
     ] = None,
     frames: Annotated[
-        str, typer.Option(metavar="N,N,...", help="Numbers of the labelled frames in the log, in place of --keyframes.")
+        str,
+        typer.Option(
+            metavar="N,N,...", hidden=True, help="Numbers of the labelled frames in the log, in place of --keyframes."
+        ),
     ] = "",
     unlabelled: Annotated[
         int | None,
         typer.Option(
             min=0,
+            hidden=True,
             help="--kind, or its weights: frames without labels to use at most; 0 = all.  [default: 300]",
         ),
     ] = None,
     variant: Annotated[
         Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
-        typer.Option(help="--kind irt, or its weights: what reads the classes.  [default: BC]"),
+        typer.Option(hidden=True, help="--kind irt, or its weights: what reads the classes.  [default: BC]"),
     ] = None,
     boxes: Annotated[
         Path | None,
@@ -86,11 +87,18 @@ def finetune(
     uncovered: Annotated[
         Literal["stuff", "empty"] | None,
         typer.Option(
+            hidden=True,
             help="--kind panoptic: what is outside of all boxes. stuff: classes that are no things, or that no box "
-            "has. empty: nothing.  [default: stuff]"
+            "has. empty: nothing.  [default: stuff]",
         ),
     ] = None,
-    depth: FinetuneDepthOption = None,
+    depth: Annotated[
+        DepthSource,
+        typer.Option(
+            help="auto: the sensor's, and computed from the pictures where the log has none; computed: always; "
+            "off: none."
+        ),
+    ] = "sensor",
     labels: Annotated[
         Path | None,
         typer.Option(
@@ -115,17 +123,52 @@ def finetune(
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --strokes --out kitchen.safetensors
-    Example: semantic-mapper finetune kitchen.mcap --kind irt --keyframes 4 --out kitchen.safetensors
     Example: semantic-mapper finetune yard.mcap --kind panoptic --boxes boxes.json --out yard.safetensors
     """
-    _refuse_mixed(weights, from_scratch, kind, keyframes, frames, labels, unlabelled, variant, boxes, pseudo, uncovered)
-    if strokes and kind in ("grid", "panoptic"):
-        raise typer.BadParameter(f"--kind {kind} learns from no strokes", param_hint="--strokes")
+    scene = kind is not None
+    own_labels = bool(frames) or labels is not None
+    refused = (
+        (from_scratch and weights is not None, "--weights", "goes with random weights only"),
+        (
+            scene and (weights is not None or from_scratch),
+            "--kind",
+            "starts from nothing; leave out --weights and --from-scratch",
+        ),
+        (kind == "grid" and own_labels, "--frames" if frames else "--labels", "a grid learns no classes"),
+        (
+            kind == "panoptic" and (keyframes is not None or own_labels),
+            "--kind",
+            "learns from all frames' pseudo labels; give them with --pseudo",
+        ),
+        ((boxes is not None) != (kind == "panoptic"), "--boxes", "--kind panoptic and --boxes FILE go together"),
+        (
+            (pseudo is not None or uncovered is not None) and kind != "panoptic",
+            "--uncovered" if pseudo is None else "--pseudo",
+            "goes with --kind panoptic only",
+        ),
+        (
+            not own_labels and (keyframes is None) != (kind in ("grid", "panoptic")),
+            "--keyframes",
+            "how many labelled frames? Only --kind grid learns none",
+        ),
+        (keyframes is not None and bool(frames), "--keyframes", "--frames already names the frames"),
+        (
+            unlabelled is not None and not scene and weights is None,
+            "--unlabelled",
+            "goes with --kind, or --weights of such a kind",
+        ),
+        (
+            variant is not None and kind != "irt" and (scene or weights is None),
+            "--variant",
+            "goes with --kind irt, or --weights of it",
+        ),
+        (strokes and kind in ("grid", "panoptic"), "--strokes", f"--kind {kind} learns from no strokes"),
+    )
+    for wrong, option, why in refused:
+        if wrong:
+            raise typer.BadParameter(why, param_hint=option)
     must_be_there(log)
     output = Output.guarded()
-    import msgspec
-
-    from semantic_mapper.config import load_config, load_mapper_config
     from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
     from semantic_mapper.training.config import FinetuneConfig
     from semantic_mapper.training.fitters import FITTERS
@@ -134,15 +177,17 @@ def finetune(
         raise typer.BadParameter(
             f"no kind '{kind}' is fitted to one scene; there is {', '.join(FITTERS)}", param_hint="--kind"
         )
-    given = {"seconds": seconds, "steps": steps, "seed": seed}
-    settings = load_config(config, FinetuneConfig) if config is not None else FinetuneConfig()
-    settings = msgspec.structs.replace(settings, **{name: v for name, v in given.items() if v is not None})
-    if variant is not None:
-        settings = msgspec.structs.replace(settings, irt=msgspec.structs.replace(settings.irt, variant=variant))
+    data = read_toml(config) if config is not None else {}
+    given = {"seconds": seconds, "steps": steps, "seed": seed, "irt.variant": variant}
+    given |= parse_assignments(set or ())
+    for name, value in given.items():
+        if value is not None:
+            assign(data, name, value, "--set")
+    settings = convert_config(data, FinetuneConfig, str(config) if config is not None else "settings of the finetuning")
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
-    depths = load_mapper_config(None, {"depth.source": depth or "sensor"}, OFFLINE).depth
+    depths = load_mapper_config(None, {"depth.source": depth}, OFFLINE).depth
     request = FinetuneRequest(
         log,
         out,
@@ -167,48 +212,6 @@ def finetune(
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
     return stop.exit_code
-
-
-def _refuse_mixed(
-    weights: Path | None,
-    from_scratch: bool,
-    kind: str | None,
-    keyframes: int | None,
-    frames: str,
-    labels: Path | None,
-    unlabelled: int | None,
-    variant: str | None,
-    boxes: Path | None,
-    pseudo: str | None,
-    uncovered: str | None,
-) -> None:
-    """Refuse options that do not go together.
-
-    Raises:
-        typer.BadParameter: which, and why.
-    """
-    if from_scratch and weights is not None:
-        raise typer.BadParameter("goes with random weights only", param_hint="--weights")
-    if kind is not None and (weights is not None or from_scratch):
-        raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
-    if kind == "grid" and (frames or labels is not None):
-        raise typer.BadParameter("a grid learns no classes", param_hint="--frames" if frames else "--labels")
-    if kind == "panoptic" and (keyframes is not None or frames or labels is not None):
-        raise typer.BadParameter("learns from all frames' pseudo labels; give them with --pseudo", param_hint="--kind")
-    if (boxes is not None) != (kind == "panoptic"):
-        raise typer.BadParameter("--kind panoptic and --boxes FILE go together", param_hint="--boxes")
-    if (pseudo is not None or uncovered is not None) and kind != "panoptic":
-        raise typer.BadParameter(
-            "goes with --kind panoptic only", param_hint="--uncovered" if pseudo is None else "--pseudo"
-        )
-    if not frames and labels is None and (keyframes is None) != (kind in ("grid", "panoptic")):
-        raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
-    if keyframes is not None and frames:
-        raise typer.BadParameter("--frames already names the frames", param_hint="--keyframes")
-    if unlabelled is not None and kind is None and weights is None:
-        raise typer.BadParameter("goes with --kind, or --weights of such a kind", param_hint="--unlabelled")
-    if variant is not None and kind != "irt" and (kind is not None or weights is None):
-        raise typer.BadParameter("goes with --kind irt, or --weights of it", param_hint="--variant")
 
 
 def finetune_lines(result: FinetuneResult, request: FinetuneRequest) -> list[str]:

@@ -2,9 +2,31 @@
 
 from __future__ import annotations
 
-import typer
+import csv as csv_files
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from semantic_mapper.nodes.cli import fleet_merge, fleet_results, fleet_run
+import msgspec
+import typer
+from rich.table import Table
+
+from semantic_mapper.config import MapperConfig
+from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.files import write_bytes
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, Settings, show_error, verb
+from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.run_folder import prepare_file
+
+if TYPE_CHECKING:
+    from semantic_mapper.nodes.fleet.compare import Estimate, FleetComparison, LogChange
+
+EXIT_USAGE = 2
+MAX_SHOWN = 500  # rows that are printed
+MAX_LOGS = 40
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -12,12 +34,280 @@ app = typer.Typer(
     help="Replay, score, label, finetune and merge many logs, on this machine or a Ray cluster.",
 )
 
-for _function in (
-    fleet_run.run,
-    fleet_run.top,
-    fleet_merge.merge,
-    fleet_results.table,
-    fleet_results.report,
-    fleet_results.compare,
-):
-    app.command(_function.__name__)(_function)
+StoreArgument = Annotated[
+    str, typer.Argument(metavar="STORE", help="Path or URL of a store, as `fleet run --out` has written it.")
+]
+
+
+@app.command()
+@verb
+def run(
+    operation: Annotated[
+        Literal["replay", "eval", "autolabel", "finetune", "refine"],
+        typer.Argument(metavar="OPERATION", help="replay, eval, autolabel, finetune or refine; as the verb."),
+    ],
+    logs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="LOG...",
+            help="Paths, URLs (s3, gs, http), globs in quotes, or manifests (CSV with a column `log`; others are "
+            "tags). refine: maps (.npz).",
+        ),
+    ],
+    out: Annotated[str, typer.Option("--out", metavar="STORE", help="Folder or URL for the results.")],
+    weights: Annotated[
+        str | None, typer.Option(help="File, URL, or name of weights in the package.  [default: as of the verb]")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Setting of the operation or mapper; may be repeated."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="TOML file with settings; --set goes before it.")
+    ] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Ray cluster to join.  [default: Ray starts here, on loopback only]"),
+    ] = None,
+    cpus: Annotated[float, typer.Option(min=0.1, help="CPUs of a task.")] = 1.0,
+    gpus: Annotated[float, typer.Option(min=0.0, help="GPUs of a task; views are rendered there then.")] = 0.0,
+    memory: Annotated[
+        float | None,
+        typer.Option(metavar="GB", min=0.1, help="Memory of a task.  [default: 2; finetune and refine: 4]"),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Do an operation with many logs, once each, and keep the results in a store.
+
+    A result is named by the content of the log, the weights, the settings and the code: what is in the store is not
+    done again, so that the same command continues a run that was stopped or killed, and tries failed logs again. The
+    exit code is 1 where logs failed. Ctrl-C ends the tasks that run (exit code 130).
+
+    Example: semantic-mapper fleet run replay "logs/*.mcap" --out runs/fleet
+    Example: semantic-mapper fleet run eval robots.csv --out s3://maps/week --address head:6379
+    Example: semantic-mapper fleet run replay "logs/*.mcap" --out runs/fleet --set voxel_map.voxel_size_m=0.05
+    """
+    output = Output.guarded()
+    output.quiet = json
+    from semantic_mapper.nodes.fleet.inputs import find_inputs
+    from semantic_mapper.nodes.fleet.urls import shown
+
+    inputs = find_inputs(logs, ".npz" if operation == "refine" else ".mcap")  # before what is heavy
+    from semantic_mapper.nodes.fleet.cluster import connected
+    from semantic_mapper.nodes.fleet.operations import OPERATIONS
+    from semantic_mapper.nodes.fleet.run import Resources, make_template, run_fleet
+
+    kind = OPERATIONS[operation]
+    on_gpu = ["render.device=cuda"] if gpus and issubclass(kind.settings, MapperConfig) else []
+    template = make_template(operation, out, weights, [*on_gpu, *(settings or ())], config)
+    resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9))
+    with (
+        StopRequest() as stop,
+        connected(address, worker_logs=Settings.verbose),
+        frame_progress(f"fleet {operation}", len(inputs), unit="logs") as bar,
+    ):
+        report = run_fleet(template, inputs, resources, lambda: stop, lambda now: bar.set(now.over))
+    output.print(
+        f"{shown(out)}: {report.done} done, {report.existing} were there, {len(report.failures)} failed, "
+        f"of {report.total}"
+    )
+    for failure in report.failures[:MAX_LOGS]:
+        output.print(f"  failed: {failure.log}: {failure.error}")
+    if json:
+        output.json({"store": shown(out), **msgspec.to_builtins(report)})
+    if stop:
+        stderr_console().print(f"stopped by {stop.name}; the same command continues it", style="yellow")
+        return stop.exit_code
+    return EXIT_FAILED if report.failures else 0
+
+
+@app.command()
+@verb
+def table(
+    store: StoreArgument,
+    query: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="QUERY",
+            help='Columns of `logs`, such as "log, miou", or a SELECT on logs, classes, events and failures.',
+        ),
+    ] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all rows here, as CSV.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Query the results of a fleet with SQL (DuckDB); without a query, show an overview and the columns.
+
+    `logs` has a row for each result: metrics such as `miou`, costs as `cost_NAME`, tags as `tag_NAME`. `classes` and
+    `events` belong to a row of `logs` by `key`; `failures` has a row for each log that failed.
+
+    Example: semantic-mapper fleet table runs/fleet
+    Example: semantic-mapper fleet table runs/fleet "log, miou" --csv miou.csv
+    Example: semantic-mapper fleet table runs/fleet "SELECT log, miou FROM logs WHERE tag_robot = 'r2' ORDER BY miou"
+    """
+    output = Output.guarded()
+    output.quiet = json
+    from semantic_mapper.nodes.fleet.store import Store
+    from semantic_mapper.nodes.fleet.table import Tables
+
+    tables = Tables(Store(store))
+    rows = tables.overview() if query is None else tables.query(query)
+    if csv is not None:
+        prepare_file(csv)
+        text = io.StringIO(newline="")
+        csv_files.writer(text).writerows([rows.names, *rows.values])
+        write_bytes(csv, text.getvalue().encode())
+        output.print(f"{counted(len(rows.values), 'row')} written to {csv}")
+    elif not json:
+        output.print(_rows_table(rows.names, rows.values[:MAX_SHOWN]))
+        if len(rows.values) > MAX_SHOWN:
+            output.print(f"{len(rows.values) - MAX_SHOWN} more rows; --csv and --json give all")
+    if query is None:
+        for name, columns in tables.columns().items():
+            output.print(f"{name}: {', '.join(columns)}")
+    if json:
+        plain = [dict(zip(rows.names, row, strict=True)) for row in rows.values]
+        output.json(plain if query is not None else {"overview": plain, "columns": tables.columns()})
+
+
+@app.command()
+@verb
+def compare(
+    store_a: Annotated[str, typer.Argument(metavar="STORE_A", help="Path or URL of the store with results before.")],
+    store_b: Annotated[str, typer.Argument(metavar="STORE_B", help="Of that with results after.")],
+    operation: Annotated[
+        str, typer.Option(metavar="NAME", help="replay, eval, ...; not needed where both stores share only one.")
+    ] = "",
+    metric: Annotated[
+        str, typer.Option(metavar="NAME", help='miou, "miou METHOD", iou:CLASS, or another metric or cost.')
+    ] = "miou",
+    threshold: Annotated[
+        float, typer.Option(min=0, help="Allowed loss of the mean over logs, in units of the metric.")
+    ] = 0.0,
+    log_threshold: Annotated[float, typer.Option(min=0, help="Allowed loss of a single log.")] = 0.02,
+    lower_is_better: Annotated[
+        bool | None,
+        typer.Option("--lower-is-better/--higher-is-better", help="Of the metric.  [default: as declared for it]"),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Say which logs of a fleet got better or worse, beyond noise: a gate for releases.
+
+    The latest results of each log are paired by its content. B is worse where the mean over logs has surely fallen
+    below that of A, where single logs have surely lost more than --log-threshold, or where logs with a result in A
+    failed in B, are missing there or have no score. Exit codes: 0 not worse, 1 worse, 2 wrong usage, or something that
+    cannot be read.
+
+    Example: semantic-mapper fleet compare runs/released runs/candidate
+    Example: semantic-mapper fleet compare runs/released runs/candidate --metric iou:person --log-threshold 0.05 --json
+    Example: semantic-mapper fleet compare runs/released runs/candidate --metric step_ms_p50 --threshold 5
+    """
+    output = Output.guarded()
+    output.quiet = json
+    from semantic_mapper.nodes.fleet.compare import GateOptions, compare_stores
+    from semantic_mapper.nodes.fleet.store import Store
+
+    try:
+        options = GateOptions(operation, metric, threshold, log_threshold, lower_is_better)
+        found = compare_stores(Store(store_a), Store(store_b), options)
+    except SemanticMapperError as error:
+        show_error(str(error))
+        return EXIT_USAGE
+    if json:
+        output.json({"worse": bool(found.reasons), **msgspec.to_builtins(found)})
+    _show_comparison(output, found)
+    return EXIT_FAILED if found.reasons else 0
+
+
+@app.command()
+@verb
+def merge(
+    maps: Annotated[
+        list[str],
+        typer.Argument(metavar="MAPS...", help="Stores with replays, saved maps, folders with one, or URLs of these."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Map to write (.npz).")],
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="JSON",
+            help="Poses of maps: an object of [x, y, z, yaw_deg] or 4 rows of 4 by name. Those of other maps are found "
+            "by what they show.",
+        ),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Fuse maps of one building into one map, which keeps what does not fit in memory on disk.
+
+    All that the maps have measured adds up, in the world of the first map or of --poses, as `merge` does for two; it
+    is refused where a map fits nowhere. A map is named by its log, its file or its folder.
+
+    Example: semantic-mapper fleet merge runs/east runs/west runs/attic --out house.npz
+    Example: semantic-mapper fleet merge runs/fleet --poses poses.json --out house.npz
+    """
+    output = Output.guarded()
+    output.quiet = json
+    from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
+
+    given = {} if poses is None else read_poses(poses)
+    sources = find_maps(maps)
+    prepare_file(out)
+    with frame_progress("merge", len(sources), unit="maps") as bar:
+        report = merge_maps(sources, given, bar.advance)
+        report.merged.save(out)
+    frames, blocks = report.merged.frames, report.merged.block_count
+    if json:
+        found = {name: T.tolist() for name, T in report.poses.items()}
+        output.json({"map": str(out), "poses": found, "frames": frames, "blocks": blocks})
+    for note in report.notes:
+        output.print(note)
+    output.print(f"{out}: {counted(len(sources), 'map')}, {counted(frames, 'frame')}, {counted(blocks, 'block')}")
+
+
+def _rows_table(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+    """Rows for people; columns of numbers end at the right."""
+    found = Table()
+    for number, name in enumerate(names):
+        numbers = all(isinstance(row[number], (int, float)) for row in rows if row[number] is not None)
+        found.add_column(name, justify="right" if rows and numbers else "left")
+    for row in rows:
+        found.add_row(*map(_cell, row))
+    return found
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 10_000 else f"{value:.0f}"
+    return str(value)
+
+
+def _show_comparison(output: Output, found: FleetComparison) -> None:
+    shown = [log for log in found.logs if log.status != "same"][:MAX_LOGS] or list(found.logs[:5])
+    names = ("log", "A", "B", "difference", "95 % interval", "")
+    rows = _rows_table(names, [(log.log, *_change_cells(log)) for log in shown])
+    direction = "lower" if found.lower_is_better else "higher"
+    output.print(f"{found.operation}, {found.metric} ({direction} is better)", rows)
+    if len(found.logs) > len(shown):
+        output.print(f"{len(found.logs) - len(shown)} more logs; --json gives all")
+    for note in found.notes:
+        output.print(f"note: {note}")
+    if found.new:
+        output.print(f"note: {counted(len(found.new), 'log')} in B only, such as {found.new[0]}")
+    if found.mean_a is not None and found.mean_b is not None:
+        output.print(
+            f"mean over logs: A {found.mean_a:.4f}, B {found.mean_b:.4f}, difference "
+            f"{found.mean_b - found.mean_a:+.4f}, 95 % interval {_interval(found.overall)}; "
+            f"{counted(found.count('worse'), 'log')} worse, {found.count('better')} better"
+        )
+    output.print(f"worse: {'; '.join(found.reasons)}" if found.reasons else "not worse")
+
+
+def _change_cells(log: LogChange) -> Iterable[str]:
+    difference = "-" if log.a is None or log.b is None else f"{log.b - log.a:+.4f}"
+    status = "" if log.status == "same" else log.status
+    return _cell(log.a), _cell(log.b), difference, _interval(log.estimate), f"{status} {log.reason}".strip()
+
+
+def _interval(estimate: Estimate | None) -> str:
+    return "-" if estimate is None else f"{estimate.low:+.4f} .. {estimate.high:+.4f}"

@@ -8,10 +8,16 @@ from typing import Annotated
 
 import typer
 
+from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.labeller.server import LabelServer
+from semantic_mapper.nodes.labeller.session import LabelSession
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.launch_note import NOTE, read_launch_note
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.transport.messages import LabelledKeyframe
 
 FRAMES_TO_LABEL = 8  # that the page shows where nobody says how many
 POLL_S = 0.2
@@ -41,8 +47,12 @@ def label(
             "by default the one that runs here.",
         ),
     ] = "",
-    teacher: Annotated[str, typer.Option(help="Who has labelled them, for the log of the finetuner.")] = "",
-    timeout: Annotated[float, typer.Option(min=0, help="How long the finetuner may take to be there, seconds.")] = 30.0,
+    teacher: Annotated[
+        str, typer.Option(hidden=True, help="Who has labelled them, for the log of the finetuner.")
+    ] = "",
+    timeout: Annotated[
+        float, typer.Option(min=0, hidden=True, help="How long the finetuner may take to be there, seconds.")
+    ] = 30.0,
     suggest: Annotated[
         int | None,
         typer.Option("--suggest", metavar="N", min=1, help="Say which N frames to label next, and send nothing."),
@@ -67,10 +77,12 @@ def label(
         Path | None,
         typer.Option(help="--suggest, --serve: weights whose keyframes count as labelled; also their classes."),
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="--serve: of the page; 0 = any that is free.")] = 9092,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, hidden=True, help="--serve: of the page; 0 = any that is free.")
+    ] = 9092,
     json: Annotated[bool, typer.Option("--json", help="--suggest: print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
-    """Label frames of a log by hand (--serve), say which to label (--suggest), or send labelled ones to a finetuner.
+    """Label frames of a log by hand (--serve), or say which to label (--suggest); or send labelled ones to a finetuner.
 
     --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a
     person paints on them, saves each stroke at once, and shows what strokes grow to. `finetune --labels DIR --strokes`
@@ -78,13 +90,12 @@ def label(
     another one, tunnel its port.
 
     Without these, labelled frames are sent to a running finetuner: those that together show most of what the log shows.
-    Frames must be in the world that the mapper maps. `semantic-mapper top --once --json` tells what became of them,
-    `semantic-mapper weights` which weights came of it.
+    Frames must be in the world that the mapper maps. `semantic-mapper view --status --once --json` tells what became
+    of them, `semantic-mapper info live` which weights came of it.
 
     Example: semantic-mapper label kitchen.mcap --suggest 8
     Example: semantic-mapper label kitchen.mcap --serve --classes classes.txt --out kitchen-labels
     Example: semantic-mapper label kitchen.mcap --keyframes 12
-    Example: semantic-mapper label kitchen.mcap --images corrected/ --to ipc:///run/robot/labels
     """
     numbers = frame_numbers(frames)
     _check_options(
@@ -136,9 +147,7 @@ def _check_options(suggest: bool, serve: bool, given: dict[str, object]) -> None
 
 
 def _suggest(output: Output, log: Path, count: int, images: Path | None, weights: Path | None, json: bool) -> None:
-    from semantic_mapper.errors import LogError
-    from semantic_mapper.nodes.cli.labelling_page import open_images, suggest_for_log, suggestion_table
-    from semantic_mapper.replay.log.sequence import open_log
+    from semantic_mapper.nodes.cli.labelling import open_images, suggest_for_log, suggestion_table
 
     if images is not None and not images.is_dir():
         raise LogError(f"--images {images}: no such folder")
@@ -164,11 +173,7 @@ def _serve(
     weights: Path | None,
     port: int,
 ) -> int:
-    from semantic_mapper.errors import LogError
-    from semantic_mapper.nodes.cli.labelling_page import open_images, page_folder, page_order, suggest_for_log
-    from semantic_mapper.nodes.labeller.server import LabelServer
-    from semantic_mapper.nodes.labeller.session import LabelSession
-    from semantic_mapper.replay.log.sequence import open_log
+    from semantic_mapper.nodes.cli.labelling import open_images, page_folder, page_order, suggest_for_log
 
     with StopRequest() as stop, open_log(log) as opened:
         folder = page_folder(opened, out, classes, weights)
@@ -203,7 +208,6 @@ def _send(
     timeout: float,
 ) -> None:
     from semantic_mapper.nodes.cli.labelling import choose_keyframes, labels_endpoint, sending
-    from semantic_mapper.transport.messages import LabelledKeyframe
 
     endpoint = labels_endpoint(to)
     if "://" not in to:
@@ -224,9 +228,6 @@ def _refuse_without_finetuner(folder: Path) -> None:
     Raises:
         TransportError: the launch has no finetuner.
     """
-    from semantic_mapper.errors import TransportError
-    from semantic_mapper.nodes.supervisor.launch_note import NOTE, read_launch_note
-
     if not (folder / NOTE).exists():
         return
     note = read_launch_note(folder)

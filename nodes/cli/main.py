@@ -1,50 +1,100 @@
-"""The command ``semantic-mapper``. Each verb lives in a file of its own and imports what is heavy when it runs."""
+"""The command ``semantic-mapper``. Each verb lives in a file of its own, which is loaded when the verb is named."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Annotated, Any, cast
 
 import typer
 from typer.core import TyperGroup
 
 from semantic_mapper import __version__
-from semantic_mapper.nodes.cli import autolabel as cli_autolabel
-from semantic_mapper.nodes.cli import bench as cli_bench
-from semantic_mapper.nodes.cli import boxes as cli_boxes
-from semantic_mapper.nodes.cli import calibrate as cli_calibrate
-from semantic_mapper.nodes.cli import cameras as cli_cameras
-from semantic_mapper.nodes.cli import compare as cli_compare
-from semantic_mapper.nodes.cli import correct as cli_correct
-from semantic_mapper.nodes.cli import demo as cli_demo
-from semantic_mapper.nodes.cli import doctor as cli_doctor
-from semantic_mapper.nodes.cli import eval as cli_eval
-from semantic_mapper.nodes.cli import export as cli_export
-from semantic_mapper.nodes.cli import finetune as cli_finetune
-from semantic_mapper.nodes.cli import fleet as cli_fleet
-from semantic_mapper.nodes.cli import keys as cli_keys
-from semantic_mapper.nodes.cli import label as cli_label
-from semantic_mapper.nodes.cli import launch as cli_launch
-from semantic_mapper.nodes.cli import log as cli_log
-from semantic_mapper.nodes.cli import map as cli_map
-from semantic_mapper.nodes.cli import query as cli_query
-from semantic_mapper.nodes.cli import record as cli_record
-from semantic_mapper.nodes.cli import refine as cli_refine
-from semantic_mapper.nodes.cli import relocalize as cli_relocalize
-from semantic_mapper.nodes.cli import replay as cli_replay
-from semantic_mapper.nodes.cli import top as cli_top
-from semantic_mapper.nodes.cli import up as cli_up
-from semantic_mapper.nodes.cli import view as cli_view
-from semantic_mapper.nodes.cli import weights as cli_weights
-from semantic_mapper.nodes.cli.verb import Settings
+from semantic_mapper.nodes.cli.verb import Settings, VerbCommand
 from semantic_mapper.redaction import without_secrets
 
 _UsageError = cast("type[Exception]", typer.BadParameter.__base__)  # Click's, or Typer's own copy of it
+_MODULES = "semantic_mapper.nodes.cli"
+# By verb: the function or group of verbs (MODULE:NAME), and what it does, as its own help begins.
+VERBS: Mapping[str, tuple[str, str]] = {
+    "demo": ("demo:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
+    "replay": ("replay:replay", "Map a recording: a log, a film, or a folder or bag that `import` takes."),
+    "compare": ("compare:compare", "Compare two runs of one log: counts, scores, and how far the maps are apart."),
+    "up": ("up:up", "Start the nodes of a launch file as processes and watch over them until they end."),
+    "view": ("view:view", "Show a running launch, a log or a saved map in a browser, until Ctrl-C."),
+    "record": ("record:record", "Record what the nodes of a running launch publish, from outside."),
+    "calibrate": ("calibrate:calibrate", "Calibrate cameras from images of a printed ChArUco board."),
+    "import": ("importing:import_", "Make a log of a recording of another program, of a film, or of a damaged log."),
+    "info": ("info:info", "Say what a log, a map or a file of boxes holds, or which weights a mapper uses."),
+    "export": ("export:export", "Write a saved map, or a log, in a format of other programs."),
+    "merge": ("export:merge", "Make one map of two: what both have measured adds up."),
+    "query": ("query:query", "Ask a saved map, or that of a running mapper, what is where."),
+    "relocalize": ("relocalize:relocalize", "Find the frames of a log in a map, each by itself."),
+    "refine": ("refine:refine", "Relabel a saved map by its shape, colour and votes."),
+    "finetune": ("finetune:finetune", "Fit the field to a few labelled keyframes of a log."),
+    "autolabel": ("autolabel:autolabel", "Label every frame of a log with weights, into a new log."),
+    "label": ("label:label", "Label frames of a log by hand (--serve), or say which to label (--suggest)."),
+    "eval": (
+        "eval:evaluate",
+        "Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML.",
+    ),
+    "bench": ("bench:bench", "Measure speed on this machine, on frames of 640x480."),
+    "fleet": ("fleet:app", "Replay, score, label, finetune and merge many logs, on this machine or a Ray cluster."),
+    "keys": ("keys:keys", "Make, show or exchange the keys by which machines know each other."),
+    "doctor": ("doctor:doctor", "Look for what this machine lacks, with a fix for each thing; or list its cameras."),
+}
+# Coordinates below 0 and keys look like options.
+_FREE_ARGUMENTS = ("query", "keys")
+
+
+class _Commands(MutableMapping[str, Any]):
+    """The verbs as Click has them, each loaded when it is looked up."""
+
+    def __init__(self) -> None:
+        self._loaded: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._loaded:
+            module, _, attribute = VERBS[name][0].partition(":")
+            found = getattr(import_module(f"{_MODULES}.{module}"), attribute)
+            if not isinstance(found, typer.Typer):
+                settings = {"ignore_unknown_options": True} if name in _FREE_ARGUMENTS else {}
+                function, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
+                found.command(name, cls=VerbCommand, context_settings=settings)(function)
+            command = typer.main.get_command(found)
+            command.name = name
+            self._loaded[name] = command
+        return self._loaded[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        self._loaded[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._loaded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(VERBS)
+
+    def __len__(self) -> int:
+        return len(VERBS)
 
 
 class _Group(TyperGroup):
-    """Shows wrong usage without the secrets of what was typed."""
+    """Loads a verb when it is used, and shows wrong usage without the secrets of what was typed."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = cast("Any", _Commands())
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """As of Click."""
+        return list(VERBS)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """As of Click, from what is known without loading a verb."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in VERBS.items()])
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         """As of Click."""
@@ -75,43 +125,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
 
-for _function in (
-    cli_demo.demo,
-    cli_map.map_,
-    cli_replay.replay,
-    cli_compare.compare,
-    cli_up.up,
-    cli_top.top,
-    cli_view.view,
-    cli_cameras.cameras,
-    cli_record.record,
-    cli_calibrate.calibrate,
-    cli_log.import_,
-    cli_log.info,
-    cli_log.recover,
-    cli_export.export,
-    cli_export.merge,
-    cli_relocalize.relocalize,
-    cli_refine.refine,
-    cli_finetune.finetune,
-    cli_autolabel.autolabel,
-    cli_correct.correct,
-    cli_label.label,
-    cli_weights.weights,
-    cli_doctor.doctor,
-):
-    app.command(_function.__name__.rstrip("_"))(_function)
-
-app.add_typer(cli_fleet.app, name="fleet")
-app.add_typer(cli_keys.app, name="keys")
-app.add_typer(cli_launch.app, name="launch")
-
-app.command("eval")(cli_eval.evaluate)
-# Coordinates below 0 look like options.
-app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)
-app.command("boxes")(cli_boxes.boxes)
-app.command("bench")(cli_bench.bench)
-
 
 def _show_version(wanted: bool) -> None:
     if wanted:
@@ -121,7 +134,7 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell more, and show where an error arose.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more, and show where an error arose.")] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
     ] = False,
@@ -130,7 +143,7 @@ def _options(
 
     Start with `semantic-mapper demo`. Each verb explains itself: `semantic-mapper replay --help`. Results go to
     stdout, messages to stderr. Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage, 3 a map that
-    cannot be trusted (`map`, `replay`), 130 Ctrl-C.
+    cannot be trusted (`replay`), 130 Ctrl-C.
     """
     Settings.verbose = verbose
 

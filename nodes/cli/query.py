@@ -2,38 +2,52 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from semantic_mapper.errors import MapError
-from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
-from semantic_mapper.nodes.console import Output
+from semantic_mapper.client import Correction, MapClient
+from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.files import write_json
+from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+from semantic_mapper.nodes import map_answers
+from semantic_mapper.nodes.cli.options import Remote
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file, verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
-from semantic_mapper.replay.run_folder import prepare_file
+from semantic_mapper.plots import write_picture
+from semantic_mapper.queries.graph import GraphTracker, SceneGraph
+from semantic_mapper.queries.graph_picture import draw_graph
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
+from semantic_mapper.replay.run_folder import map_path, prepare_file
 
-if TYPE_CHECKING:
-    from semantic_mapper.queries.graph import SceneGraph
-    from semantic_mapper.queries.snapshot import MapSnapshot
+POLL_S = 0.2
 
 
 class Question(StrEnum):
-    """What can be asked."""
+    """What can be request."""
 
     INFO = "info"
     AT = "at"
     NEAREST = "nearest"
     INSTANCES = "instances"
     GRAPH = "graph"
+    CORRECT = "correct"
 
 
-ARGUMENTS = {Question.AT: "X Y Z", Question.NEAREST: "CLASS X Y Z"}
+ARGUMENTS = {Question.AT: "X Y Z", Question.NEAREST: "CLASS X Y Z", Question.CORRECT: "FILE"}
 
 
-class Asked(NamedTuple):
+class Request(NamedTuple):
     """A question and what it may need; see the options of ``query``."""
 
     question: Question
@@ -41,8 +55,7 @@ class Asked(NamedTuple):
     point: tuple[float, ...] = ()
     up: tuple[float, float, float] | None = None
     min_confidence: float = 0.0
-    server: str = ""
-    keys: Path | None = None
+    remote: Remote = Remote()
     gone: bool = False
     picture: Path | None = None
 
@@ -53,13 +66,16 @@ def query(
         str,
         typer.Argument(
             metavar="MAP",
-            help="Saved map, folder of results, `live` for the launch that runs here, ipc://PATH, tcp://HOST:PORT, or "
-            "folder or URL of tiles (`fleet merge`).",
+            help="Saved map, folder of results, `live` for the launch that runs here, ipc://PATH or tcp://HOST:PORT.",
         ),
     ],
-    question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest, instances or graph.")],
+    question: Annotated[
+        Question, typer.Argument(metavar="QUESTION", help="info, at, nearest, instances, graph or correct.")
+    ],
+    remote: Remote,
     arguments: Annotated[
-        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z]", help="Class, and world coordinates in metres.")
+        list[str] | None,
+        typer.Argument(metavar="[CLASS] [X Y Z] [FILE]", help="Class, and world coordinates in metres."),
     ] = None,
     up: Annotated[
         tuple[float, float, float] | None,
@@ -73,167 +89,131 @@ def query(
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
     ] = 0.0,
     gone: Annotated[
-        bool, typer.Option("--gone", help="Running mapper, instances: also those of earlier answers that have gone.")
+        bool,
+        typer.Option(
+            "--gone", hidden=True, help="Running mapper, instances: also those of earlier answers that have gone."
+        ),
     ] = False,
     picture: Annotated[
         Path | None, typer.Option(metavar="PNG", help="graph: also draw rooms, doors and objects from above.")
     ] = None,
-    server: ServerOption = "",
-    keys: KeysOption = None,
+    camera: Annotated[
+        str, typer.Option(hidden=True, help="correct: the camera of the poses; needed where the mapper has several.")
+    ] = "",
+    apply_until: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            metavar="SECONDS",
+            hidden=True,
+            help="correct: frames after this time are posed in the corrected world already; without it, all that come "
+            "after the last pose of the file move with that pose, those to come as well.",
+        ),
+    ] = None,
+    wait: Annotated[
+        bool, typer.Option("--wait/--no-wait", hidden=True, help="correct: until the map has moved.")
+    ] = True,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the answer here, as JSON.")] = None,
     json: JsonOption = False,
-) -> None:
+) -> int:
     """Ask a saved map, or that of a running mapper, what is where.
 
     info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
     things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
     that `refine` has told things apart in, those. graph: floors, their rooms, which part at doors, the doors between
-    them, and the same things with their rooms. Of a map in tiles, only tiles that an answer needs are in memory; graph
-    needs all.
+    them, and the same things with their rooms.
+
+    correct moves the map of a running mapper to corrected poses (TUM: stamp tx ty tz qx qy qz qw), such as after a
+    loop closure. The mapper has to keep its frames (`history.max_frames` in its config). It goes on mapping, and
+    exchanges the map when the corrected one is ready. A pose goes to the frame nearest in time, within 5 ms.
 
     Example: semantic-mapper query runs/demo info
-    Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
-    Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
-    Example: semantic-mapper query live nearest chair 0 0 1 --json
-    Example: semantic-mapper query live instances --gone --json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
-    Example: semantic-mapper query s3://maps/house nearest chair 0 0 1
+    Example: semantic-mapper query live correct optimised.tum
     """
+    if question is Question.CORRECT:
+        (file,) = _arguments_of(question, arguments or [])
+        return _correct(source, Path(file), camera, apply_until, remote, wait=wait, json=json)
     class_name, point = _read_arguments(question, arguments or [])
-    from semantic_mapper.replay.run_folder import holds_tiles
-
-    in_tiles = holds_tiles(source)
-    endpoint = "" if in_tiles else map_endpoint(source)
+    endpoint = map_endpoint(source)
     if gone and not (endpoint and question is Question.INSTANCES):
         raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
     if picture is not None and question is not Question.GRAPH:
         raise typer.BadParameter("goes with `graph`", param_hint="--picture")
     output = Output.guarded()
-    from semantic_mapper.files import write_json
-    from semantic_mapper.nodes.map_answers import answer_table
-
     out, output.quiet = results_file(out), json
     for path in (out, picture):
         if path is not None:
             prepare_file(path)
-    ask = ask_tiles if in_tiles else ask_mapper if endpoint else ask_file
-    asked = Asked(question, class_name, point, up, min_confidence, server, keys, gone, picture)
-    found = {"map": source, **ask(endpoint or source, asked)}
+    ask = ask_mapper if endpoint else ask_file
+    request = Request(question, class_name, point, up, min_confidence, remote, gone, picture)
+    found = {"map": source, **ask(endpoint or source, request)}
     if out is not None:
         write_json(out, found)
     if output.quiet:
         output.json(found)
-    output.print(answer_table(found, output.console.width))
+    output.print(map_answers.answer_table(found, output.console.width))
     for path in (out, picture):
         if path is not None:
             output.print(f"written to {path}")
+    return 0
 
 
-def ask_file(source: str, asked: Asked) -> dict[str, Any]:
+def ask_file(source: str, request: Request) -> dict[str, Any]:
     """Answer of a saved map.
 
     Raises:
         ConfigError, MapError, LabelError: no map there, or a question that cannot be answered.
     """
-    from semantic_mapper.nodes import map_answers
-    from semantic_mapper.queries.graph import GraphTracker
-    from semantic_mapper.queries.instances import InstanceTracker
-    from semantic_mapper.queries.lookup import at
-    from semantic_mapper.queries.mirror import MapMirror
-    from semantic_mapper.queries.nearest import nearest
-    from semantic_mapper.replay.run_folder import map_path
-
     snapshot = MapMirror.load(map_path(Path(source))).snapshot()
-    match asked.question:
+    match request.question:
         case Question.INFO:
             return map_answers.describe_map(snapshot)
         case Question.AT:
-            return map_answers.answer_at(snapshot.label_set, asked.point, at(snapshot, [asked.point]))
+            return map_answers.answer_at(snapshot.label_set, request.point, at(snapshot, [request.point]))
         case Question.NEAREST:
-            hit = nearest(snapshot, asked.class_name, asked.point, asked.min_confidence)
-            return map_answers.answer_nearest(asked.class_name, asked.point, hit)
+            hit = nearest(snapshot, request.class_name, request.point, request.min_confidence)
+            return map_answers.answer_nearest(request.class_name, request.point, hit)
         case Question.INSTANCES:
             by = map_answers.CONNECTED if snapshot.instances is None else map_answers.LEARNED
-            up = asked.up or _find_up(snapshot)
+            up = request.up or _find_up(snapshot)
             return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot), by)
-        case Question.GRAPH:
-            return _answer_graph(source, GraphTracker(asked.up).update(snapshot), asked.picture)
-
-
-def ask_tiles(source: str, asked: Asked) -> dict[str, Any]:
-    """The same of a map in tiles.
-
-    Raises:
-        ConfigError, MapError, LabelError: no tiles there, or a question that cannot be answered.
-        StoreError: the store cannot be reached.
-    """
-    from semantic_mapper.mapping.files.up_axis import find_up
-    from semantic_mapper.nodes import map_answers
-    from semantic_mapper.nodes.fleet.tile_reading import open_tiles
-    from semantic_mapper.queries.graph import GraphTracker
-    from semantic_mapper.queries.mirror import MapMirror
-
-    tiled = open_tiles(source)
-    match asked.question:
-        case Question.INFO:
-            return map_answers.describe_tiles(tiled.manifest)
-        case Question.AT:
-            return map_answers.answer_at(tiled.manifest.label_set, asked.point, tiled.at([asked.point]))
-        case Question.NEAREST:
-            hit = tiled.nearest(asked.class_name, asked.point, asked.min_confidence)
-            return map_answers.answer_nearest(asked.class_name, asked.point, hit)
-        case Question.INSTANCES:
-            up = asked.up
-            if up is None:
-                points = tiled.points()
-                try:
-                    up = tuple(find_up(points, tiled.manifest.label_set).tolist())
-                except MapError:
-                    up = map_answers.UP
-            return map_answers.answer_instances(up, tiled.instances(up=up), map_answers.CONNECTED)
-        case Question.GRAPH:
-            snapshot = MapMirror.of(tiled.load()).snapshot()
-            return _answer_graph(source, GraphTracker(asked.up).update(snapshot), asked.picture)
+        case _:  # the graph
+            return _answer_graph(source, GraphTracker(request.up).update(snapshot), request.picture)
 
 
 def _find_up(snapshot: MapSnapshot) -> tuple[float, ...]:
     """Away from the floor, as in the graph; z of the world where no floor shows it, which the answer tells (``up``)."""
-    from semantic_mapper.nodes.map_answers import UP
-    from semantic_mapper.queries.graph import GraphTracker
-
     try:
         return tuple(GraphTracker().up_in(snapshot).tolist())
     except MapError:
-        return UP
+        return map_answers.UP
 
 
-def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
+def ask_mapper(source: str, request: Request) -> dict[str, Any]:
     """The same of a running mapper.
 
     Raises:
         TransportError: nobody answers there.
         MapError, LabelError: a question that cannot be answered.
     """
-    from semantic_mapper.client import MapClient
-    from semantic_mapper.nodes import map_answers
-
-    with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
-        match asked.question:
+    with MapClient(source, identity=request.remote.identity()) as client:
+        match request.question:
             case Question.INFO:
                 return map_answers.describe_map(client.mirror().snapshot())
             case Question.AT:
-                return map_answers.answer_at(client.info().label_set, asked.point, client.at([asked.point]))
+                return map_answers.answer_at(client.info().label_set, request.point, client.at([request.point]))
             case Question.NEAREST:
-                hit = client.nearest(asked.class_name, asked.point, asked.min_confidence)
-                return map_answers.answer_nearest(asked.class_name, asked.point, hit)
+                hit = client.nearest(request.class_name, request.point, request.min_confidence)
+                return map_answers.answer_nearest(request.class_name, request.point, hit)
             case Question.INSTANCES:
-                up = asked.up or map_answers.UP
-                return map_answers.answer_instances(up, client.instances(up, gone=asked.gone), map_answers.CONNECTED)
-            case Question.GRAPH:
-                return _answer_graph(source, client.graph(asked.up), asked.picture)
+                up = request.up or map_answers.UP
+                return map_answers.answer_instances(up, client.instances(up, gone=request.gone), map_answers.CONNECTED)
+            case _:  # the graph
+                return _answer_graph(source, client.graph(request.up), request.picture)
 
 
 def _answer_graph(source: str, graph: SceneGraph, picture: Path | None) -> dict[str, Any]:
@@ -242,27 +222,82 @@ def _answer_graph(source: str, graph: SceneGraph, picture: Path | None) -> dict[
     Raises:
         MapError: there is no floor to draw.
     """
-    from semantic_mapper.nodes import map_answers
-
     if picture is not None:
-        from semantic_mapper.plots import write_picture
-        from semantic_mapper.queries.graph_picture import draw_graph
-
         if not graph.floors:
             raise MapError(f"{source}: there is nothing to draw: {map_answers.NO_FLOOR}")
         write_picture(picture, draw_graph(source, graph))
     return map_answers.answer_graph(graph)
 
 
-def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:
-    """Class name and point, as far as the question has them."""
+def _arguments_of(question: Question, arguments: list[str]) -> list[str]:
+    """As many as the question takes."""
     expected = ARGUMENTS.get(question, "").split()
     if len(arguments) != len(expected):
         raise typer.BadParameter(
             f"`{question.value}` takes {' '.join(expected) or 'nothing more'}, got {' '.join(arguments) or 'nothing'}"
         )
+    return arguments
+
+
+def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:
+    """Class name and point, as far as the question has them."""
+    arguments = _arguments_of(question, arguments)
     name = arguments[0] if question is Question.NEAREST else ""
     try:
         return name, tuple(float(a) for a in arguments[-3:])
     except ValueError as error:
         raise typer.BadParameter(f"X Y Z must be numbers, got {' '.join(arguments[-3:])}") from error
+
+
+def _correct(
+    endpoint: str, file: Path, camera: str, apply_until: float | None, remote: Remote, *, wait: bool, json: bool
+) -> int:
+    """Send corrected poses to a running mapper.
+
+    Raises:
+        ConfigError: it is a saved map.
+        ImportSourceError: the poses cannot be read.
+        MapError, TransportError: the mapper is not there, or refuses them.
+    """
+    output = Output.guarded()
+
+    if "://" not in endpoint and Path(endpoint).exists():
+        raise ConfigError(
+            f"{endpoint}: is no running mapper; a saved map keeps no frames to correct, so map its log again with "
+            f"`semantic-mapper replay LOG --corrections {file} --out FOLDER`"
+        )
+    trajectory = read_corrections(file)
+    pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
+    poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
+    until_ns = ALWAYS if apply_until is None else round(apply_until * 1e9)
+    endpoint = map_endpoint(endpoint) or endpoint
+    with MapClient(endpoint, identity=remote.identity()) as client:
+        begun = client.correct_poses(poses, until_ns=until_ns, within_ns=MATCH_NS)
+        state = _follow(client) if wait else begun
+    outcome = {**asdict(state), "used": begun.used, "left_out": begun.left_out}
+    if json:
+        output.json(outcome)
+    else:
+        left_out = f"; {begun.left_out} have no frame in the history and were left out" if begun.left_out else ""
+        output.print(f"{begun.used} corrected poses {_correction_text(state)}{left_out}")
+    return EXIT_FAILED if state.failure else 0
+
+
+def _follow(client: MapClient) -> Correction:
+    """Wait until no correction is under way."""
+    with frame_progress("correct", None) as bar:
+        state = client.correction()
+        bar.start(state.total)
+        while state.running:
+            bar.set(state.done, f"of {state.total}")  # frames that come meanwhile are added
+            time.sleep(POLL_S)
+            state = client.correction()
+    return state
+
+
+def _correction_text(state: Correction) -> str:
+    if state.failure:
+        return f"were given up, the map is as it was: {state.failure}"
+    if state.running:
+        return f"are being worked into the map: {state.done} of {state.total} frames"
+    return "are in the map"

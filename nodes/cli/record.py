@@ -5,26 +5,53 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar
 
 import typer
 
+from semantic_mapper.config import convert_config, read_toml
+from semantic_mapper.errors import ConfigError, LogError
+from semantic_mapper.nodes.cli.options import SettingOptions
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.recorder.node import Recorder
+from semantic_mapper.nodes.recorder.node import record as record_until_end
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
+from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
+from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 from semantic_mapper.plain_text import counted
-
-if TYPE_CHECKING:
-    from semantic_mapper.nodes.node import NodeContext
-    from semantic_mapper.nodes.options import RecorderOptions
-    from semantic_mapper.nodes.recorder.node import Recorder
+from semantic_mapper.replay.run_folder import prepare_file
 
 HEAR_S = 10.0  # how long the nodes, which run already, may take to answer
+
+
+class RecorderSettings(SettingOptions):
+    """Those of a recorder node that a person may want to set."""
+
+    kind = RecorderOptions
+    options: ClassVar = {
+        "--split-mb": "split_mb",
+        "--split-s": "split_s",
+        "--on-disk-full": "disk_full",
+        "--reserve-mb": "reserve_mb",
+    }
+
+    def table(self) -> dict[str, Any]:
+        """As a launch file has them.
+
+        Raises:
+            ConfigError: a file that is no TOML.
+        """
+        return {**(read_toml(self.path) if self.path else {}), **self.given}
 
 
 @verb
 def record(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap); further parts: -1, -2, ...")],
+    recorder: RecorderSettings,
     launch: Annotated[str, typer.Option(help="Socket folder of the launch; by default the one that runs here.")] = "",
     source: Annotated[
         list[str] | None, typer.Option(help="Node to record, may be repeated; by default cameras and mappers.")
@@ -33,12 +60,6 @@ def record(
         list[str] | None, typer.Option(help="May be repeated; by default info, frame, refused and status; or map.")
     ] = None,
     duration: Annotated[float, typer.Option(min=0, help="Seconds; 0 = to the end of the stream, or Ctrl-C.")] = 0.0,
-    split_mb: Annotated[float, typer.Option(min=0, help="Begin a new part before one grows beyond this.")] = 0.0,
-    split_s: Annotated[float, typer.Option(min=0, help="Begin a new part after this many seconds.")] = 0.0,
-    on_disk_full: Annotated[
-        Literal["stop", "delete-oldest"], typer.Option(help="Stop, or delete the oldest parts of this recording.")
-    ] = "stop",
-    reserve_mb: Annotated[float, typer.Option(min=0, help="With so much left, the disk counts as full.")] = 500.0,
     jpeg: Annotated[
         int, typer.Option(min=0, max=100, help="Colour images as JPEG of this quality; 0 = as they are, lossless.")
     ] = 0,
@@ -56,39 +77,33 @@ def record(
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.recorder.node import record as record_until_end
-    from semantic_mapper.nodes.supervisor.running_launches import launch_folder
-    from semantic_mapper.replay.run_folder import prepare_file
 
     prepare_file(log)
     wanted = {
         "out": str(log),
         "source_timeout_s": HEAR_S,
-        "split_mb": split_mb,
-        "split_s": split_s,
-        "disk_full": on_disk_full,
-        "reserve_mb": reserve_mb,
         "overwrite": overwrite,
+        **recorder.table(),
         **({"topics": topic} if topic else {}),
         **({"rgb": "jpeg", "jpeg_quality": jpeg} if jpeg else {}),
     }
     with StopRequest() as stop, frame_progress("record", None) as bar:
         context, options = _join(launch_folder(launch), tuple(source or ()), wanted, stop)
-        recorder = record_until_end(context, options, _Watch(bar, duration).follow)
-    return _tell(output, log, recorder)
+        done = record_until_end(context, options, _Watch(bar, duration).follow)
+    return _report(output, log, done)
 
 
-def _tell(output: Output, log: Path, recorder: Recorder) -> int:
+def _report(output: Output, log: Path, recorder: Recorder) -> int:
     """Say what is recorded, and what is not; the exit code.
 
     Raises:
         LogError: nothing is.
     """
-    from semantic_mapper.errors import LogError
-
     done = recorder.recording
     if done is None:
-        raise LogError(f"{log}: nothing was recorded: no stream has begun; `semantic-mapper top` shows the nodes")
+        raise LogError(
+            f"{log}: nothing was recorded: no stream has begun; `semantic-mapper view --status` shows the nodes"
+        )
     if done.nothing_left:
         raise LogError(f"{log}: its files were removed while it was recorded; record again")
     parts = f" in {done.parts} parts" if done.parts > 1 else ""
@@ -125,19 +140,12 @@ class _Watch:
 def _join(
     folder: Path, sources: tuple[str, ...], wanted: dict[str, Any], stop: StopRequest
 ) -> tuple[NodeContext, RecorderOptions]:
-    """What a recorder node would be told by the launcher.
+    """What the launcher would give a recorder node.
 
     Raises:
         TransportError: the launch does not say what it is.
         ConfigError: a source that is none of its nodes, or options that do not go together.
     """
-    from semantic_mapper.config import convert_config
-    from semantic_mapper.errors import ConfigError
-    from semantic_mapper.nodes.node import NodeContext
-    from semantic_mapper.nodes.options import RecorderOptions
-    from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-    from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
-
     note = read_launch_note(folder)
     names = [node.name for node in note.nodes]
     for name in sources:

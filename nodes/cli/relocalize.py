@@ -7,8 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.relocalize import relocalize_frames
+from semantic_mapper.replay.run_folder import map_path
 
 _NAMED = 10  # frames that cannot be read
 
@@ -31,14 +36,9 @@ def relocalize(
     Example: semantic-mapper relocalize runs/yesterday today.mcap
     """
     output = Output.guarded()
-    from semantic_mapper.replay.run_folder import map_path
 
     map_file = map_path(saved)
     must_be_there(log)
-    from semantic_mapper.errors import MapError
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.replay.log.sequence import open_log
-    from semantic_mapper.replay.relocalize import relocalize_frames
 
     voxel_map = VoxelMap.load(map_file)
     if not len(voxel_map.places):

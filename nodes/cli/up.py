@@ -9,13 +9,24 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.errors import LogError
+from semantic_mapper.nodes.cli.eval import print_results
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.launch_config import load_launch
+from semantic_mapper.nodes.supervisor.launcher import Launcher
+from semantic_mapper.nodes.supervisor.packaged_files import find_launch
+from semantic_mapper.nodes.supervisor.systemd import Notifier
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.run_folder import hold_folder
 
 LaunchArgument = Annotated[
-    Path, typer.Argument(metavar="LAUNCH", help="Launch file, or one of the package: `semantic-mapper launch list`.")
+    Path,
+    typer.Argument(
+        metavar="LAUNCH",
+        help="Launch file, or the name of one of the package: camera, replay, ...; an unknown name lists all.",
+    ),
 ]
 
 
@@ -35,19 +46,12 @@ def up(
     Ctrl-C ends all nodes in order, the map so far is written, and the exit code is 0; a second Ctrl-C kills them. When
     a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1;
     where the launch file says so it is restarted first (`restart`). The exit code is 1, too, where a recorder knows at
-    its end that frames are not in its log. `semantic-mapper top` shows how the nodes are.
+    its end that frames are not in its log. `semantic-mapper view --status` shows how the nodes are.
 
     Example: semantic-mapper up replay --set log=kitchen.mcap --out runs/up
     Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.eval import print_results
-    from semantic_mapper.nodes.options import MapperOptions
-    from semantic_mapper.nodes.supervisor.launch_config import load_launch
-    from semantic_mapper.nodes.supervisor.launcher import Launcher
-    from semantic_mapper.nodes.supervisor.packaged_files import find_launch
-    from semantic_mapper.nodes.supervisor.systemd import Notifier
-    from semantic_mapper.replay.run_folder import hold_folder
 
     checked = load_launch(find_launch(launch), settings or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]

@@ -1,4 +1,4 @@
-"""What all verbs of the command line share: process set-up, one clear line for an error, exit codes.
+"""What all verbs of the command line share: process set-up, groups of options, one clear line for an error, exit codes.
 
 0 done; 1 failed; 2 wrong usage; 3 a map that cannot be trusted; 130 after Ctrl-C, 143 after SIGTERM (what was done so
 far is written where a verb says so); 1 too where a result is negative (``doctor`` finds something missing).
@@ -11,13 +11,15 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, ParamSpec
+from typing import Annotated, Any
 
 import structlog
 import typer
 from rich.text import Text
+from typer.core import TyperCommand, TyperOption
 
 from semantic_mapper.errors import LogError, SemanticMapperError
+from semantic_mapper.nodes.cli.options import OptionGroup
 from semantic_mapper.nodes.console import stderr_console
 from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.process import prepare_process
@@ -32,8 +34,6 @@ MIN_OPTION = 1e-9  # of the same, but for 0: one divided by it must be a number
 
 _log = structlog.get_logger(__name__)
 
-ParamsT = ParamSpec("ParamsT")
-
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
 
 
@@ -43,15 +43,49 @@ class Settings:
     verbose = False
 
 
-def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
-    """Make a command of a function that returns an exit code (None = 0) and raises ``SemanticMapperError``."""
+class VerbCommand(TyperCommand):
+    """A command whose rare options are hidden: ``--help-all`` shows them, too."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As of Click."""
+        if "--help-all" in args:
+            for parameter in self.params:
+                if isinstance(parameter, TyperOption):
+                    parameter.hidden = False
+            args = ["--help"]
+        return super().parse_args(ctx, args)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Says that there are more options."""
+        if any(getattr(parameter, "hidden", False) for parameter in self.params):
+            formatter.write_paragraph()
+            formatter.write_text("--help-all shows more options.")
+
+
+def verb(function: Callable[..., int | None]) -> Callable[..., None]:
+    """Make a command of a function that returns an exit code (None = 0) and raises ``SemanticMapperError``.
+
+    A parameter whose type is an ``OptionGroup`` stands for the options of the group.
+    """
+    signature = inspect.signature(function, eval_str=True)
+    groups: dict[str, tuple[type[OptionGroup], list[str]]] = {}
+    parameters: list[inspect.Parameter] = []
+    for parameter in signature.parameters.values():
+        if isinstance(parameter.annotation, type) and issubclass(parameter.annotation, OptionGroup):
+            options = parameter.annotation.parameters()
+            groups[parameter.name] = parameter.annotation, [option.name for option in options]
+            parameters += options
+        else:
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
 
     @functools.wraps(function)
-    def command(*args: ParamsT.args, **kwargs: ParamsT.kwargs) -> None:
+    def command(**kwargs: Any) -> None:
         prepare_process(verbose=Settings.verbose)
         _check_values(kwargs)
         try:
-            code = function(*args, **kwargs)
+            for name, (group, options) in groups.items():
+                kwargs[name] = group(**{option: kwargs.pop(option) for option in options})
+            code = function(**kwargs)
         except SemanticMapperError as error:
             if Settings.verbose:
                 _log.exception("failed", error=str(error))
@@ -72,6 +106,8 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
         sys.stderr.flush()
         raise typer.Exit(code or 0)
 
+    command.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    command.__annotations__ = {p.name: p.annotation for p in parameters}
     # Click joins the lines of a paragraph but for those after a backspace: an example is there to be copied.
     command.__doc__ = inspect.cleandoc(function.__doc__ or "").replace("\n\nExample:", "\n\n\b\nExample:", 1)
     return command

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
+import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.nodes.doctor.check import Check, failed
 from semantic_mapper.nodes.doctor.launch_nodes import node_settings
-from semantic_mapper.nodes.doctor.robot import port_is_taken
 from semantic_mapper.nodes.options import FoxgloveOptions, MapperOptions, ZenohOptions
 from semantic_mapper.nodes.supervisor.launch_config import Launch, load_launch
 from semantic_mapper.transport.endpoints import check_bind
@@ -78,7 +78,23 @@ def _address(endpoint: str, folder: str) -> Check:
     except SemanticMapperError as error:
         return failed("address", error)
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    if endpoint.startswith("tcp://") and re.fullmatch("[0-9]{1,5}", port) and port_is_taken(int(port), host):
+    if endpoint.startswith("tcp://") and re.fullmatch("[0-9]{1,5}", port) and _port_is_taken(int(port), host):
         mend = f"`ss -ltnp 'sport = :{port}'` says who; give another with --set"
         return Check("address", "note", f"{endpoint} is in use (by this very launch, if it runs)", mend)
     return Check("address", "ok", endpoint)
+
+
+def _port_is_taken(port: int, host: str = "127.0.0.1") -> bool:
+    """Whether somebody listens at a TCP port of this machine.
+
+    Args:
+        port: Its number.
+        host: Where one wants to listen; other than on loopback, all interfaces count.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1" if host in ("127.0.0.1", "localhost") else "", port))
+        except OSError:
+            return True
+    return False

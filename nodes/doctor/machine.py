@@ -19,7 +19,6 @@ from packaging.version import Version
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import is_out_of_memory
 from semantic_mapper.nodes.doctor import launch_file as doctor_launch
-from semantic_mapper.nodes.doctor import robot as doctor_robot
 from semantic_mapper.nodes.doctor.check import Check
 from semantic_mapper.nodes.process import usable_cores
 
@@ -37,9 +36,7 @@ def examine(launch: Path | None = None, settings: Sequence[str] = ()) -> list[Ch
     """
     checks: list[Check] = []
     own = (_python, _libc, _packages, _libusb, _open3d, _torch, _weights, _sockets, _curve, _machine, _disk)
-    robot = doctor_robot
-    others = (robot.room, robot.cameras, robot.oak, robot.realsense, robot.clocks, robot.ports, robot.left_sockets)
-    for check in (*own, *others, doctor_launch.own_keys):
+    for check in (*own, doctor_launch.own_keys):
         checks.extend(check())
     if launch is not None:
         checks.extend(doctor_launch.launch_file(launch, settings))

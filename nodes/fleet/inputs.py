@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.fleet.urls import is_url, persistently, shown, split_url, unstripped
+from semantic_mapper.nodes.fleet.urls import full_url, is_url, open_url, reaching, shown
 
-MANIFEST_SUFFIXES = (".csv", ".parquet")
+MANIFEST_SUFFIX = ".csv"
 LOG_COLUMN = "log"
-MAX_MANIFEST_BYTES = 1 << 28
 _GLOB = re.compile(r"[*?[]")
 
 
@@ -32,24 +29,13 @@ class LogInput:
     tags: dict[str, str] = field(default_factory=dict[str, str])
 
 
-def check_inputs(arguments: Sequence[str]) -> None:
-    """Check that local files and folders are there, before the packages that read them are loaded.
-
-    Raises:
-        ConfigError: one is missing.
-    """
-    for argument in arguments:
-        if not is_url(argument) and not _GLOB.search(argument) and not os.path.exists(argument):
-            raise ConfigError(f"{argument}: no such log; give a path, a URL, a glob or a manifest")
-
-
 def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
-    """Every log that is meant, once each, in the order of their names within an argument.
+    """Every log that is meant, once each, in the order of the arguments.
 
     A glob stands for the files that it matches (``site/*.mcap``) or, with a slash at its end, for folders
-    (``site/*/``); a folder is the parts of one recording, as for ``replay``. A manifest is CSV or Parquet with a column
-    ``log`` (relative paths count from the manifest) and any others, which become tags. Whether a log that is named can
-    be read is found out by its task.
+    (``site/*/``); a folder is the parts of one recording, as for ``replay``. A manifest is CSV with a column ``log``
+    (relative paths count from the manifest) and any others, which become tags. Whether a log can be read is found out
+    by its task.
 
     Args:
         arguments: Paths and URLs.
@@ -73,104 +59,58 @@ def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
 
 
 def _expand(argument: str, suffix: str) -> Iterator[LogInput]:
-    if _without_query(argument).lower().endswith(MANIFEST_SUFFIXES):
+    if argument.lower().endswith(MANIFEST_SUFFIX):
         yield from _read_manifest(argument)
         return
-    fs, path = split_url(argument)
-    if not is_url(argument) and os.path.exists(path):  # letters of globs may stand in names
+    _, path = open_url(argument)
+    is_local = not is_url(argument)
+    if is_local and os.path.exists(path):  # letters of globs may stand in names
         yield LogInput(path)
-        return
-    if not _GLOB.search(path) or argument.startswith(("http://", "https://")):
-        check_inputs([argument])
+    elif _GLOB.search(path) and not argument.startswith(("http://", "https://")):
+        yield from _matches(argument, suffix)
+    elif is_local:
+        raise ConfigError(f"{argument}: no such log; give a path, a URL, a glob or a manifest")
+    else:
         yield LogInput(argument)
-        return
-    folders = argument.endswith("/")
-    matches: dict[str, dict[str, Any]] = persistently(lambda: fs.glob(path, detail=True), shown(argument))
-    wanted = "directory" if folders else "file"
-    names = sorted(name for name, info in matches.items() if info.get("type") == wanted)
-    if not folders:
+
+
+def _matches(argument: str, suffix: str) -> Iterator[LogInput]:
+    fs, path = open_url(argument)
+    wanted, kind = ("directory", "folder") if argument.endswith("/") else ("file", f"file that ends in {suffix}")
+    with reaching(argument):
+        matches = fs.glob(path, detail=True)
+    names = sorted(name for name, info in matches.items() if info["type"] == wanted)
+    if wanted == "file":
         names = [name for name in names if name.lower().endswith(suffix)]
     if not names:
-        kind = "folder" if folders else f"file that ends in {suffix}"
         raise ConfigError(
             f"{shown(argument)}: matches no {kind}; put the pattern in quotes, try it with `ls`, and write [[] for a [ "
             "of a name"
         )
     for name in names:
-        yield LogInput(unstripped(fs, name, argument))
-
-
-def _without_query(argument: str) -> str:
-    return argument.split("?", 1)[0] if argument.startswith(("http://", "https://")) else argument
-
-
-def _absolute(argument: str) -> str:
-    if is_url(argument):
-        return argument
-    return split_url(argument)[1]
+        yield LogInput(full_url(fs, name, argument))
 
 
 def _read_manifest(argument: str) -> Iterator[LogInput]:
-    fs, path = split_url(argument)
+    fs, path = open_url(argument)
+    where = shown(argument)
     try:
-        size = int(persistently(lambda: fs.info(path), shown(argument)).get("size") or 0)
-        if size > MAX_MANIFEST_BYTES:
-            raise ConfigError(f"{shown(argument)}: is larger than {MAX_MANIFEST_BYTES:,} bytes; split it")
-        data: bytes = persistently(lambda: fs.cat_file(path), shown(argument))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{shown(argument)}: no such manifest") from error
-    rows = (
-        _parquet_rows(data, argument)
-        if _without_query(path).lower().endswith(".parquet")
-        else _csv_rows(data, argument)
-    )
-    base = _without_query(argument).rsplit("/", 1)[0] if is_url(argument) else path.rsplit("/", 1)[0]
-    count = 0
-    for number, row in enumerate(rows, 1):
-        log = (row.pop(LOG_COLUMN, "") or "").strip()
-        if not log:
-            raise ConfigError(f"{shown(argument)}: row {number} names no log; fill its column '{LOG_COLUMN}'")
-        url = log if is_url(log) or log.startswith("/") else f"{base}/{log}"
-        yield LogInput(_absolute(url), {name: value for name, value in row.items() if value})
-        count += 1
-    if not count:
-        raise ConfigError(f"{shown(argument)}: has no rows; add one for each log")
-
-
-def _csv_rows(data: bytes, where: str) -> Iterator[dict[str, str]]:
-    try:
-        text = data.decode("utf-8-sig")
+        with reaching(argument):
+            text = fs.cat_file(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{shown(where)}: is no text in UTF-8 ({error})") from error
-    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+        raise ConfigError(f"{where}: is no text in UTF-8 ({error})") from error
+    reader = csv.DictReader(text.splitlines(), strict=True)
+    base = (argument if is_url(argument) else path).rsplit("/", 1)[0]
     try:
-        names = list(reader.fieldnames or ())
-        if LOG_COLUMN not in names:
-            raise ConfigError(
-                f"{shown(where)}: has no column '{LOG_COLUMN}' (it has {', '.join(names) or 'none'}); name the column "
-                "with paths or URLs so"
-            )
-        if len(set(names)) < len(names):
-            raise ConfigError(f"{shown(where)}: two columns have the same name; rename one of them")
+        if LOG_COLUMN not in (reader.fieldnames or ()):
+            raise ConfigError(f"{where}: has no column '{LOG_COLUMN}'; name the column with paths or URLs so")
         for row in reader:
             if None in row or None in row.values():
-                raise ConfigError(
-                    f"{shown(where)}: line {reader.line_num} has another number of columns than its head; mend it"
-                )
-            yield dict(row)
+                raise ConfigError(f"{where}: line {reader.line_num} has another number of columns than the first line")
+            log = row.pop(LOG_COLUMN).strip()
+            if not log:
+                raise ConfigError(f"{where}: line {reader.line_num} names no log; fill its column '{LOG_COLUMN}'")
+            url = log if is_url(log) or log.startswith("/") else f"{base}/{log}"
+            yield LogInput(url, {name: value for name, value in row.items() if value})
     except csv.Error as error:
-        raise ConfigError(f"{shown(where)}: line {reader.line_num}: {error}") from error
-
-
-def _parquet_rows(data: bytes, where: str) -> Iterator[dict[str, str]]:
-    import pyarrow
-    from pyarrow import parquet
-
-    try:
-        table = parquet.read_table(pyarrow.BufferReader(data))
-    except (pyarrow.ArrowException, OSError) as error:
-        raise ConfigError(f"{shown(where)}: is no readable Parquet file ({error})") from error
-    if LOG_COLUMN not in table.column_names:
-        raise ConfigError(f"{shown(where)}: has no column '{LOG_COLUMN}' (it has {', '.join(table.column_names)})")
-    for row in table.to_pylist():
-        yield {name: "" if value is None else str(value) for name, value in row.items()}
+        raise ConfigError(f"{where}: line {reader.line_num}: {error}") from error

@@ -78,8 +78,8 @@ class Limits(Config, frozen=True):
     # and finetuner. One that gets on, be it slowly, may take as long as it needs.
     stop_s: Positive = 15.0
     finish_s: Positive = 300.0
-    # A fixed endpoint at which the status of all nodes can be subscribed to (`semantic-mapper top`), beside the one in
-    # the folder of sockets: ipc://PATH, tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
+    # A fixed endpoint at which the status of all nodes can be subscribed to (`semantic-mapper view --status`), next to
+    # that in the folder of sockets: ipc://PATH, tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
     publish: Annotated[str, msgspec.Meta(pattern=r"^([a-z]+://.+|\{\w+\}|)\Z")] = ""
     keys: str = ""  # folder of keys (`semantic-mapper keys`) for it; empty = none
 

@@ -1,4 +1,4 @@
-"""What ``top`` shows of a running launch: rates from totals, one row a node."""
+"""What ``view --status`` shows of a running launch: rates from totals, one row a node."""
 
 from __future__ import annotations
 

@@ -106,7 +106,9 @@ def node_endpoints(folder: Path) -> dict[str, str]:
         while not (view.complete and view.all_ready):
             view.listen(subscriber, LISTEN_S)
             if time.monotonic() > deadline:
-                raise TransportError(f"{status}: its nodes have not all come to run for {START_S:g} s; see `top`")
+                raise TransportError(
+                    f"{status}: its nodes have not all come to run for {START_S:g} s; see `view --status`"
+                )
     nodes = view.to_json()["nodes"].items()
     return {name: f"ipc://{folder}/{name}" for name, node in nodes if node["state"] != "ended"}
 

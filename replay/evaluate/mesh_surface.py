@@ -45,7 +45,7 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
     except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
         raise MapError(f"{mesh}: needs arrays 'vertices' (V, 3) and 'faces' (F, 3) in an .npz: {error}") from error
     voxel_map = VoxelMap.load(folder / "map.npz")
-    require_metres(voxel_map.scale_known, f"{folder / 'map.npz'} beside {mesh}")
+    require_metres(voxel_map.scale_known, f"{folder / 'map.npz'} next to {mesh}")
     points = voxel_map.points()
     if not len(points.xyz):
         raise MapError(f"{folder / 'map.npz'}: the map is empty")

@@ -71,7 +71,7 @@ class ExportRequest:
         height: Grid: LOW and HIGH in metres above the floor.
         resolution: Grid: side of a cell in metres; 5 cm by default, or a voxel where that is larger.
         floor: Grid: height of the floor along ``up`` in metres; found by default.
-        costs: Grid: TOML file with the cost of classes; a grid of costs is written beside the plan then.
+        costs: Grid: TOML file with the cost of classes; a grid of costs is written next to the plan then.
     """
 
     format: Format
@@ -161,7 +161,7 @@ def parse_up(text: str) -> Float64 | None:
 
 
 def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
-    """Write a map to ``path``, and what belongs to it beside it.
+    """Write a map to ``path``, and what belongs to it next to it.
 
     Raises:
         ConfigError: an option that the format cannot honour.

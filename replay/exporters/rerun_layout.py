@@ -134,7 +134,7 @@ def camera_path(camera: str) -> str:
 def layout(
     cameras: Sequence[str], *, mapped: bool, aged: bool, computed: bool = False, eye: Eye | None
 ) -> rrb.Blueprint:
-    """The map in one tab a colouring, the legend beside it, the images of each camera, and the times of all stages.
+    """The map in one tab a colouring, the legend next to it, the images of each camera, and the times of all stages.
 
     Args:
         cameras: Their names; none for a map alone.

@@ -290,18 +290,18 @@ class RerunExporter:
     def __init__(self, path: Path, info: StreamInfo) -> None:
         self.notices: list[str] = []
         self._label_set = info.label_set or make_label_set("none", ["no class"])
-        self._told_pseudo = self._told_computed = False
+        self._noted_pseudo = self._noted_computed = False
         self._log = RerunLog(recording_file(path), self._label_set)
         self._log.note_scale(info.scale_known)
 
     def add(self, item: ExportFrame) -> None:
         """Draw one frame."""
-        if item.frame.label_is_pseudo and not self._told_pseudo:
-            self._told_pseudo = True
+        if item.frame.label_is_pseudo and not self._noted_pseudo:
+            self._noted_pseudo = True
             self._log.note("labels", "pseudo labels, which weights have rendered: no truth")
             self.notices.append("labels are pseudo labels, at least of some frames; the entity `labels` says so")
-        if item.frame.depth_sigma_m is not None and not self._told_computed:
-            self._told_computed = True
+        if item.frame.depth_sigma_m is not None and not self._noted_computed:
+            self._noted_computed = True
             self._log.note("depth", "computed, not a sensor's, at least of some frames")
             self.notices.append("depth is computed, at least of some frames; the entity `depth` says so")
         self._log.log_step(item.frame, self._as_update(item.frame))

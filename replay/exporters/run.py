@@ -13,6 +13,7 @@ from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT
 from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
+from semantic_mapper.replay.exporters.foxglove import FoxgloveExporter
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_as
 from semantic_mapper.transport.images import sniff_image
@@ -132,8 +133,6 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
 
 def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
     if name == "foxglove":
-        from semantic_mapper.replay.exporters.foxglove import FoxgloveExporter
-
         return FoxgloveExporter(place, info)
     if name == "rrd":
         from semantic_mapper.replay.exporters.rerun_log import RerunExporter

@@ -85,7 +85,7 @@ class Skipped:
 
     Args:
         file: The file that is at fault.
-        reason: What is wrong with it, and how to mend it.
+        reason: What is wrong with it, and how to fix it.
         frame: Number of the frame in the recording.
         label_only: The frame is in the log, but without its label image.
     """
@@ -534,7 +534,7 @@ def image_size_must_be(rgb: UInt8, intrinsics: CameraIntrinsics, file: Path) -> 
         raise BadFrameError(
             file,
             f"the image is {rgb.shape[1]}x{rgb.shape[0]}, the camera's intrinsics say "
-            f"{intrinsics.width}x{intrinsics.height}; resize it or mend the intrinsics",
+            f"{intrinsics.width}x{intrinsics.height}; resize it or fix the intrinsics",
         )
 
 

@@ -1,4 +1,4 @@
-"""COLMAP's models, text and binary, with their pictures in ``images`` beside ``sparse`` (or beside the model).
+"""COLMAP's models, text and binary, with their pictures in ``images`` next to ``sparse`` (or to the model).
 
 Where the pictures have GPS positions, these tell scale, up and north. Otherwise up is how the camera was held, and the
 unit is the model's own, unless a scale is given; without one, the median depth of the points becomes 2 units.
@@ -46,8 +46,8 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
         notices.append(f"the model is damaged in {counted(len(model.damaged), 'place')}; the first: {model.damaged[0]}")
     names = {file for file, _ in images}
     places, below = ({file.parent for file in names}, "*") if root == folder else ({root}, "**/*")
-    beside = sorted(path for place in places for path in place.glob(below))
-    unposed = [path for path in beside if path.suffix.lower() in PICTURES and path not in names]
+    pictures_there = sorted(path for place in places for path in place.glob(below))
+    unposed = [path for path in pictures_there if path.suffix.lower() in PICTURES and path not in names]
     if unposed:
         notices.append(
             f"{counted(len(unposed), 'picture')} in {root} without a pose in this model; the first: {unposed[0].name}"

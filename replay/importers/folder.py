@@ -118,7 +118,7 @@ class FolderRecording:
         if not self._rows:
             raise ImportSourceError(f"{folder / 'poses.txt'}: holds no pose")
         numbers = sorted({*self._color, *range(len(self._rows))})
-        # An image that is missing is a bad frame, but thousands of poses beside a few images are no bad frames.
+        # An image that is missing is a bad frame, but thousands of poses with a few images are no bad frames.
         self._numbers = numbers if len(numbers) <= 2 * len(self._color) else sorted(self._color)
         poses_only = sum(number < len(self._rows) for number in numbers) - sum(
             n < len(self._rows) for n in self._numbers
@@ -239,7 +239,7 @@ class FolderRecording:
         if back:
             raise ImportSourceError(
                 f"{file}: row {back} is not later than the row before it; frames need rising stamps: sort the images, "
-                "or mend the stamps"
+                "or fix the stamps"
             )
         (first, first_ns), (last, last_ns) = good[0], good[-1]
         if last > first and (last_ns - first_ns) / (last - first) < LEAST_PERIOD_NS:

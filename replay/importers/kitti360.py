@@ -245,7 +245,7 @@ def find_drive(folder: Path) -> tuple[Path, str]:
 
 
 def rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> tuple[CameraIntrinsics, Float64]:
-    """Intrinsics of a rectified camera, and ``T_cam0_camera`` (4, 4): where it stands beside the left one.
+    """Intrinsics of a rectified camera, and ``T_cam0_camera`` (4, 4): where it stands next to the left one.
 
     Args:
         values: Lines of ``perspective.txt`` by name.

@@ -31,7 +31,7 @@ from semantic_mapper.replay.importers.base import (
     unknown_keys,
     unknown_notice,
 )
-from semantic_mapper.replay.importers.posed import PlacedModel, PosedPicture, PosedPictures, has_picture, place_model
+from semantic_mapper.replay.importers.posed import PosedModel, PosedPicture, PosedPictures, has_picture, place_model
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
 from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth, scene_depth
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
@@ -63,7 +63,7 @@ class _Camera(msgspec.Struct):
     k4: float = 0.0
 
 
-class _Shot(msgspec.Struct):
+class _PosedImage(msgspec.Struct):
     rotation: Vector
     translation: Vector
     camera: str
@@ -116,14 +116,14 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     left_out: list[str] = []
     for name in names:
         try:
-            shot = convert_known(model.shots[name], _Shot, f"{file}, shot '{name}'")
+            shot = convert_known(model.shots[name], _PosedImage, f"{file}, shot '{name}'")
             pictures.append(_picture(root, name, shot, cameras, file))
         except ImportSourceError as error:
             left_out.append(str(error))
     if not pictures:
         raise ImportSourceError(left_out[0])
     poses = np.stack([picture.T_world_camera for picture in pictures])
-    reference = model.reference_lla or _reference_beside(file)
+    reference = model.reference_lla or _reference_in_file(file)
     if reference is None or not (reference.latitude or reference.longitude):
         placed = place_model(poses, pictures, options, lambda: _depth(model.points, pictures))
     elif options.scale is not None:
@@ -132,7 +132,7 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         origin = GpsPosition(reference.latitude, reference.longitude, reference.altitude)
         said = ["scale, up and north are those that OpenSfM found by GPS"]
         far = scene_depth(_depth(model.points, pictures))
-        placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin), **far})
+        placed = PosedModel(poses, True, said, {ORIGIN_KEY: str(origin), **far})
     opened = placed.pictures("opensfm", folder, pictures, options)
     opened.notices += unknown_notice(file, unknown_keys(map(_table, model.cameras.values()), _Camera))
     unposed = [
@@ -165,10 +165,10 @@ def _read(file: Path, kind: type[ReadT]) -> ReadT:
         raise ImportSourceError(str(error)) from error
 
 
-def _reference_beside(file: Path) -> _Reference | None:
+def _reference_in_file(file: Path) -> _Reference | None:
     """Older versions keep it in a file of its own."""
-    beside = file.with_name(REFERENCE)
-    return _read(beside, _Reference) if beside.is_file() else None
+    other = file.with_name(REFERENCE)
+    return _read(other, _Reference) if other.is_file() else None
 
 
 def _root(folder: Path, file: Path, names: list[str]) -> Path:
@@ -181,7 +181,7 @@ def _root(folder: Path, file: Path, names: list[str]) -> Path:
 
 
 def _picture(
-    root: Path, name: str, shot: _Shot, cameras: Mapping[str, CameraIntrinsics | str], file: Path
+    root: Path, name: str, shot: _PosedImage, cameras: Mapping[str, CameraIntrinsics | str], file: Path
 ) -> PosedPicture:
     camera = cameras.get(shot.camera, f"{file}, shot '{name}': its camera '{shot.camera}' is missing")
     if isinstance(camera, str):

@@ -38,7 +38,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 KEPT_RECTIFIERS = 8  # of some megabytes each
 SHIFT_NS = 1_000_000  # between pictures of one time
 DEFAULT_HZ = 2.0  # at which pictures without times count as taken
-T_Z_UP_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of ARKit's worlds
+T_Z_UP_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of ARKit's world frame
 GL_AXES = np.diag((1.0, -1.0, -1.0, 1.0))  # T_gl_cv: OpenGL's cameras look along -z, with y up
 
 
@@ -214,7 +214,7 @@ def _in_time(pictures: Sequence[PosedPicture], hz: float, notices: list[str]) ->
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlacedModel:
+class PosedModel:
     """A model in the world of a log.
 
     Args:
@@ -251,7 +251,7 @@ def has_picture(root: Path, name: str) -> bool:
 
 def place_model(
     poses: Float64, pictures: list[PosedPicture], options: ImportOptions, depth: Callable[[], float]
-) -> PlacedModel:
+) -> PosedModel:
     """Place a model by the positions of its pictures if they have some and no scale is given, else upright.
 
     Args:
@@ -271,9 +271,9 @@ def place_model(
             if fit is not None:
                 said = [f"scale, up and north: {fit}"]
                 moved = np.stack([fit.moved(pose) for pose in poses])
-                return PlacedModel(moved, True, said, {ORIGIN_KEY: str(fit.origin), **scene_depth(fit.scale * median)})
+                return PosedModel(moved, True, said, {ORIGIN_KEY: str(fit.origin), **scene_depth(fit.scale * median)})
     placed = upright(poses[0], camera_up(poses)) @ poses
     if options.scale is not None:
-        return PlacedModel(placed, False, notices, scene_depth(options.scale * median))
+        return PosedModel(placed, False, notices, scene_depth(options.scale * median))
     placed[:, :3, 3] *= UNSCALED_DEPTH_M / median if median > 0 else 1.0
-    return PlacedModel(placed, False, notices)
+    return PosedModel(placed, False, notices)

@@ -117,12 +117,12 @@ def _seconds(found: _Metadata, numbers: list[int], file: Path, notices: list[str
     given = fps is not None and 0 < fps <= 1000
     rate = fps if fps is not None and given else FPS
     wanted = np.array(numbers, np.float64)
-    told = [(number, time) for number, time in enumerate(_numbers(found.frame_times)) if time is not None]
-    if not told:
+    given_times = [(number, time) for number, time in enumerate(_numbers(found.frame_times)) if time is not None]
+    if not given_times:
         if not given:
             notices.append(f"{file}: tells neither times nor fps: stamps are made up at {FPS:g} frames a second")
         return (wanted / rate).tolist()
-    known, times = np.array(told, np.float64).T
+    known, times = np.array(given_times, np.float64).T
     missing = int((~np.isin(wanted, known)).sum())
     if missing:
         notices.append(

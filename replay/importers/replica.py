@@ -8,7 +8,7 @@ is the one of its ``SSR/training/trainer.py``: 640x480, horizontal field of view
 principal point in the middle. Another image size keeps that field of view.
 
 Class names come from Replica's own ``info_semantic.json`` ("classes": [{"id", "name"}, ...]), which is looked for in
-the sequence's folder, the scene's, its ``habitat``, and in ``semantic_info/SCENE`` beside the scenes.
+the sequence's folder, the scene's, its ``habitat``, and in ``semantic_info/SCENE`` next to the scenes.
 """
 
 from __future__ import annotations

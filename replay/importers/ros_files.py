@@ -1,4 +1,4 @@
-"""Files of ROS bags, told by their content: bags that were merged, renamed or packed have other names and profiles."""
+"""Files of ROS bags, known by their content: bags that were merged, renamed or packed have other names and profiles."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _with_profile(file: Path, path: Path) -> None:
                 )
             writer.finish()
     except (OSError, McapError, ValueError) as error:
-        raise ImportSourceError(f"{file}: cannot be read: {error}; `mcap recover` mends what was cut off") from error
+        raise ImportSourceError(f"{file}: cannot be read: {error}; `mcap recover` repairs what was cut off") from error
 
 
 def _unpacked(file: Path, folder: Path) -> Path:

@@ -140,8 +140,8 @@ class Track:
 
 
 @dataclass(slots=True)
-class _Told:
-    """What one source tells of where one frame sits."""
+class _Published:
+    """What one source publishes of where one frame sits."""
 
     topic: str
     parents: set[str] = field(default_factory=set[str])
@@ -157,7 +157,7 @@ class _Told:
         """Namespace of the topic."""
         return self.topic.rsplit("/", 1)[0]
 
-    def contradicts(self, other: _Told) -> bool:
+    def contradicts(self, other: _Published) -> bool:
         """Whether both cannot be true."""
         if self.parents != other.parents:
             return True
@@ -166,7 +166,7 @@ class _Told:
         return self.track.differs(other.track, unless_apart=self.topic == other.topic)
 
     def is_only(self, T: Float64) -> bool:
-        """Whether all that is told is this transform (4, 4)."""
+        """Whether all that is published is this transform (4, 4)."""
         return all(_same(mine, T) for mine in self.fixed) and (self.track is None or self.track.is_at(T))
 
 
@@ -179,7 +179,7 @@ class TransformTree:
 
     def __init__(self) -> None:
         self.refused = 0
-        self._told: dict[str, dict[str, _Told]] = {}  # by child and source
+        self._published: dict[str, dict[str, _Published]] = {}  # by child and source
         self._parents: dict[str, set[str]] = {}
         self._fixed: dict[str, Float64] = {}
         self._tracks: dict[str, Track] = {}
@@ -200,17 +200,17 @@ class TransformTree:
             if row is None or not child or child == parent:
                 self.refused += 1
                 continue
-            told = self._told.setdefault(child, {}).setdefault(source, _Told(topic))
-            told.parents.add(parent)
+            given = self._published.setdefault(child, {}).setdefault(source, _Published(topic))
+            given.parents.add(parent)
             if topic.endswith("tf_static"):
                 T = pose_matrix(np.array(row[:3]), np.array(row[3:]))
-                if not any(_same(T, known) for known in told.fixed):
-                    told.fixed.append(T)
+                if not any(_same(T, known) for known in given.fixed):
+                    given.fixed.append(T)
             else:
                 stamp_ns = stamp_of(stamped.header)
-                told.stamps_ns.append(stamp_ns)
-                told.received_ns.append(received_ns)
-                told.rows.append(row)
+                given.stamps_ns.append(stamp_ns)
+                given.received_ns.append(received_ns)
+                given.rows.append(row)
 
     def close(self, image: str) -> list[str]:
         """Sort what was taken in; sentences on what is odd about it.
@@ -220,29 +220,30 @@ class TransformTree:
                 it is counts.
         """
         notices: list[str] = []
-        for told in (told for sources in self._told.values() for told in sources.values()):
-            told.unstamped = fill_stamps(told.stamps_ns, told.received_ns)
-            told.track = Track(told.stamps_ns, told.rows) if told.rows else None
+        for given in (given for sources in self._published.values() for given in sources.values()):
+            given.unstamped = fill_stamps(given.stamps_ns, given.received_ns)
+            given.track = Track(given.stamps_ns, given.rows) if given.rows else None
         others = self._other_robots(image)
         for space in sorted(others):
             notices.append(f"transforms of {space}/tf are left out: {image} is not in its namespace")
-        for child, sources in self._told.items():
-            for source in [source for source, told in sources.items() if told.space in others]:
+        for child, sources in self._published.items():
+            for source in [source for source, given in sources.items() if given.space in others]:
                 del sources[source]
-            for told in sources.values():
-                self._parents.setdefault(child, set()).update(told.parents)
-                if told.fixed:
-                    self._fixed[child] = told.fixed[-1]
-            moving = [told for told in sources.values() if told.track is not None]
+            for given in sources.values():
+                self._parents.setdefault(child, set()).update(given.parents)
+                if given.fixed:
+                    self._fixed[child] = given.fixed[-1]
+            moving = [given for given in sources.values() if given.track is not None]
             if not moving:
                 continue
-            unstamped = sum(told.unstamped for told in moving)
+            unstamped = sum(given.unstamped for given in moving)
             self._tracks[child] = Track(
-                [ns for told in moving for ns in told.stamps_ns], [row for told in moving for row in told.rows]
+                [ns for given in moving for ns in given.stamps_ns],
+                [row for given in moving for row in given.rows],
             )
-            for told in moving:
-                notices += told.track.oddities(f"tf of '{child}'") if told.track is not None else []
-                told.stamps_ns, told.received_ns, told.rows = [], [], []
+            for given in moving:
+                notices += given.track.oddities(f"tf of '{child}'") if given.track is not None else []
+                given.stamps_ns, given.received_ns, given.rows = [], [], []
             if unstamped:
                 notices.append(
                     f"tf of '{child}': {counted(unstamped, 'pose')} without a stamp; the time of receipt stands for it"
@@ -252,9 +253,11 @@ class TransformTree:
     def _other_robots(self, image: str) -> set[str]:
         """Namespaces whose transforms contradict those of a namespace that is nearer to the images'."""
         others: set[str] = set()
-        for sources in self._told.values():
+        for sources in self._published.values():
             for a, b in combinations(sources.values(), 2):
-                rank = {told.space: len(told.space) if image.startswith(told.space + "/") else -1 for told in (a, b)}
+                rank = {
+                    given.space: len(given.space) if image.startswith(given.space + "/") else -1 for given in (a, b)
+                }
                 if len(set(rank.values())) == 2 and not others & set(rank) and a.contradicts(b):
                     others.add(min(rank, key=lambda space: rank[space]))
         return others
@@ -267,28 +270,28 @@ class TransformTree:
         """
         up, down = self.way_up(source), self.way_up(target)
         for child in set(up) ^ set(down):
-            if child not in self._told:
+            if child not in self._published:
                 continue
             what = f"tf: '{child}' on '{next(iter(self._parents[child]))}'"
-            sources = self._told[child]
-            for name, told in sources.items():
-                if len(told.fixed) > 1:
-                    a, b = (_place(T) for T in (told.fixed[0], told.fixed[-1]))
+            sources = self._published[child]
+            for name, given in sources.items():
+                if len(given.fixed) > 1:
+                    a, b = (_place(T) for T in (given.fixed[0], given.fixed[-1]))
                     raise ImportSourceError(
                         f"{what} is fixed, but {name} says first {a}, then {b}: cut the bag between the two, or record "
                         "the true one alone"
                     )
-            for (a, told), (b, other) in combinations(sources.items(), 2):
-                if told.contradicts(other):
+            for (a, given), (b, other) in combinations(sources.items(), 2):
+                if given.contradicts(other):
                     raise ImportSourceError(
-                        f"{what} is told by {a} and, otherwise, by {b}: record the true one alone, or keep only it in "
-                        "the bag (`rosbag filter`, `ros2 bag convert`)"
+                        f"{what} is published by {a} and, otherwise, by {b}: record the true one alone, or keep "
+                        "only it in the bag (`rosbag filter`, `ros2 bag convert`)"
                     )
             jump = self._tracks[child].jump_m() if child in self._tracks else 0.0
             if jump:
                 raise ImportSourceError(
                     f"{what} jumps to and fro by {jump:.2g} m or rad: two programs publish it; stop one (such as the "
-                    "odometry of the wheels beside a filter) and record again, or name a topic of poses: --topic "
+                    "odometry of the wheels next to a filter) and record again, or name a topic of poses: --topic "
                     "pose=NAME"
                 )
 
@@ -355,7 +358,7 @@ def stamp_of(header: Any) -> int:
 
 
 def fill_stamps(stamps_ns: list[int], received_ns: list[int]) -> int:
-    """Put the time of receipt where a stamp is 0, which is none; returns how often.
+    """Put the time of receipt where a stamp is 0, which no stamp is; returns how often.
 
     A simulated clock begins at 0, so there it is one.
     """

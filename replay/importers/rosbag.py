@@ -74,9 +74,9 @@ _VIEWER = (
     ". Recordings of the RealSense Viewer have none: record with ROS and an odometry, or live with `semantic-mapper "
     "up` of a launch file with a camera of kind realsense, which finds poses"
 )
-_MEND = (
-    "`ros2 bag reindex`, `mcap recover` or `rosbag reindex` mends a bag whose recorder was killed; one that was copied "
-    "in part has to be copied again"
+_REPAIR = (
+    "`ros2 bag reindex`, `mcap recover` or `rosbag reindex` repairs a bag whose recorder was killed; one that was "
+    "copied in part has to be copied again"
 )
 
 
@@ -169,8 +169,8 @@ class RosbagRecording:
                 self._refuse_two_lenses(depth, own, infos[color.name], name)
             self._link_depth(depth, own)
         pose_topic = self._pose_topic()
-        self._pose_at, told = self._pose_source(pose_topic, poses.get(pose_topic, []))
-        self.notices.append(told)
+        self._pose_at, source = self._pose_source(pose_topic, poses.get(pose_topic, []))
+        self.notices.append(source)
         self._check_times(pose_topic)
         if self._tree.refused:
             self.notices.append(f"{self._tree.refused} transforms of tf are left out: they hold NaN or no rotation")
@@ -760,7 +760,7 @@ class _Bag:
                 yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype), node
 
     def message(self, name: str, series: list[tuple[int, int]], index: int) -> Any:
-        """One message of a topic; quick where they are asked for in order.
+        """One message of a topic; quick where they are read in order.
 
         Args:
             name: Of the topic.
@@ -837,7 +837,7 @@ class _Bag:
             raise
         except Exception as error:  # storage, compression and messages each raise their own
             raise ImportSourceError(
-                f"{self.src}: this ROS bag cannot be read: {visible(str(error)) or type(error).__name__}; {_MEND}"
+                f"{self.src}: this ROS bag cannot be read: {visible(str(error)) or type(error).__name__}; {_REPAIR}"
             ) from error
 
 
@@ -892,7 +892,7 @@ def _distinct(lenses: list[tuple[int, CameraIntrinsics]]) -> tuple[NDArray[np.in
 
 
 def _rate(stamps: Any) -> float:
-    """Images a second, 0 where it cannot be told."""
+    """Images a second, 0 where it is unknown."""
     if len(stamps) < 2 or stamps.max() == stamps.min():
         return 0.0
     return round(1e9 * (len(stamps) - 1) / float(stamps.max() - stamps.min()), 3)

@@ -76,7 +76,7 @@ _NOT_ENOUGH = ("colmap", "opensfm", "rosbag")  # formats that are known by what 
 SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
 LISTED = 5  # recordings that an error names
 _SEE = "replay/importers/ says what each format consists of"
-_VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
+_VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper replay` find them"
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),

@@ -233,7 +233,7 @@ class LogReader:
         if not found.finished:
             self.notices.append(
                 f"{self.path} was not closed by its writer; the {len(self._frames)} frames that are whole are read. "
-                "`semantic-mapper recover` writes a clean copy"
+                "`semantic-mapper import` writes a clean copy"
             )
 
     def _parts(self, entries: list[_Entry]) -> Iterator[tuple[Envelope, list[bytes]]]:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
@@ -38,7 +39,7 @@ TURN_PX, TURN_FOCALS = 3.0, np.geomspace(0.4, 2.0, 12)  # off a turn at most, fo
 # between the rays to what both see may be this small. COLMAP's defaults, 0.95 and 16 degrees, leave none to a camera
 # that goes forwards. It begins with the widest, and halves the angle twice.
 AHEAD_MAX_FORWARD, AHEAD_ANGLE_DEG = 1.0, 8.0
-MAX_POINT_SIGMAS = 2000  # points whose depths are asked for
+MAX_POINT_SIGMAS = 2000  # points whose depths are judged
 UNKNOWN_FOCAL = 0.3  # standard deviation of a focal length that usual lenses tell better than the film: it is assumed
 
 
@@ -387,7 +388,7 @@ def _check_focal(pycolmap: Any, folder: Path) -> FocalCheck:
 def _settle(
     pycolmap: Any, folder: Path, camera: Camera, prior: float, *, free: bool, assumed: bool = False
 ) -> Sigmas | None:
-    """Adjust the model in a folder until it converges, and tell how exact it is; None where that cannot be told.
+    """Adjust the model in a folder until it converges, and say how exact it is; None where that is unknown.
 
     A covariance belongs to the minimum, and while it maps, COLMAP ends its adjustments before that.
 
@@ -472,8 +473,6 @@ def _precision(camera: Camera) -> float:
 
 def _verified(pycolmap: Any, path: Path, camera: Camera) -> list[Pair]:
     """Pairs of frames near each other in the sequence, whose matches agree."""
-    import cv2
-
     size = max(camera.width, camera.height)
     centre = np.array(((camera.width, camera.height), (camera.width, camera.height))) / 2
     focals = TURN_FOCALS * size if camera.fixed is None else np.array(camera.fixed[:1])

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
+from PIL import Image
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.files import numeric_order
@@ -49,7 +50,7 @@ class Film:
 
     Args:
         path: Film file, or folder of pictures, which are read by the numbers in their names.
-        quarters: Turn every frame clockwise by this many quarters, beside what the film's own rotation mark says.
+        quarters: Turn every frame clockwise by this many quarters, on top of what the film's own rotation mark says.
 
     Attributes:
         width, height: Of the frames as they are given, in pixels.
@@ -177,8 +178,6 @@ def focal_of_exif(file: Path, longer_px: int, shorter_px: int) -> float | None:
         file: JPEG or another format with EXIF data.
         longer_px, shorter_px: Sides of the picture.
     """
-    from PIL import Image
-
     try:
         with Image.open(file) as image:
             focal_mm = image.getexif().get_ifd(0x8769).get(_FOCAL_35MM, 0)
@@ -307,7 +306,7 @@ class FilmNote(msgspec.Struct, frozen=True):
         picked, registered: Frames that structure from motion was given, and has placed.
         error_px: Mean reprojection error.
         focal_px: In pixels of the film.
-        sigmas: How exact the poses are; None where that cannot be told, and of older logs.
+        sigmas: How exact the poses are; None where that is unknown.
     """
 
     frames: int

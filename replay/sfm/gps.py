@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.evaluation.trajectory import align_similar
@@ -17,7 +18,7 @@ MIN_POSITIONS = 4
 TRIALS = 300  # of three pictures each; the one with the least median error begins the fit
 INLIERS = 2.5  # pictures further off than this many standard deviations do not count
 ALWAYS_M = 1.0  # pictures that are no further off count in any case
-MIN_TO_DOUBT = 8  # of fewer pictures all count
+MIN_FOR_OUTLIERS = 8  # of fewer pictures all count
 MAX_ERROR = 0.2  # median error, as a fraction of how far the positions are spread (rms)
 MIN_WIDTH = 0.05  # of what the pictures cover, as a fraction of its length: on a line nothing tells the roll
 ORIGIN_KEY = "origin"  # of a log's metadata: latitude, longitude, altitude of the world's origin
@@ -70,8 +71,6 @@ class GpsFit:
 
 def read_position(file: Path) -> GpsPosition | None:
     """Where a picture was taken by its EXIF data; None where these lack latitude, longitude or altitude."""
-    from PIL import Image
-
     try:
         with Image.open(file) as image:
             found = image.getexif().get_ifd(_GPS)
@@ -136,7 +135,7 @@ def place_by_gps(T_model_camera: Float64, positions: Sequence[GpsPosition | None
     if not (spread_m > 0 and length > 0):
         raise ImportSourceError("the GPS positions are one and the same")
     if width < MIN_WIDTH * length:
-        raise ImportSourceError("the pictures lie on a line, about which GPS tells no roll; take some beside it")
+        raise ImportSourceError("the pictures lie on a line, about which GPS tells no roll; take some off it")
     inside = _consensus(centers, truth)
     T, scale = align_similar(centers[inside], truth[inside])
     error_m = float(np.median(_errors(T, scale, centers, truth)))
@@ -155,7 +154,7 @@ def _errors(T: Float64, scale: float, a: Float64, b: Float64) -> Float64:
 def _consensus(a: Float64, b: Float64) -> np.ndarray:
     """Which points (N, 3) agree with the similarity that has the least median error."""
     rng, best, least = np.random.default_rng(0), np.ones(len(a), bool), np.inf
-    if len(a) < MIN_TO_DOUBT:
+    if len(a) < MIN_FOR_OUTLIERS:
         return best
     rank = (len(a) + 3) // 2  # three points always agree
     for chosen in [np.arange(len(a)), *(rng.choice(len(a), 3, replace=False) for _ in range(TRIALS))]:

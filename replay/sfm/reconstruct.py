@@ -40,8 +40,8 @@ from semantic_mapper.replay.sfm.film import (
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsFit, place_by_gps
 from semantic_mapper.replay.sfm.refusals import (
     LEAST_ANGLE_DEG,
-    doubt_baseline,
-    doubt_focal,
+    baseline_notes,
+    focal_note,
     refuse_features,
     refuse_look,
     refuse_outcome,
@@ -152,7 +152,7 @@ class FilmReport:
         pictures: RGB of a few frames of the log, with their times in seconds.
         info: What stands in the log's head.
         bytes: Size of the log.
-        sigmas: How exact focal length, places and depths are; None where that cannot be told.
+        sigmas: How exact focal length, places and depths are; None where that is unknown.
     """
 
     film: Path
@@ -415,11 +415,11 @@ class _Import:
         angle_deg = _parallax_deg(models[0])
         if angle_deg < LEAST_ANGLE_DEG:
             raise turning(self._film.path)
-        self._notices += doubt_baseline(best.ahead, angle_deg, outcome.sigmas)
+        self._notices += baseline_notes(best.ahead, angle_deg, outcome.sigmas)
         if outcome.focal is not None and self._lens.measured is not None:
             given_px = self._lens.measured.fx * self._film.full_width / self._film.width
-            doubt = doubt_focal(self._film.path, self._options.calibration, given_px, outcome.focal)
-            self._notices += [doubt] if doubt else []
+            note = focal_note(self._film.path, self._options.calibration, given_px, outcome.focal)
+            self._notices += [note] if note else []
         priors = list(dict.fromkeys(f"{a.focal_prior_px:.0f}" for a in outcome.attempts))
         if len(priors) > 1:
             self._notices.append(

@@ -27,7 +27,7 @@ LEAST_LINKED = 0.5  # of the neighbours in the sequence
 MOST_TURNED = 0.9  # of the pairs some steps apart, that a turn explains: their model is noise, however large
 LEAST_MODEL = 0.6  # of the picked frames in the largest model
 LEAST_ANGLE_DEG = 1.0  # between the rays to a point, the median: less is a camera that turns on the spot
-DOUBTED_FOCAL, WRONG_FOCAL = 0.05, 0.1  # of a given focal length: its difference from what the pictures say
+UNCERTAIN_FOCAL, WRONG_FOCAL = 0.05, 0.1  # of a given focal length: its difference from what the pictures say
 UNSURE_FOCAL, UNSURE_DEPTH, UNSURE_POSITION = 0.02, 0.03, 0.02  # standard deviations that are worth a note
 LEAST_SIGMAS = 10.0  # of this difference: rolling shutter and the like make a few
 _HOW = "film again: walk slowly, sideways past things with texture, in good light"
@@ -153,7 +153,7 @@ def turning(film: object) -> FilmError:
     )
 
 
-def doubt_focal(film: object, calibration: object, focal_px: float, check: FocalCheck) -> str:
+def focal_note(film: object, calibration: object, focal_px: float, check: FocalCheck) -> str:
     """What is wrong with the focal length of a calibration; empty where nothing is, or the film does not tell.
 
     Args:
@@ -166,7 +166,7 @@ def doubt_focal(film: object, calibration: object, focal_px: float, check: Focal
         FilmError: it is far off.
     """
     off = abs(check.factor - 1)
-    if off < DOUBTED_FOCAL or check.sigmas < LEAST_SIGMAS:
+    if off < UNCERTAIN_FOCAL or check.sigmas < LEAST_SIGMAS:
         return ""
     text = (
         f"the focal length of {calibration} is {focal_px:.0f} px of the film, and its pictures fit "
@@ -178,7 +178,7 @@ def doubt_focal(film: object, calibration: object, focal_px: float, check: Focal
     return text
 
 
-def doubt_baseline(ahead: bool, angle_deg: float, sigmas: Sigmas | None) -> list[str]:
+def baseline_notes(ahead: bool, angle_deg: float, sigmas: Sigmas | None) -> list[str]:
     """Notes on what a film tells badly, because its camera hardly moves sideways; none where it tells all.
 
     Args:
@@ -187,7 +187,7 @@ def doubt_baseline(ahead: bool, angle_deg: float, sigmas: Sigmas | None) -> list
         sigmas: Of the model.
     """
     if sigmas is None:
-        return ["how exact the poses are cannot be told: their adjustment is degenerate"]
+        return ["how exact the poses are is unknown: their adjustment is degenerate"]
     notes: list[str] = []
     if ahead or sigmas.depth > UNSURE_DEPTH or sigmas.position > UNSURE_POSITION:
         notes.append(

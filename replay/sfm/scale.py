@@ -12,7 +12,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.bundle.floor import floor_height
+from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.drivers.poses.config import BoardPoses

@@ -173,7 +173,7 @@ class _PoseFlood:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.bind(endpoint)
         stack.callback(self._socket.close)
-        self._source = stack.enter_context(TopicPoseSource(TopicPoses(endpoint=endpoint, wait_s=ANSWER_S)))
+        self._source = stack.enter_context(TopicPoseSource(TopicPoses(endpoint=endpoint), ANSWER_S))
         if not self._socket.poll(10_000):
             raise SystemExit("the pose source did not subscribe")
 

@@ -1,7 +1,7 @@
 """How often `fleet compare` calls a fleet worse that is not, and how often it finds one that is, on simulated logs.
 
 A log has 12 stretches of frames and 8 classes of uneven frequency. The result B of a log differs from A by a loss that
-all logs share, by one of its own, and by noise in each stretch and class. Figures come from ``compare_results``, as
+all logs share, by one of its own, and by noise in each stretch and class. Figures come from ``compare_stores``, as
 those of the verb do.
 """
 
@@ -10,19 +10,22 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from semantic_mapper.evaluation.bootstrap import miou_of_counts
-from semantic_mapper.nodes.fleet.compare import GateOptions, compare_results
-from semantic_mapper.nodes.fleet.results import Findings, SegmentRow, TaskResult
+from semantic_mapper.evaluation.bootstrap import class_sums, miou_of_counts
+from semantic_mapper.nodes.fleet.compare import FleetComparison, GateOptions, compare_stores
+from semantic_mapper.nodes.fleet.store import Findings, MethodScores, Store, TaskResult
 from semantic_mapper.types import Float64
 
 CLASSES, STRETCHES = 8, 12
 NAMES = tuple(f"class {n}" for n in range(CLASSES))
 NOISE = 0.03  # spread of the fraction of right pixels of a class in a stretch
 FREQUENCY = np.array([0.35, 0.25, 0.15, 0.1, 0.07, 0.04, 0.03, 0.01])
+_NUMBERS = count()
 
 
 class SimulatedLog:
@@ -49,13 +52,26 @@ class SimulatedLog:
 
 def result(number: int, counts: Float64) -> TaskResult:
     """A result that has stretches alone."""
-    rows = tuple(
-        SegmentRow("replay", 10 * n, 10, NAMES, tuple(int(c) for c in part.ravel())) for n, part in enumerate(counts)
-    )
+    stretches: Any = tuple(tuple(map(tuple, part)) for part in class_sums(counts).astype(int).tolist())
+    scores = MethodScores("replay", {}, NAMES, stretches, tuple(range(STRETCHES)))
+    miou = float(miou_of_counts(counts.sum(axis=0, keepdims=True))[0])
     name = f"{number:05d}"
-    findings = Findings({"miou": float(miou_of_counts(counts.sum(axis=0, keepdims=True))[0])}, segments=rows)
     return TaskResult(
-        name, "replay", name, name, 0, {}, "w", "w", {}, "0", "c", findings, {}, f"results/{name}/1", 1, 1.0, "host", 0
+        key=name,
+        operation="replay",
+        log=name,
+        log_digest=name,
+        log_bytes=0,
+        tags={},
+        weights="",
+        settings={},
+        version="0",
+        findings=Findings({"miou": miou}, scores=(scores,)),
+        files={},
+        folder=f"files/{name}/1",
+        seconds=1.0,
+        node="host",
+        finished_ns=0,
     )
 
 
@@ -87,16 +103,29 @@ def loss_of_points(points: float) -> float:
     return low
 
 
+def compared(results: Iterator[tuple[TaskResult, TaskResult]]) -> FleetComparison:
+    """A fleet before and after, through stores in memory."""
+    number = next(_NUMBERS)
+    before, after = (Store(f"memory://{side}{number}", create=True) for side in "ab")
+    for a, b in results:
+        before.commit(a)
+        after.commit(b)
+    found = compare_stores(before, after, GateOptions())
+    before.remove("results")
+    after.remove("results")
+    return found
+
+
 def rates(fleets: int, logs: int, points: float, own_points: float, first_points: float) -> dict[str, float]:
     """Fractions of simulated fleets that are called worse, as a whole, by the mean and by single logs."""
     losses = [loss_of_points(p) if p else 0.0 for p in (points, own_points, first_points)]
     rng = np.random.default_rng(7)
-    found = [compare_results(pairs(rng, logs, *losses), GateOptions()) for _ in range(fleets)]
+    found = [compared(pairs(rng, logs, *losses)) for _ in range(fleets)]
     by_mean = np.mean([any("mean" in reason for reason in f.reasons) for f in found])
     by_logs = np.mean([f.count("worse") > 0 for f in found])
     named = np.mean([f.count("worse") for f in found]) / logs
     return {
-        "worse": float(np.mean([f.worse for f in found])),
+        "worse": float(np.mean([bool(f.reasons) for f in found])),
         "by_mean": float(by_mean),
         "by_logs": float(by_logs),
         "logs_named": float(named),

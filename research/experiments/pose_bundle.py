@@ -14,8 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +25,7 @@ from research.scenes.pose_noise import drifting_poses
 from semantic_mapper.bundle.refiner import PoseRefiner
 from semantic_mapper.bundle.tracks import follow
 from semantic_mapper.config import PoseRefinerConfig, convert_config
-from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import VisualPoses
 from semantic_mapper.drivers.poses.visual import VisualPoseSource
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error
@@ -139,21 +138,12 @@ def refine(walk: Walk, config: PoseRefinerConfig) -> dict[str, Any]:
     return {**rows, "refined": refined / len(live), "processor_ms": ms}
 
 
-class ListedPoses:
+class ListedPoses(PoseSource):
     """A pose source that reads its poses from a list."""
 
     def __init__(self, poses: dict[int, Float64]) -> None:
+        super().__init__()
         self._poses = poses
-        self.warnings: tuple[str, ...] = ()
-        self.counters: dict[str, int] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Of its stamp."""

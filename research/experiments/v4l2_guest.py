@@ -19,7 +19,7 @@ sys.modules["torch"] = types.ModuleType("torch")  # the library names its types,
 
 from semantic_mapper.drivers.base import Camera  # noqa: E402
 from semantic_mapper.drivers.registry import find_cameras, open_camera  # noqa: E402
-from semantic_mapper.drivers.v4l2 import ioctls, paths  # noqa: E402
+from semantic_mapper.drivers.v4l2 import devices, ioctls  # noqa: E402
 from semantic_mapper.errors import CameraError  # noqa: E402
 
 DRIVER = Path("/sys/bus/platform/drivers/vivid")
@@ -33,7 +33,7 @@ def _link_camera() -> Path:
     """What udev does: the camera's name leads to where it is now."""
     LINKS.mkdir(parents=True, exist_ok=True)
     LINK.unlink(missing_ok=True)
-    node = paths.video_nodes()[-1]
+    node = devices.video_nodes()[-1]
     LINK.symlink_to(node)
     return node
 
@@ -150,7 +150,7 @@ def _check_unplugged_and_back_under_another_index() -> None:
         _until(lambda: any("waited for since" in t for t in camera.warnings), str(camera.warnings))
         print(camera.warnings)
         (DRIVER / "bind").write_text("vivid.0")
-        _until(lambda: bool(paths.video_nodes()), "no node")
+        _until(lambda: bool(devices.video_nodes()), "no node")
         node = _link_camera()
         back_ns = time.monotonic_ns()
         after = next(i for i in images if i.stamp_ns > back_ns)
@@ -170,7 +170,7 @@ def _check_the_disconnect_control() -> None:
         _until(lambda: any("waited for since" in t for t in camera.warnings), str(camera.warnings))
         (DRIVER / "unbind").write_text("vivid.0")
         (DRIVER / "bind").write_text("vivid.0")
-        _until(lambda: bool(paths.video_nodes()), "no node")
+        _until(lambda: bool(devices.video_nodes()), "no node")
         _link_camera()
         back_ns = time.monotonic_ns()
         next(i for i in images if i.stamp_ns > back_ns)

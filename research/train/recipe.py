@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ from typing import Any
 import torch
 
 import semantic_mapper
-from semantic_mapper.nodes.fleet.code_version import git_revision
 
 _PACKAGE = Path(semantic_mapper.__file__).resolve().parent
 
@@ -42,3 +42,24 @@ def rooms_before(origins: Sequence[Mapping[str, Any]]) -> int:
     """
     recipes = [origin["recipe"] for origin in origins]
     return sum(int(recipe.get("rooms", 0)) + rooms_before(recipe.get("origins", ())) for recipe in recipes)
+
+
+def git_revision(package: Path) -> str | None:
+    """Commit of the checkout whose top folder holds ``package``, with "-dirty" where files differ from it.
+
+    None where the package is installed rather than checked out, or where git is missing.
+    """
+    top = _git(package, "rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != package.parent:
+        return None
+    return _git(package, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False, timeout=30
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

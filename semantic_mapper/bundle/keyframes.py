@@ -9,7 +9,7 @@ import numpy as np
 
 from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, reprojection_errors
 from semantic_mapper.bundle.tracks import Tracks
-from semantic_mapper.geometry import camera_matrix, invert_pose, project, transform
+from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose, project, transform
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, Int64
 
 _LEAST_PARALLAX = np.radians(1.0)  # between the rays that a point is found from
@@ -88,11 +88,9 @@ class KeyframeMap:
             return None
         rows = np.asarray(inliers, np.int64).ravel()
         turn, shift = cv2.solvePnPRefineLM(points[rows], pixels[rows], K, None, turn, shift)
-        T_camera_world = np.eye(4)
-        T_camera_world[:3, :3], T_camera_world[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
         off = np.ones(len(points), bool)
         off[rows] = False
-        return invert_pose(T_camera_world), tracks.ids[mask][off]
+        return invert_pose(make_pose(turn, shift)), tracks.ids[mask][off]
 
     def wants_keyframe(self, tracks: Tracks) -> bool:
         """Whether a frame that sees these corners should become the next keyframe."""

@@ -15,11 +15,18 @@ import cv2
 import numpy as np
 
 from semantic_mapper.bundle.adjustment import adjust_bundle
-from semantic_mapper.bundle.floor import floor_height
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap, triangulate
+from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
-from semantic_mapper.geometry import camera_matrix, interpolate_pose, invert_pose, scale_intrinsics, transform
+from semantic_mapper.geometry import (
+    camera_matrix,
+    interpolate_pose,
+    invert_pose,
+    make_pose,
+    scale_intrinsics,
+    transform,
+)
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 _LEAST_POINTS = 15  # that must agree on a picture's pose
@@ -210,9 +217,9 @@ class VisualOdometry:
         tracks = self._tracker.replenish()
         number = self._map.keyframes[-1].number + 1
         self._map.add(Keyframe(number, tracks, pose, pose, sigmas))
-        asked = self._map.problem()
-        if asked is not None:
-            self._map.apply(*asked, adjust_bundle(asked[0], _ITERATIONS))
+        problem = self._map.problem()
+        if problem is not None:
+            self._map.apply(*problem, adjust_bundle(problem[0], _ITERATIONS))
         pose = self._map.keyframes[-1].T_world_camera
         self._places.append(self._place(image, self._map.keyframes[-1].tracks, pose))
         if len(self._places) > self._max_places:
@@ -358,8 +365,6 @@ def _match(
         return None
     rows = np.asarray(inliers, np.int64).ravel()
     turn, shift = cv2.solvePnPRefineLM(place.points[theirs[rows]], pixels[ours[rows]], K, None, turn, shift)
-    T_camera_world = np.eye(4)
-    T_camera_world[:3, :3], T_camera_world[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
     ids = place.tracks.ids[theirs[rows]]
     order = np.argsort(ids)
-    return invert_pose(T_camera_world), Tracks(ids[order], pixels[ours[rows]][order])
+    return invert_pose(make_pose(turn, shift)), Tracks(ids[order], pixels[ours[rows]][order])

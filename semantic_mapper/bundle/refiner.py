@@ -13,7 +13,7 @@ from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.errors import FrameError
-from semantic_mapper.geometry import invert_pose, rotation_vector, scale_intrinsics, transform
+from semantic_mapper.geometry import invert_pose, nearest_pose, pose_distance, scale_intrinsics, transform
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 _LEAST_POINTS = 20  # that must agree on a frame's pose
@@ -25,7 +25,7 @@ _LEAST_SIGMAS = 0.05  # of it where they fit the pictures as well as refined one
 _MISFIT_FRAMES = 30  # that this is judged by; from a third of them on
 _SCALE_SIGMA = 0.05  # of refined poses, before they are compared with given ones
 _CORRELATED = 5.0  # keyframes whose given poses share an error
-_CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not told
+_CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not reported
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ class RefinedPose:
 
 @dataclass(slots=True, eq=False)
 class _Frame:
-    """A frame whose pose may still change: where it is relative to its keyframe, and what was told last.
+    """A frame whose pose may still change: where it is relative to its keyframe, and what was reported last.
 
     ``tracks`` are of a frame that no points were known for yet: None of all others.
     """
@@ -56,7 +56,7 @@ class _Frame:
     key: tuple[str, int]
     keyframe: Keyframe
     T_keyframe_camera: Float64
-    told: Float64
+    reported: Float64
     tracks: Tracks | None
 
 
@@ -92,9 +92,9 @@ class PoseRefiner:
         intrinsics, points = self._start(frame)
         self._collect(wait=False)
         image = prepare_image(frame.rgb, intrinsics.width, intrinsics.height)
-        given = _rigid(frame.T_world_camera)
+        given = nearest_pose(frame.T_world_camera)
         self._sigma_m = self._sigmas(frame)[0]
-        guess = _rigid(self._refined @ invert_pose(self._given) @ given) if self._count else given
+        guess = nearest_pose(self._refined @ invert_pose(self._given) @ given) if self._count else given
         expected = points.predict(self._tracker.tracks, self._refined, guess)
         tracks = self._tracker.advance(image, expected)
         pose, refined = self._locate(points, tracks, guess, self._sigmas(frame))
@@ -117,7 +117,7 @@ class PoseRefiner:
     def corrections(self) -> dict[tuple[str, int], Float64]:
         """Better poses T_world_camera (4, 4) of earlier frames, by camera and stamp, since the last call.
 
-        A frame is told of again while its keyframe is in the window, wherever its pose changed by 1 mm or 0.03 degrees.
+        A frame is reported again while its keyframe is in the window, where its pose changed by 1 mm or 0.03 degrees.
         """
         self._collect(wait=False)
         changed: dict[tuple[str, int], Float64] = {}
@@ -126,9 +126,9 @@ class PoseRefiner:
         for frame in self._frames:
             self._locate_late(frame)
             pose = frame.keyframe.T_world_camera @ frame.T_keyframe_camera
-            moved = invert_pose(frame.told) @ pose
-            if np.linalg.norm(moved[:3, 3]) > _CORRECTED_M or np.linalg.norm(rotation_vector(moved)) > _CORRECTED_RAD:
-                changed[frame.key] = frame.told = pose
+            moved_m, turned = pose_distance(frame.reported, pose)
+            if moved_m > _CORRECTED_M or turned > _CORRECTED_RAD:
+                changed[frame.key] = frame.reported = pose
             if frame.keyframe.number in alive:
                 kept.append(frame)
         self._frames = kept
@@ -151,7 +151,7 @@ class PoseRefiner:
     @property
     def scale_spread(self) -> float:
         """One sigma of the scale of refined poses and of what is computed from them, a fraction: the error of given
-        poses against the extent of the path that they tell it from. Infinite before the camera has moved."""
+        poses against the extent of the path that it comes from. Infinite before the camera has moved."""
         _, given = self._keyframe_poses()
         if not len(given):
             return np.inf
@@ -199,9 +199,8 @@ class PoseRefiner:
         if found is None:
             return guess, False
         pose, wrong = found
-        off = invert_pose(guess) @ pose  # against the given motion since the frame before
-        metres, radians = sigmas
-        if np.hypot(np.linalg.norm(off[:3, 3]) / metres, np.linalg.norm(rotation_vector(off)) / radians) > _MAX_SIGMAS:
+        moved_m, turned = pose_distance(guess, pose)  # against the given motion since the frame before
+        if np.hypot(moved_m / sigmas[0], turned / sigmas[1]) > _MAX_SIGMAS:
             return guess, False
         self._tracker.drop(wrong)
         return pose, True
@@ -219,13 +218,13 @@ class PoseRefiner:
         """Bundle now, or in the worker where that is free."""
         if self._pending is not None:
             return
-        asked = points.problem()
-        if asked is None:
+        problem = points.problem()
+        if problem is None:
             return
         if self._worker is None:
-            self._apply(*asked, adjust_bundle(asked[0], _ITERATIONS))
+            self._apply(*problem, adjust_bundle(problem[0], _ITERATIONS))
         else:
-            self._pending = (*asked, self._worker.submit(adjust_bundle, asked[0], _ITERATIONS))
+            self._pending = (*problem, self._worker.submit(adjust_bundle, problem[0], _ITERATIONS))
 
     def _collect(self, wait: bool) -> None:
         if self._pending is not None and (wait or self._pending[3].done()):
@@ -262,11 +261,11 @@ def align_poses(moved: Float64, to: Float64) -> tuple[Float64, float]:
     their places p, ``scale * T[:3, :3] @ p + T[:3, 3]``.
 
     Unlike a fit of places alone it is sure of the rotation where the camera has moved little, or straight on. The scale
-    is near 1 where the places do not tell it: where what is left of their distances is large beside the path.
+    is near 1 where the places do not show it: where what is left of their distances is large against the path.
     """
     T = np.eye(4)
     T[:3, :3] = np.einsum("kij,klj->il", to[:, :3, :3], moved[:, :3, :3])
-    T = _rigid(T)
+    T = nearest_pose(T)
     middle, to_middle = moved[:, :3, 3].mean(axis=0), to[:, :3, 3].mean(axis=0)
     a, b = (moved[:, :3, 3] - middle) @ T[:3, :3].T, to[:, :3, 3] - to_middle
     extent = float((a * a).sum())
@@ -278,11 +277,3 @@ def align_poses(moved: Float64, to: Float64) -> tuple[Float64, float]:
         scale += (fit - 1) * _SCALE_SIGMA**2 / (_SCALE_SIGMA**2 + variance)
     T[:3, 3] = to_middle - scale * T[:3, :3] @ middle
     return T, scale
-
-
-def _rigid(T: Float64) -> Float64:
-    """The nearest rigid transform: given rotations are exact to three digits only, and errors would add up."""
-    u, _, vt = np.linalg.svd(T[:3, :3])
-    exact = T.copy()
-    exact[:3, :3] = u @ vt
-    return exact

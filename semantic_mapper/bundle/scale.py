@@ -1,4 +1,4 @@
-"""How long a unit of a map without scale is, from coarse poses in metres over a long way."""
+"""How long a unit of a map without scale is: from coarse poses in metres over a long way, or by the floor."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ from semantic_mapper.types import Float64
 _STEP_M = 0.2  # ways are compared over at least so much, so that a reference's jitter does not add to them
 _FIRST_M = 0.6  # of way, for a first scale
 _WINDOW_M = 4.0  # of way that the scale is taken over
-_MAX_RATIO = 3.0  # a way that differs so much from the others tells of a slip or a jump
+_MAX_RATIO = 3.0  # a way that differs so much from the others means a slip or a jump
+
+_BINS = 60
+_STRONG = 0.2  # of the strongest layer below the camera: the lowest layer that is as strong is the floor
+_LEAST_POINTS = 20
+_MOST_BELOW, _MARGIN = 0.03, 0.1  # fraction of the points further below it than this part of the camera's height
 
 
 @dataclass(slots=True)
 class _Way:
-    """The same way in both worlds."""
+    """The same way in the map and in the reference."""
 
     metres: float
     units: float
@@ -67,3 +72,28 @@ class ScaleEstimator:
         middle = float(np.median([w.metres / w.units for w in ways]))
         kept = [w for w in ways if 1 / _MAX_RATIO < w.metres / w.units / middle < _MAX_RATIO]
         return sum(w.metres for w in kept) / sum(w.units for w in kept)
+
+
+def floor_height(z: Float64, camera_z: float) -> float | None:
+    """z of the floor: the lowest strong layer of points below the camera; None if no floor is found.
+
+    Args:
+        z: (N,) of points.
+        camera_z: Of the cameras that see them, the median.
+    """
+    below = z[z < camera_z]
+    if len(below) < _LEAST_POINTS:
+        return None
+    low = float(np.percentile(below, 0.5))
+    counts, edges = np.histogram(below, bins=_BINS, range=(low - 1e-6, camera_z))
+    summed = np.convolve(counts, (1, 1, 1), mode="same")  # a layer lies across bins
+    strong = np.flatnonzero(summed >= max(_LEAST_POINTS, _STRONG * summed.max()))
+    if not len(strong):
+        return None
+    at = int(strong[0])
+    while at + 1 < len(summed) and summed[at + 1] > summed[at]:  # to the top of this layer
+        at += 1
+    near = below[(below >= edges[max(at - 1, 0)]) & (below <= edges[min(at + 2, len(edges) - 1)])]
+    floor = float(np.median(near))
+    deep = floor - _MARGIN * (camera_z - floor)
+    return floor if (below < deep).mean() < _MOST_BELOW else None  # a bed or a table

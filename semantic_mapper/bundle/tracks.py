@@ -13,7 +13,7 @@ _WINDOW = (21, 21)  # pixels that a corner is compared by
 _CONTRAST_WINDOW = 0.1  # of the width; each pixel has the mean and spread of such a square around it taken away
 _CONTRAST_NOISE = 4.0  # of 255; what varies less stays flat
 _CONTRAST_GAIN = 40.0  # grey levels a spread
-_LEVELS = 3  # of the pyramid, beside the image itself
+_LEVELS = 3  # of the pyramid, next to the image itself
 _STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
 _BACK_PX = 0.7  # followed forth and back, a corner must come so near to where it was
 _QUALITY = 0.005  # of a corner, against the best one of the image
@@ -140,7 +140,7 @@ class Tracker:
 
 
 def _on_epipolar_lines(before: Float64, after: Float64, good: np.ndarray) -> np.ndarray:
-    """(N,) whether corners move as a still scene does; all of them where too few are there to tell."""
+    """(N,) whether corners move as a still scene does; all of them where there are too few to judge."""
     fits = np.ones(len(before), bool)
     if good.sum() >= _EPIPOLAR_LEAST:
         cv2.setRNGSeed(1)

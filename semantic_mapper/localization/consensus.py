@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semantic_mapper.geometry import invert_pose, rotation_vector, transform
+from semantic_mapper.geometry import invert_pose, pose_distance, transform
 from semantic_mapper.types import Float64
 
 AGREEING = 3  # frames that must say the same
@@ -96,7 +96,7 @@ def _largest_group(seen: Sequence[Sighting]) -> list[Sighting]:
 
 def _agree(a: Sighting, b: Sighting) -> bool:
     for pose in (a.T_world_camera, b.T_world_camera):
-        apart = invert_pose(a.T_map_world @ pose) @ (b.T_map_world @ pose)
-        if np.linalg.norm(apart[:3, 3]) > _SAME_M or np.linalg.norm(rotation_vector(apart)) > _SAME_RAD:
+        moved_m, turned = pose_distance(a.T_map_world @ pose, b.T_map_world @ pose)
+        if moved_m > _SAME_M or turned > _SAME_RAD:
             return False
     return True

@@ -12,19 +12,27 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from semantic_mapper.geometry import invert_pose, nearest_pixels, scale_intrinsics, transform, unproject
+from semantic_mapper.geometry import (
+    invert_pose,
+    make_pose,
+    nearest_pixels,
+    nearest_pose,
+    scale_intrinsics,
+    transform,
+    unproject,
+)
+from semantic_mapper.localization.depth_alignment import Level, make_level
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, UInt8
 
 _WIDTH = 160  # of both depth images
 _POINTS = 5000  # of the frame that are aligned, at most
 _ROUNDS, _STEPS = 3, 6  # ray casts, and steps on each
 _REACH_M = (0.15, 0.08, 0.05)  # in each round: points further from the map's surface do not pull
-_POINTS_A_VOTE = 10  # neighbouring points have the same error: that many tell as much as one
+_POINTS_A_VOTE = 10  # neighbouring points have the same error: that many count as one
 _DEPTH_SIGMA_M = 0.01
 _FEATURE_SIGMA_PX = 8.0
 _HUBER = 2.0  # in sigmas
 _AWAY_M = 0.5  # further from the first guess the alignment has lost it
-_EDGE = 0.05  # neighbours whose depths differ by more than this fraction are of two surfaces
 _TOLERANCE_M, _TOLERANCE = 0.04, 0.025  # depths agree within the sum of both, the second as a fraction of the depth
 
 
@@ -120,14 +128,16 @@ def align_depth(
     points = points[:: max(1, len(points) // _POINTS)]
     pose = T_world_camera
     for number in range(_ROUNDS):
-        view = surface.ray_cast(pose, intrinsics).depth_m
-        target, normals = _points_and_normals(view, intrinsics)
+        view = make_level(surface.ray_cast(pose, intrinsics).depth_m, intrinsics)
         T_world_view = pose
         for _ in range(_STEPS):
-            change = _step(points, target, normals, T_world_view, intrinsics, pose, _REACH_M[number])
-            change += _landmark_step(landmarks, frame_intrinsics, pose)
-            twist = np.linalg.solve(change.normal + 1e-6 * np.eye(6), -change.gradient).astype(np.float64)
-            pose = _moved(pose, twist)
+            by_depth = _step(points, view, T_world_view, pose, _REACH_M[number])
+            by_features = _landmark_step(landmarks, frame_intrinsics, pose)
+            normal, gradient = (a + b for a, b in zip(by_depth, by_features, strict=True))
+            twist = np.linalg.solve(normal + 1e-6 * np.eye(6), -gradient).astype(np.float64)
+            turned = make_pose(twist[:3], (0, 0, 0)) @ pose
+            turned[:3, 3] = pose[:3, 3] + twist[3:]
+            pose = nearest_pose(turned)
             away = np.linalg.norm(pose[:3, 3] - T_world_camera[:3, 3])
             if not away < _AWAY_M:  # NaN, too
                 return None
@@ -152,7 +162,7 @@ def compare_depth(
     both = measured & (view.depth_m > 0)
     gap = depth_m - view.depth_m
     limit = _TOLERANCE_M + _TOLERANCE * view.depth_m
-    # Beside an edge a pixel may show either surface: it contradicts only where no neighbour of the map's agrees.
+    # Next to an edge a pixel may show either surface: it contradicts only where no neighbour of the map's agrees.
     near = _any_neighbour_agrees(depth_m, view.depth_m)
     agree = both & (near | (np.abs(gap) < limit))
     count = max(int(both.sum()), 1)
@@ -175,41 +185,31 @@ def compare_depth(
     )
 
 
-@dataclass(slots=True, eq=False)
-class _Normal:
-    normal: Float64  # (6, 6)
-    gradient: Float64  # (6,)
-
-    def __add__(self, other: _Normal) -> _Normal:
-        return _Normal(self.normal + other.normal, self.gradient + other.gradient)
-
-
 def _step(
     points: Float64,
-    target: Float64,
-    normals: Float64,
+    view: Level,
     T_world_view: Float64,
-    intrinsics: CameraIntrinsics,
     pose: Float64,
     reach_m: float,
-) -> _Normal:
-    """Point-to-plane, for a turn about the camera and a shift, both in the world's axes."""
-    arm = points @ pose[:3, :3].T
-    world = arm + pose[:3, 3]
-    inside, rows, columns = nearest_pixels(transform(invert_pose(T_world_view), world), intrinsics)
-    there, facing = target[rows, columns], normals[rows, columns]
+) -> tuple[Float64, Float64]:
+    """Normal matrix (6, 6) and gradient (6,) of points to planes, for a turn about the camera and a shift, both in the
+    world's axes."""
+    lever = points @ pose[:3, :3].T
+    world = lever + pose[:3, 3]
+    inside, rows, columns = nearest_pixels(transform(invert_pose(T_world_view), world), view.intrinsics)
+    there, facing = (a[rows, columns].astype(np.float64) for a in (view.points, view.normals))
     use = inside & np.isfinite(facing[:, 0])
     n = facing[use] @ T_world_view[:3, :3].T
     gap = ((world[use] - transform(T_world_view, there[use])) * n).sum(axis=1)
     near = np.abs(gap) < reach_m
-    gap, n, arm = gap[near], n[near], arm[use][near]
+    gap, n, lever = gap[near], n[near], lever[use][near]
     weight = _huber(gap / _DEPTH_SIGMA_M) / (_DEPTH_SIGMA_M**2 * _POINTS_A_VOTE)
-    j = np.concatenate((np.cross(arm, n), n), axis=1)
-    return _Normal((j * weight[:, None]).T @ j, (j * (weight * gap)[:, None]).sum(axis=0))
+    j = np.concatenate((np.cross(lever, n), n), axis=1)
+    return (j * weight[:, None]).T @ j, (j * (weight * gap)[:, None]).sum(axis=0)
 
 
-def _landmark_step(landmarks: Landmarks, intrinsics: CameraIntrinsics, pose: Float64) -> _Normal:
-    """Of the distances in the image."""
+def _landmark_step(landmarks: Landmarks, intrinsics: CameraIntrinsics, pose: Float64) -> tuple[Float64, Float64]:
+    """The same of the distances in the image."""
     seen = transform(invert_pose(pose), landmarks.points)
     front = seen[:, 2] > 0.05
     x, y, z = seen[front].T
@@ -224,42 +224,16 @@ def _landmark_step(landmarks: Landmarks, intrinsics: CameraIntrinsics, pose: Flo
         axis=1,
     )  # (K, 2, 3) of the point in the camera's axes
     by_world = by_point @ pose[:3, :3].T
-    arm = landmarks.points[front] - pose[:3, 3]
-    # A turn w of the camera moves the point in its axes as -w x arm in the world's, a shift t as -t.
-    by_turn = -np.cross(np.broadcast_to(arm[:, None], by_world.shape), by_world)
+    lever = landmarks.points[front] - pose[:3, 3]
+    # A turn w of the camera moves the point in its axes as -w x lever in the world's, a shift t as -t.
+    by_turn = -np.cross(np.broadcast_to(lever[:, None], by_world.shape), by_world)
     j = np.concatenate((by_turn, -by_world), axis=2).reshape(-1, 6)
     weight = _huber(off / _FEATURE_SIGMA_PX) / _FEATURE_SIGMA_PX**2
-    return _Normal((j * weight[:, None]).T @ j, (j * (weight * off)[:, None]).sum(axis=0))
+    return (j * weight[:, None]).T @ j, (j * (weight * off)[:, None]).sum(axis=0)
 
 
 def _huber(sigmas: Float64) -> Float64:
     return np.minimum(1.0, _HUBER / np.maximum(np.abs(sigmas), 1e-9))
-
-
-def _moved(pose: Float64, twist: Float64) -> Float64:
-    moved = pose.copy()
-    moved[:3, :3] = np.asarray(cv2.Rodrigues(twist[:3])[0], np.float64) @ pose[:3, :3]
-    moved[:3, 3] += twist[3:]
-    u, _, vt = np.linalg.svd(moved[:3, :3])
-    moved[:3, :3] = u @ vt
-    return moved
-
-
-def _points_and_normals(depth_m: Float32, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64]:
-    """(H, W, 3) points and unit normals in the camera's axes; normals are NaN beside edges and misses."""
-    points = unproject(depth_m, intrinsics)
-    normals = np.full_like(points, np.nan)
-    across = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    middle = depth_m[1:-1, 1:-1]
-    whole = (middle > 0) & (np.abs(across[..., 2]) < _EDGE * middle) & (np.abs(down[..., 2]) < _EDGE * middle)
-    square = np.cross(across, down)
-    length = np.linalg.norm(square, axis=-1)
-    whole &= length > 0
-    square[whole] /= length[whole][:, None]
-    square[~whole] = np.nan
-    normals[1:-1, 1:-1] = square
-    return points, normals
 
 
 def _any_neighbour_agrees(depth_m: Float32, map_m: Float32) -> Bool:

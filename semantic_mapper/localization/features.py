@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.geometry import camera_matrix, invert_pose
+from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 Matches = NDArray[np.int64]
@@ -129,9 +129,7 @@ def pose_from_points(
         turn,
         shift,
     )
-    T_camera_points = np.eye(4)
-    T_camera_points[:3, :3] = cv2.Rodrigues(turn)[0]
-    T_camera_points[:3, 3] = np.ravel(shift)
+    T_camera_points = make_pose(turn, shift)
     if not np.isfinite(T_camera_points).all():
         return None
     return invert_pose(T_camera_points), chosen

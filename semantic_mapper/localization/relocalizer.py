@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from semantic_mapper.geometry import invert_pose, project, rotation_vector, transform
+from semantic_mapper.geometry import invert_pose, pose_distance, project, transform
 from semantic_mapper.localization.depth_fit import (
     DepthFit,
     Landmarks,
@@ -42,44 +42,27 @@ _GROUP = 4  # at most
 _REPROJECTION = 4.0 / 525.0  # of the focal length
 _SUPPORT = 8.0 / 525.0  # how far a feature may be from where the aligned pose has it: that fits the depth first
 _LEAST_DEPTH = 0.1  # fraction of the pixels
-_TRIED = 3  # poses that the map is asked about
+_TRIED = 3  # poses that are compared with the map
 _FAR_M = 10.0  # from the place that it is about, no pose is believed
 _REACH_M = 1.5  # places whose views are this near may show what the frame shows; a radian counts like a metre
 _DEPTH_M, _DEPTH = 0.06, 0.04  # by which the depths of a feature may differ
 _ALIKE = 0.75 * 512.0  # distance of descriptors
-_APART_M, _FLAT = 0.3, 0.8  # features that tell sizes are so far apart, most of it across the view
+_APART_M, _FLAT = 0.3, 0.8  # features that sizes are measured by are so far apart, most of it across the view
 _PAIRS = 30  # of such features, at least
 _SAME_M, _SAME_RAD = 0.3, np.deg2rad(10.0)  # poses further apart are two
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What a pose must show to be believed.
-
-    Set by views of 26 rooms (``research.experiments.relocalization``): in the mirrored room a symmetric shelf or
-    bed has up to 167 features for it; then 0.94 of the depth agrees at most, with a likeness of 0.6. In the room
-    itself likeness is 0.79 or more in all but one of 500.
-
-    Args:
-        min_inliers: Features that agree on the pose.
-        min_spread: Their standard deviation in the image, as a fraction of its diagonal.
-        min_overlap, min_agree, min_likeness, min_classes: See ``DepthFit``.
-        sure_inliers: With fewer features than these, the depth has to agree by ``sure_agree``.
-        max_rival: Features of another pose, as a fraction of those of the best.
-        max_stretch: By which fraction sizes across the view may differ from the map's. In the kitchen it is 1 % at
-            most; a focal length that is 15 % too long makes it 11 %.
-    """
-
-    min_inliers: int = 12
-    min_spread: float = 0.08
-    min_overlap: float = 0.4
-    min_agree: float = 0.85
-    min_likeness: float = 0.75
-    min_classes: float = 0.4
-    sure_inliers: int = 40
-    sure_agree: float = 0.92
-    max_rival: float = 0.6
-    max_stretch: float = 0.05
+# What a pose must show to be believed. Set by views of 26 rooms: in the mirrored room a symmetric shelf or bed has up
+# to 167 features for it; then 0.94 of the depth agrees at most, with a likeness of 0.6. In the room itself likeness is
+# 0.79 or more in all but one of 500.
+MIN_INLIERS = 12  # features that agree on the pose
+MIN_SPREAD = 0.08  # their standard deviation in the image, as a fraction of its diagonal
+MIN_OVERLAP, MIN_AGREE, MIN_LIKENESS, MIN_CLASSES = 0.4, 0.85, 0.75, 0.4  # see ``DepthFit``
+SURE_INLIERS, SURE_AGREE = 40, 0.92  # with fewer features than these, the depth has to agree by so much
+MAX_RIVAL = 0.6  # features of another pose, as a fraction of those of the best
+# By which fraction sizes across the view may differ from the map's. In a real kitchen it is 1 % at most; a focal length
+# that is 15 % too long makes it 11 %.
+MAX_STRETCH = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,16 +123,12 @@ class Relocalizer:
         places: What the map keeps to find itself by.
         surface: The map.
         ignore_id: Of its classes.
-        limits: What is believed.
     """
 
-    def __init__(
-        self, places: Sequence[Place], surface: MapSurface, ignore_id: int = 255, limits: Limits = Limits()
-    ) -> None:
+    def __init__(self, places: Sequence[Place], surface: MapSurface, ignore_id: int = 255) -> None:
         self._places = places
         self._surface = surface
         self._ignore_id = ignore_id
-        self._limits = limits
         self._index = PlaceIndex(max(1, len(places)))
         for number, place in enumerate(places):
             self._index.add_descriptors(number, place.descriptors)
@@ -202,45 +181,45 @@ class Relocalizer:
     def check_classes(
         self, found: Relocalized, rgb: UInt8, depth_m: Float32, intrinsics: CameraIntrinsics, label: UInt8
     ) -> Relocalized | NotFound:
-        """Doubt a frame that was found, where its classes are not the map's; arguments as of ``find``."""
+        """Refuse a frame that was found, where its classes are not the map's; arguments as of ``find``."""
         depth, small = small_depth(depth_m, intrinsics)
         fit = compare_depth(self._surface, depth, small, rgb, found.T_map_camera, label, self._ignore_id)
-        if fit.classes < self._limits.min_classes:  # false for NaN
+        if fit.classes < MIN_CLASSES:  # false for NaN
             return NotFound("classes", _other_classes(fit), found.T_map_camera, found.inliers, fit)
         return replace(found, fit=fit)
 
     def _refusal(
         self, best: _Tried, tried: list[_Tried], depth_m: Float32, intrinsics: CameraIntrinsics
     ) -> tuple[Reason, str] | None:
-        limits, fit, count = self._limits, best.fit, len(best.support.points)
-        if count < limits.min_inliers:
-            return "few-features", f"{count} features agree on a pose, {limits.min_inliers} have to"
+        fit, count = best.fit, len(best.support.points)
+        if count < MIN_INLIERS:
+            return "few-features", f"{count} features agree on a pose, {MIN_INLIERS} have to"
         diagonal = float(np.hypot(intrinsics.width, intrinsics.height))
-        if float(np.sqrt(best.support.pixels.var(axis=0).sum())) < limits.min_spread * diagonal:
+        if float(np.sqrt(best.support.pixels.var(axis=0).sum())) < MIN_SPREAD * diagonal:
             return "few-features", "the features that agree on a pose are all of one small thing"
         size = _relative_size(best.guess.landmarks, depth_m, intrinsics)
-        if abs(size - 1) > limits.max_stretch:  # false for NaN
+        if abs(size - 1) > MAX_STRETCH:  # false for NaN
             return "calibration", (
                 f"the frame shows things {size:.2f} times as large as the map has them: focal length or depth is wrong"
             )
-        sure = count >= limits.sure_inliers
-        if fit.overlap < limits.min_overlap or fit.agree < (limits.min_agree if sure else limits.sure_agree):
+        sure = count >= SURE_INLIERS
+        if fit.overlap < MIN_OVERLAP or fit.agree < (MIN_AGREE if sure else SURE_AGREE):
             return "contradicted", (
                 f"{fit.overlap:.0%} of the depth shows what the map has, and {fit.agree:.0%} of that agrees "
                 f"({fit.through:.0%} sees through it, {fit.before:.0%} stands before it)"
             )
-        if fit.likeness < limits.min_likeness:
+        if fit.likeness < MIN_LIKENESS:
             return "looks-different", f"brightness of frame and map correlate by {fit.likeness:.2f} only"
-        if fit.classes < limits.min_classes:  # false for NaN
+        if fit.classes < MIN_CLASSES:  # false for NaN
             return "classes", _other_classes(fit)
         rival = max((len(t.support.points) for t in tried[1:] if not _same(t.pose, best.pose)), default=0)
-        if rival > limits.max_rival * count:
+        if rival > MAX_RIVAL * count:
             return "ambiguous", f"another pose has {rival} features for it, this one {count}"
         return None
 
     def _support(self, features: Features, pose: Float64, intrinsics: CameraIntrinsics) -> Landmarks:
         """Features of a frame that the places round its pose have where they must be: at that pixel and depth."""
-        apart = [_apart_m(p.T_world_camera, pose) for p in self._places]
+        apart = [sum(pose_distance(p.T_world_camera, pose)) for p in self._places]
         near = [i for i in np.argsort(apart, kind="stable")[:_GROUP] if apart[i] < _REACH_M]
         if not near or not len(features.pixels):
             return Landmarks(np.zeros((0, 3)), np.zeros((0, 2)))
@@ -262,7 +241,7 @@ class Relocalizer:
         return Landmarks(points[best[alike]], features.pixels[alike])
 
     def _guesses(self, features: Features, intrinsics: CameraIntrinsics) -> list[_Guess]:
-        """Poses that features tell of, those with the most of them first."""
+        """Poses that features lead to, those with the most of them first."""
         ranked = [key for key, _ in self._index.candidates(features, _CANDIDATES)]
         pairs = {key: match_features(features.descriptors, self._places[key].descriptors) for key in ranked}
         limit_px = _REPROJECTION * intrinsics.fx
@@ -292,7 +271,7 @@ class Relocalizer:
 
 
 def _relative_size(landmarks: Landmarks, depth_m: Float32, intrinsics: CameraIntrinsics) -> float:
-    """Median of distances between features, as the frame has them against those in the map; NaN where too few tell."""
+    """Median of distances between features, in the frame against those in the map; NaN where there are too few."""
     u, v = np.rint(landmarks.pixels).astype(np.intp).T
     z = depth_m[v.clip(0, intrinsics.height - 1), u.clip(0, intrinsics.width - 1)].astype(np.float64)
     x, y = ((landmarks.pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy) * z[:, None]).T
@@ -312,13 +291,8 @@ def _other_classes(fit: DepthFit) -> str:
 
 
 def _within(a: Float64, b: Float64, way_m: float, turn_rad: float) -> bool:
-    apart = invert_pose(a) @ b
-    return bool(np.linalg.norm(apart[:3, 3]) < way_m and np.linalg.norm(rotation_vector(apart)) < turn_rad)
-
-
-def _apart_m(a: Float64, b: Float64) -> float:
-    apart = invert_pose(a) @ b
-    return float(np.linalg.norm(apart[:3, 3]) + np.linalg.norm(rotation_vector(apart)))
+    moved_m, turned = pose_distance(a, b)
+    return moved_m < way_m and turned < turn_rad
 
 
 def _same(a: Float64, b: Float64) -> bool:

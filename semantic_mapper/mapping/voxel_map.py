@@ -438,40 +438,51 @@ class VoxelMap:
         return loaded
 
     def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
-        """A new map of what both have measured, in this map's frame and with its settings; see ``merge``.
+        """A new map of what both have measured, in this map's frame and with its settings; see ``add``."""
+        joined = VoxelMap(self.config, self.label_set)
+        joined.add(self, np.eye(4))
+        joined.add(other, T_self_other)
+        return joined
+
+    def add(self, other: VoxelMap, T_self_other: Float64) -> None:
+        """Add all that another map has measured; see ``merge``.
 
         Where voxels coincide (no rotation but quarter turns, a shift by whole voxels) measurements add up exactly;
-        else those of ``other`` are interpolated.
+        else those of ``other`` are interpolated. After an error of the disk the map holds a part of ``other``.
 
         Args:
-            other: Of the same voxel size, truncation and classes.
+            other: Of the same voxel size, truncation and classes; is read.
             T_self_other: (4, 4) float64, where its frame lies in this map's.
 
         Raises:
-            MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or the new
-                one would grow past ``max_blocks``.
+            MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or this one
+                would grow past ``max_blocks``.
             PoseError: the pose is not a rigid transform.
         """
         check_pose(T_self_other, "merge")
         check_fit(self.config, self.label_set, other.config, other.label_set)
-        require_same_scale(self.scale_known, other.scale_known, "merge")
+        if self.frames:
+            require_same_scale(self.scale_known, other.scale_known, "merge")
         if shared := shared_places(self.places.places, other.places.places):
             raise MapError(
                 f"both maps were made with the same frames ({shared} of their places are of the same ones), which "
                 "would count twice; make one map of all logs instead"
             )
-        joined = VoxelMap(self.config, self.label_set)
-        joined.note_scale(self.scale_known)
-        joined.refined = self.refined or other.refined
-        for place in (*self.places.places, *(moved_place(p, T_self_other) for p in other.places.places)):
-            joined.places.add(place)
         with _KERNEL_LOCK:
-            joined.frames = joined.version = self.frames + other.frames
-            joined.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)
-            transform = voxel_transform(T_self_other, self.config.voxel_size_m)
-            copy_blocks(joined._grid, self._grid, joined.frames)
-            add_blocks(joined._grid, other._grid, transform, self.config.max_weight, joined.frames)
-        return joined
+            version = self.version + other.frames
+            if not self.block_count and (T_self_other == np.eye(4)).all():
+                copy_blocks(self._grid, other._grid, version)
+            else:
+                transform = voxel_transform(T_self_other, self.config.voxel_size_m)
+                add_blocks(self._grid, other._grid, transform, self.config.max_weight, version)
+            self.version = version
+            self.frames += other.frames
+            self.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)
+            self.note_scale(other.scale_known)
+            self.refined = self.refined or other.refined
+            self.instances = None
+            for place in other.places.places:
+                self.places.add(moved_place(place, T_self_other))
 
     def _choose_changes(self, since: int, limit: int, min_weight: float) -> ChosenBlocks:
         _check_min_weight(min_weight)

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from research.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+from tests.drawn_room import truth_of, walk_frames
 
 INTRINSICS = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
 
@@ -15,12 +15,12 @@ INTRINSICS = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
 @cache
 def walk() -> tuple[PosedFrame, ...]:
     """Frames 5 cm apart, and where they truly are."""
-    return tuple(room_frames(TRAIN_SEEDS[7], 30, INTRINSICS, path=CameraPathConfig(step_m=0.05)))
+    return walk_frames(7, 30, INTRINSICS, step_m=0.05)
 
 
 def truth() -> Float64:
     """(N, 4, 4) T_world_camera of the walk."""
-    return np.array([f.T_world_camera for f in walk()])
+    return truth_of(walk())
 
 
 def way_m() -> float:

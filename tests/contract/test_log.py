@@ -67,7 +67,7 @@ def test_a_spoiled_log_is_told_of_and_mended(cut: int, tmp_path: Path) -> None:
     described = api.run_here("info", log, "--json")
     told = json.loads(described.stdout)
     assert told["finished"] == (not cut) and bool(told["damage"]) and described.code == 1
-    assert api.run_here("recover", log, mended).code == 0
+    assert api.run_here("import", log, mended).code == 0
     with api.LogReader(mended) as clean, api.LogReader(LOG) as whole:
         kept, there = {f.seq: plain(f) for f in clean}, {f.seq: plain(f) for f in whole}
         assert clean.finished and not clean.errors and clean.info == whole.info

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.drivers.v4l2 import ioctls, paths
+from semantic_mapper.drivers.v4l2 import devices, ioctls
 from semantic_mapper.drivers.v4l2.ioctls import Control
 
 SELECT_S = 0.15  # how long OpenCV waits for a stream that has stalled; 10 s by default
@@ -183,8 +183,8 @@ def make_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     made = Machine(tmp_path)
     monkeypatch.setattr(ioctls, "fcntl", SimpleNamespace(ioctl=made.ioctl))
     monkeypatch.setattr(cv2, "VideoCapture", made.capture)
-    monkeypatch.setattr(paths, "DEVICES", made.dev)
-    monkeypatch.setattr(paths, "LINKS", (made.by_id,))
+    monkeypatch.setattr(devices, "DEVICES", made.dev)
+    monkeypatch.setattr(devices, "LINKS", (made.by_id,))
     return made
 
 

@@ -9,10 +9,8 @@ import pytest
 
 from semantic_mapper.drivers.calibration import load_calibration, load_mount, save_calibration
 from semantic_mapper.drivers.mounts import mount_of
-from semantic_mapper.drivers.poses.config import FixedPose
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
-from semantic_mapper.drivers.poses.still import FixedPoseSource
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import CameraIntrinsics
 from tests.drivers.poses.images import ListCamera, image, rigid
@@ -82,9 +80,9 @@ def test_poses_of_the_camera_itself_are_left_alone_or_the_mistake_is_told(tmp_pa
                 "kind": "topic",
                 "endpoint": "ipc://x",
                 "T_base_rig": np.eye(4).tolist(),
-                "cameras": {"a": np.eye(4).tolist()},
+                "T_base_camera": T_RIG_CAMERA.tolist(),
             },
-            "give T_base_rig, or else",
+            "give T_base_camera or",
         ),
         ({"kind": "topic", "endpoint": "ipc://x", "T_base_rig": (2 * np.eye(4)).tolist()}, "T_base_rig"),
     ],
@@ -92,9 +90,3 @@ def test_poses_of_the_camera_itself_are_left_alone_or_the_mistake_is_told(tmp_pa
 def test_what_contradicts_itself_is_refused(settings: dict[str, object], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         read_pose_config(settings)
-
-
-def test_without_a_rig_nothing_has_changed() -> None:
-    with PosedCamera(ListCamera([image(5)]), FixedPoseSource(FixedPose(T_world_camera=ROWS))) as camera:
-        (frame,) = camera
-    np.testing.assert_array_equal(frame.T_world_camera, T_RIG_CAMERA)

@@ -16,10 +16,9 @@ import pytest
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
+from semantic_mapper.drivers.live import StreamClock, nominal_hz
 from semantic_mapper.drivers.oak import config as oak_config
 from semantic_mapper.drivers.opencv import list_devices
-from semantic_mapper.drivers.opencv.clock import StreamClock
-from semantic_mapper.drivers.opencv.stream import nominal_hz
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.v4l2 import config as v4l2_config
 from semantic_mapper.errors import CameraError, ConfigError

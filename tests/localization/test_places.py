@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 
-from research.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.localization.features import (
     Features,
@@ -15,6 +14,7 @@ from semantic_mapper.localization.features import (
 )
 from semantic_mapper.localization.places import PlaceIndex
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from tests.drawn_room import walk_frames
 
 INTRINSICS = CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120)
 
@@ -22,8 +22,7 @@ INTRINSICS = CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120)
 @cache
 def walk() -> tuple[PosedFrame, ...]:
     """Every third of 24 frames through a furnished room."""
-    path = CameraPathConfig(step_m=0.08)
-    return tuple(room_frames(TRAIN_SEEDS[7], 24, INTRINSICS, path=path))[::3]
+    return walk_frames(7, 24, INTRINSICS, step_m=0.06)[::3]
 
 
 def features_of(frame: PosedFrame, light: float = 1.0) -> Features:

@@ -251,7 +251,7 @@ def test_top_shows_a_running_launch(watched: Running) -> None:
     os.kill(pid, signal.SIGKILL)
     pid = wait_for_start(watched, "eye", 1)
     for _ in range(20):  # the new process first has to publish
-        done = run("top", sockets, "--once", "--json")
+        done = run("view", "--status", sockets, "--once", "--json")
         assert done.returncode == 0, done.stderr
         shown = json.loads(done.stdout)
         eye = shown["nodes"]["eye"]
@@ -261,14 +261,14 @@ def test_top_shows_a_running_launch(watched: Running) -> None:
     assert eye["counters"]["published"] > 0 and eye["rates_hz"]["published"] > 0 and eye["ages_s"]["frame"] >= 0
     assert "killed by SIGKILL" in eye["degraded"][0] and 0 <= eye["ages_s"]["beat"] < eye["ages_s"]["start"]
     assert shown["launch"]["pid"] == watched.process.pid and shown["launch"]["counters"]["restarts"] == 1
-    table = run("top", f"ipc://{sockets}/launch", "--once").stdout
+    table = run("view", "--status", f"ipc://{sockets}/launch", "--once").stdout
     assert re.search(rf"eye +\w+ +{pid} ", table)
 
 
 @pytest.mark.slow
 def test_top_says_where_there_is_nothing_to_see(tmp_path: Path) -> None:
-    assert "no socket folder of a launch" in error_line(run("top", str(tmp_path), "--once").stderr)
-    assert run("top", "--json").returncode == 2
+    assert "no socket folder of a launch" in error_line(run("view", "--status", str(tmp_path), "--once").stderr)
+    assert run("view", "--status", "--json").returncode == 2
 
 
 def test_systemd_hears_of_start_life_and_end(long_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

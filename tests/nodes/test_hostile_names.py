@@ -90,14 +90,14 @@ def test_names_in_results_maps_and_scores_are_text(hostile: Path, results: Path,
         ("query", results, "class", "[/b]"),
         ("export", results, "--out", tmp_path / "map.ply"),
         ("export", log, "--out", tmp_path / "folder", "--format", "folder"),
-        ("recover", log, tmp_path / "recovered.mcap"),
-        ("correct", results, "--poses", tmp_path / "[/b]\x1b.txt"),
+        ("import", log, tmp_path / "recovered.mcap"),
+        ("query", results, "correct", tmp_path / "[/b]\x1b.txt"),
         ("label", log, "--to", "ipc:///[/b]\x1b"),
         ("finetune", log, "--out", tmp_path / "[/b]" / "w.safetensors", "--weights", tmp_path / "[/b]\x1b"),
         ("merge", results, results, "--out", tmp_path / "merged[/b].npz"),
         ("up", tmp_path / "[/b]\x1b.toml"),
         ("view", tmp_path / "[/b]\x1b.mcap"),
-        ("top", "ipc:///[/b]\x1b"),
+        ("view", "--status", "ipc:///[/b]\x1b"),
     ):
         _, said = run_here(*arguments)
         check_plain(said)

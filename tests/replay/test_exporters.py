@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import rerun.chunk
 from scipy.spatial.transform import Rotation
+from semantic_mapper.nodes.cli.export_log import export_recording
 
 from semantic_mapper.errors import ConfigError, ImportSourceError, LogError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.cli.export_log import export_recording
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.replay.exporters import LogExportReport, LogExportRequest, export_log, log_format_of
 from semantic_mapper.replay.importers import ImportOptions, import_recording

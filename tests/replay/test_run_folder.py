@@ -17,7 +17,7 @@ from semantic_mapper.replay.run_folder import map_path
         ("kitchen.mcap", "no map.npz in this folder; its logs hold frames: `semantic-mapper replay"),
         ("kitchen.npz", "name the map itself, such as"),
         ("run1/map.npz", "there is one in"),
-        ("fleet.json", "no merge into it has finished"),
+        ("fleet.json", "a fleet's store: `fleet merge` fuses its maps"),
     ],
 )
 def test_a_folder_without_a_map_says_what_is_in_it(tmp_path: Path, file: str, says: str) -> None:

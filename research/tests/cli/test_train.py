@@ -103,7 +103,7 @@ def test_ranks_without_ray_and_ray_under_torchrun_are_refused(
 ) -> None:
     done = run("train", "--config", recipe, "--out", tmp_path / "run", "--ranks", "2")
     assert done.returncode == 1 and "need --ray; torchrun has --nproc_per_node" in done.stderr
-    for options in (("--ray", "local"), ("--ranks", "2"), ("--trusted-network",)):
+    for options in (("--ray", "local"), ("--ranks", "2")):
         done = run("train", "--kind", "nesf", "--out", tmp_path / "run", *options)
         assert done.returncode == 1 and "--ray and its options are for fields" in done.stderr
     monkeypatch.setenv("WORLD_SIZE", "2")

@@ -1,4 +1,4 @@
-/* A depth view on another one, point to plane: what one Gauss-Newton step needs; see drivers/poses/alignment.py. */
+/* A depth view on another one, point to plane: what one Gauss-Newton step needs; see localization/depth_alignment.py. */
 #include <string.h>
 
 #include "kernels.h"

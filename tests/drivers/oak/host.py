@@ -21,7 +21,7 @@ from semantic_mapper.types import Float64
 
 WIDTH, HEIGHT, FPS = 64, 48, 50.0
 PERIOD = timedelta(seconds=1 / FPS)
-CONFIG = Config(width=WIDTH, height=HEIGHT, fps=FPS, start_s=10.0, stall_s=5.0, retry_s=0.02, queue=64)
+CONFIG = Config(width=WIDTH, height=HEIGHT, fps=FPS)
 SOCKETS = dai.CameraBoardSocket
 FOCAL, BASE_WIDTH, BASE_HEIGHT = 1000.0, 1280, 960  # of the calibration: twenty times the images
 RGB_IN_LEFT_CM = (3.75, 0.5, -0.25)
@@ -137,7 +137,7 @@ def played(
 def camera(*connections: Callable[[], Sources], config: Config = CONFIG) -> OakCamera:
     """The driver's camera on these sources, one after the other; each may raise a ``CameraError``."""
     rest = list(connections)
-    return OakCamera(config, "front", connect=lambda config, on_state: rest.pop(0)())
+    return OakCamera(config, "front", connect=lambda config, on_state, search_s: rest.pop(0)())
 
 
 def record(folder: Path, count: int) -> timedelta:

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.oak import camera as camera_module
 from semantic_mapper.drivers.oak import odometry
 from semantic_mapper.drivers.oak.odometry import T_BODY_LEFT, basalt_pose
 from semantic_mapper.drivers.oak.stream import Sources
@@ -23,7 +24,7 @@ from tests.drivers.oak.host import FPS, HEIGHT, WIDTH, rgb_message
 
 SPEED = np.array((0.4, -0.2, 0.1))  # metres a second
 TURN = np.array((0.1, 0.5, -0.3))  # radians a second
-WAITS = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, retry_s=0.02, queue=64, odometry_wait_s=20.0, odometry=True)
+WAITS = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, odometry=True)
 
 
 def pose(rotation: Float64, position: Float64) -> Float64:
@@ -78,14 +79,14 @@ def test_images_carry_the_pose_of_their_moment(calibration: Path) -> None:
 
 def test_images_do_not_wait_for_ever(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry, "ANSWER_S", 0.2)
-    config = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, odometry=True, odometry_wait_s=0.1)
+    monkeypatch.setattr(camera_module, "ODOMETRY_WAIT_S", 0.1)
     go_on = threading.Event()
 
     def says_nothing(k: int) -> dai.TransformData:
         go_on.wait(60)
         return basalt_says(k)
 
-    camera = host.camera(lambda: host.tracked(live(calibration, 60), says_nothing, T_LEFT_RGB), config=config)
+    camera = host.camera(lambda: host.tracked(live(calibration, 60), says_nothing, T_LEFT_RGB), config=WAITS)
     with camera:
         images = list(itertools.islice(camera, 40))
         assert any("odometry has not answered for 0.2 s" in trouble for trouble in camera.warnings)

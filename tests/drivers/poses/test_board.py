@@ -1,11 +1,21 @@
 from __future__ import annotations
 
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 
 from semantic_mapper.drivers.base import CameraImage
-from semantic_mapper.drivers.poses.board import BoardPoseSource, make_board
+from semantic_mapper.drivers.poses.board import (
+    MARGIN_M,
+    BoardFinder,
+    BoardPoseSource,
+    draw_sheet,
+    make_board,
+    sheet_png,
+)
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import camera_matrix, invert_pose, look_at
@@ -16,7 +26,7 @@ from .images import rigid
 INTRINSICS = CameraIntrinsics(520.0, 525.0, 322.0, 238.0, 640, 480)
 CHARUCO = BoardPoses(columns=7, rows=5, square_m=0.05, marker_m=0.037)
 TAGS = BoardPoses(pattern="tags", columns=3, rows=2, square_m=0.1, marker_m=0.08)
-ONE_TAG = BoardPoses(pattern="tags", columns=1, rows=1, square_m=0.2, marker_m=0.2, min_corners=4)
+ONE_TAG = BoardPoses(pattern="tags", columns=1, rows=1, square_m=0.2, marker_m=0.2)
 PIXELS_A_METRE = 4000
 FINE = 3  # rendered this much larger, then averaged, as a sensor does
 
@@ -96,16 +106,16 @@ def test_no_board_and_too_little_of_it_give_no_pose() -> None:
 
 
 def test_wrong_intrinsics_are_noticed() -> None:
-    source = BoardPoseSource(BoardPoses(**{**config_fields(CHARUCO), "max_error_px": 0.5}))
+    source = BoardPoseSource(CHARUCO)
     seen = render(CHARUCO, views(CHARUCO)[1])
-    wrong = CameraIntrinsics(520.0, 700.0, 322.0, 238.0, 640, 480)
+    wrong = CameraIntrinsics(520.0, 900.0, 322.0, 238.0, 640, 480)
     assert source.pose(CameraImage(1, 0, "cam", seen.rgb, None, wrong)) is None
     assert source.counters["inexact"] == 1 and "check its sizes" in source.warnings[0]
 
 
 def test_a_small_board_is_not_guessed_at() -> None:
     """Head on nothing tells where the camera is; a little from the side two places fit."""
-    tiny = BoardPoses(pattern="tags", columns=1, rows=1, square_m=0.05, marker_m=0.05, min_corners=4)
+    tiny = BoardPoses(pattern="tags", columns=1, rows=1, square_m=0.05, marker_m=0.05)
     target = np.array((0.025, 0.025, 0.0))
     source = BoardPoseSource(tiny)
     for offset in ((0.0, 0.02, -0.8), (0.08, 0.06, -0.8)):
@@ -119,3 +129,32 @@ def test_boards_that_cannot_be_are_refused() -> None:
         make_board(BoardPoses(dictionary="DICT_9X9"))
     with pytest.raises(ConfigError, match="50 markers, the board needs 200"):
         make_board(BoardPoses(dictionary="DICT_4X4_50", columns=20, rows=20))
+
+
+BOARDS = [BoardPoses(), BoardPoses(pattern="tags", columns=3, rows=2, square_m=0.06, marker_m=0.045)]
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=["charuco", "tags"])
+def test_the_sheet_is_the_board_in_its_true_size(board: BoardPoses) -> None:
+    sheet, a_metre = draw_sheet(board)
+    points, pixels = BoardFinder(board).find(np.repeat(sheet[..., None], 3, axis=2))
+    assert len(points) == 24
+    off = pixels + 0.5 - (points[:, :2] + MARGIN_M) * a_metre
+    assert np.abs(off).max() < 1.5  # of 12 pixels a millimetre
+
+
+def test_the_file_says_how_large_it_is() -> None:
+    data = sheet_png(BoardPoses())
+    place = data.index(b"pHYs")
+    x, y, unit = struct.unpack(">IIB", data[place + 4 : place + 13])
+    assert x == y and unit == 1
+    assert struct.unpack(">I", data[place + 13 : place + 17])[0] == zlib.crc32(data[place : place + 13])
+    read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    height, width = np.asarray(read).shape
+    assert (width / x, height / y) == pytest.approx((0.29, 0.21), abs=2e-4)  # a sheet of A4 holds it
+    np.testing.assert_array_equal(read, draw_sheet(BoardPoses())[0])
+
+
+def test_a_wall_is_no_sheet() -> None:
+    with pytest.raises(ConfigError, match="too large to be drawn"):
+        sheet_png(BoardPoses(square_m=1.0, marker_m=0.8))

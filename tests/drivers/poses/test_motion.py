@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
-from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
 from semantic_mapper.types import Float64
 
 from .images import MS, rigid
@@ -46,22 +45,6 @@ def test_the_motion_goes_on_for_a_bounded_while(ahead_ms: int) -> None:
     assert found.sigma > 0.01  # a guess is less sure
 
 
-def test_curved_motion_is_followed_to_second_order() -> None:
-    def circle(t: float) -> Float64:
-        return rigid((0, 0, t), (np.cos(t), np.sin(t), 0))
-
-    errors = []
-    for step in (0.2, 0.1):
-        made = PoseTrack(10, 10**10, 0)
-        made.add(StampedPose(0, circle(0)))
-        made.add(StampedPose(round(step * 1e9), circle(step)))
-        found = made.at(round(step * 5e8))
-        assert isinstance(found, StampedPose)
-        errors.append(np.linalg.norm(found.T[:3, 3] - circle(step / 2)[:3, 3]))
-    assert errors[0] == pytest.approx(0.2**2 / 8, rel=0.01)  # the chord's distance from the arc
-    assert errors[1] == pytest.approx(errors[0] / 4, rel=0.01)
-
-
 def test_where_there_is_no_pose_the_track_says_why() -> None:
     made = track([1000, 1100, 1600, 1700])
     assert PoseTrack(3, 1, 1).at(5) == "empty"
@@ -79,12 +62,4 @@ def test_late_and_doubled_samples_are_left_out_and_old_ones_forgotten() -> None:
     assert not made.add(StampedPose(250 * MS, np.eye(4)))
     assert made.at(150 * MS) == "before" and made.newest_ns == 300 * MS
     made.clear()
-    assert made.newest_ns is None
-
-
-def test_a_motion_goes_on_beyond_its_ends() -> None:
-    a, b = truth(0), truth(10**9)
-    assert np.allclose(interpolate_pose(a, b, 1.7), truth(1_700_000_000)) and np.allclose(
-        interpolate_pose(a, b, -0.5), truth(-500_000_000)
-    )
-    assert np.allclose(rotation_vector(invert_pose(a) @ b), RATE)
+    assert made.newest_ns == -1 and len(made) == 0

@@ -3,36 +3,39 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import msgspec
+import cv2
 import numpy as np
 import pytest
 
-from research.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
-from semantic_mapper.drivers.poses.alignment import Target, align, fit
+from semantic_mapper.drivers.poses import odometry
 from semantic_mapper.drivers.poses.config import OdometryPoses
-from semantic_mapper.drivers.poses.depth_view import make_levels, thin_depth, thinned
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
-from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
+from semantic_mapper.drivers.poses.odometry import OdometryPoseSource, find_turn
 from semantic_mapper.errors import CameraError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
-from semantic_mapper.geometry import invert_pose, rotation_vector, unproject
-from semantic_mapper.localization.features import find_features, pose_from_features
-from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+from semantic_mapper.geometry import camera_matrix, invert_pose, rotation_vector
+from semantic_mapper.localization.depth_alignment import Target
+from semantic_mapper.localization.features import find_features
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
+from tests.drawn_room import truth_of, walk_frames
 
 from . import images
 from .images import as_image, rigid
 
 INTRINSICS = CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120)
-CONFIG = OdometryPoses(width=160, features=400, depth_max_m=6.0)
-PATH = CameraPathConfig(step_m=0.04)
+CONFIG = OdometryPoses()
 
 
 @cache
-def walk(noise: bool = False) -> tuple[PosedFrame, ...]:
+def walk(noisy: bool = False) -> tuple[PosedFrame, ...]:
     """Forty frames of 160x120 through a furnished room."""
-    sensor = NoiseConfig(depth="d435") if noise else None
-    return tuple(room_frames(TRAIN_SEEDS[7], 40, INTRINSICS, path=PATH, noise=sensor))
+    return walk_frames(7, 40, INTRINSICS, noisy=noisy)
+
+
+@cache
+def other_room(count: int) -> tuple[PosedFrame, ...]:
+    return walk_frames(23, count, INTRINSICS)
 
 
 def follow(frames: list[CameraImage], source: OdometryPoseSource) -> list[PoseEstimate | None]:
@@ -46,14 +49,12 @@ def poses_of(estimates: list[PoseEstimate | None]) -> Float64:
 
 
 def truth() -> Float64:
-    return np.array([f.T_world_camera for f in walk()])
+    return truth_of(walk())
 
 
-def started(config: OdometryPoses = CONFIG) -> OdometryPoseSource:
+def started() -> OdometryPoseSource:
     rows = tuple(tuple(float(v) for v in row) for row in walk()[0].T_world_camera)
-    return OdometryPoseSource(
-        OdometryPoses(**{**{n: getattr(config, n) for n in config.__struct_fields__}, "T_world_start": rows})
-    )
+    return OdometryPoseSource(OdometryPoses(T_world_start=rows))
 
 
 def test_a_camera_is_followed_through_a_room() -> None:
@@ -71,7 +72,7 @@ def test_a_camera_is_followed_through_a_room() -> None:
 
 def test_noisy_depth_is_followed_too_and_the_uncertainty_grows_with_the_way() -> None:
     source = started()
-    estimates = follow([as_image(f) for f in walk(noise=True)], source)
+    estimates = follow([as_image(f) for f in walk(noisy=True)], source)
     found = poses_of(estimates)
     assert absolute_trajectory_error(found, truth()).rmse_m < 0.05
     off = np.linalg.norm(found[:, :3, 3] - truth()[:, :3, 3], axis=1)
@@ -101,7 +102,7 @@ def test_a_blacked_out_stretch_is_lost_and_the_camera_found_again() -> None:
 
 def test_a_place_that_was_never_seen_is_not_taken_for_one_that_was() -> None:
     """Lost in one room, the camera wakes up in another."""
-    elsewhere = [as_image(f) for f in room_frames(TRAIN_SEEDS[23], 8, INTRINSICS, path=PATH)]
+    elsewhere = [as_image(f) for f in other_room(8)]
     source = started()
     with source:
         for f in walk()[:15]:
@@ -112,10 +113,7 @@ def test_a_place_that_was_never_seen_is_not_taken_for_one_that_was() -> None:
 
 def test_a_camera_that_stays_lost_begins_a_new_world_and_goes_on_there() -> None:
     here = [as_image(f) for f in walk()[:8]]
-    there = [
-        replace(as_image(f), stamp_ns=8 * 10**9 + k * 10**9)
-        for k, f in enumerate(room_frames(TRAIN_SEEDS[23], 9, INTRINSICS, path=PATH))
-    ]
+    there = [replace(as_image(f), stamp_ns=8 * 10**9 + k * 10**9) for k, f in enumerate(other_room(9))]
     source = OdometryPoseSource(CONFIG)
     assert all(e is not None and e.world == 0 for e in follow(here, source))
     found = follow(there, source)
@@ -132,10 +130,7 @@ def test_a_camera_that_stays_lost_begins_a_new_world_and_goes_on_there() -> None
 def test_a_covered_lens_tells_of_no_other_place() -> None:
     here = [as_image(f) for f in walk()[:8]]
     dark = [replace(here[-1], depth_m=np.zeros((120, 160), np.float32), stamp_ns=k * 10**9) for k in range(2, 12)]
-    there = [
-        replace(as_image(f), stamp_ns=12 * 10**9 + k * 10**9)
-        for k, f in enumerate(room_frames(TRAIN_SEEDS[23], 7, INTRINSICS, path=PATH))
-    ]
+    there = [replace(as_image(f), stamp_ns=12 * 10**9 + k * 10**9) for k, f in enumerate(other_room(7))]
     source = OdometryPoseSource(CONFIG)
     assert all(e is not None for e in follow(here, source))
     found = follow([*dark, *there], source)
@@ -144,20 +139,21 @@ def test_a_covered_lens_tells_of_no_other_place() -> None:
 
 
 @pytest.mark.parametrize("loop_closure", [False, True])
-def test_keyframes_that_have_gone_are_not_asked_for_when_a_world_ends(loop_closure: bool) -> None:
-    source = OdometryPoseSource(
-        msgspec.structs.replace(CONFIG, max_keyframes=5, keyframe_m=0.05, loop_closure=loop_closure)
-    )
-    there = room_frames(TRAIN_SEEDS[23], 30, INTRINSICS, path=PATH)
+def test_keyframes_that_have_gone_are_not_needed_when_a_world_ends(
+    loop_closure: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(odometry, "KeyframeMap", lambda: KeyframeMap(capacity=5))
+    monkeypatch.setattr(odometry, "KEYFRAME_M", 0.05)
+    source = OdometryPoseSource(OdometryPoses(loop_closure=loop_closure))
     follow([as_image(f) for f in walk()], source)
-    found = follow([replace(as_image(f), stamp_ns=8 * 10**9 + f.seq * 10**9) for f in there], source)
-    assert {e.world for e in found if e is not None} == {1} and len(source.keyframe_poses) == 5
+    found = follow([replace(as_image(f), stamp_ns=8 * 10**9 + f.seq * 10**9) for f in other_room(15)], source)
+    assert {e.world for e in found if e is not None} == {1} and source.counters["keyframes"] > 10
     source.correction(final=True)
 
 
 def test_first_images_that_show_too_little_are_left_behind() -> None:
     frames = [as_image(f) for f in walk()[:6]]
-    elsewhere = as_image(next(iter(room_frames(TRAIN_SEEDS[23], 1, INTRINSICS, path=PATH))))
+    elsewhere = as_image(other_room(1)[0])
     source = OdometryPoseSource(CONFIG)
     found = follow([replace(elsewhere, stamp_ns=frames[0].stamp_ns - 10**7), *frames], source)
     assert [e.world for e in found if e is not None] == [0, *[1] * 6] and source.counters["lost"] == 0
@@ -211,67 +207,6 @@ def test_another_camera_or_size_in_between_is_refused() -> None:
         source.pose(replace(first, camera_id="other"))
 
 
-def test_points_and_rays_of_thinned_images_are_those_of_the_whole() -> None:
-    frame = walk()[0]
-    assert frame.depth_m is not None
-    whole = unproject(frame.depth_m, INTRINSICS)
-    for stride in (2, 3):
-        small = thinned(INTRINSICS, stride, stride // 2)
-        depth = thin_depth(frame.depth_m, stride, 100.0)
-        assert depth.shape == (small.height, small.width)
-        assert np.allclose(unproject(depth, small), whole[stride // 2 :: stride, stride // 2 :: stride], atol=1e-5)
-
-
-def test_normals_are_those_of_the_surface() -> None:
-    """A plane, aslant."""
-    normal = np.array((0.3, -0.4, -1.0)) / np.linalg.norm((0.3, -0.4, -1.0))
-    rays = unproject(np.ones((120, 160), np.float32), INTRINSICS)
-    depth = (-2.0 / (rays @ normal)).astype(np.float32)
-    for level in make_levels(depth, INTRINSICS, 2):
-        known = np.isfinite(level.normals[..., 0])
-        assert known.mean() > 0.8
-        assert np.abs(level.normals[known] @ normal).min() > 0.999
-
-
-def test_alignment_finds_the_way_between_two_views() -> None:
-    a, b = walk()[0], walk()[2]
-    levels = []
-    for f in (a, b):
-        assert f.depth_m is not None
-        levels.append(make_levels(thin_depth(f.depth_m, 1, 6.0), INTRINSICS, 3))
-    target = Target(levels[0], a.T_world_camera)
-    guess = b.T_world_camera @ rigid((0.01, -0.015, 0.01), (0.02, -0.01, 0.02))
-    found = align(CONFIG, levels[1], [target], guess)
-    assert found is not None
-    assert np.linalg.norm(found[:3, 3] - b.T_world_camera[:3, 3]) < 0.005
-    assert np.allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
-    before, after = (fit(CONFIG, levels[1], target, T) for T in (guess, found))
-    assert after.rmse_m < 0.5 * before.rmse_m and after.fitness > 0.9 and after.overlap > 0.6
-
-
-def test_a_bare_wall_holds_nothing() -> None:
-    wall = make_levels(np.full((120, 160), 2.0, np.float32), INTRINSICS, 3)
-    found = fit(CONFIG, wall, Target(wall, np.eye(4)), np.eye(4))
-    eigenvalues = np.linalg.eigvalsh(found.normal_matrix)
-    assert (eigenvalues[:3] < 1e-3 * eigenvalues[3]).all()  # along it, and turning on it
-
-
-def test_corners_tell_the_way_between_two_views() -> None:
-    a, b = walk()[0], walk()[3]
-    found_of = []
-    for f in (a, b):
-        assert f.depth_m is not None
-        found_of.append(find_features(f.rgb, f.depth_m, 400))
-    found = pose_from_features(found_of[1], found_of[0], INTRINSICS, 15)
-    assert found is not None and found[1] >= 15
-    truth_of = invert_pose(a.T_world_camera) @ b.T_world_camera
-    assert np.linalg.norm(found[0][:3, 3] - truth_of[:3, 3]) < 0.07
-    assert np.rad2deg(np.linalg.norm(rotation_vector(invert_pose(found[0]) @ truth_of))) < 2
-    blank = find_features(np.full((120, 160, 3), 50, np.uint8), np.ones((120, 160), np.float32), 400)
-    assert pose_from_features(blank, found_of[0], INTRINSICS, 15) is None
-    assert pose_from_features(found_of[0], blank, INTRINSICS, 15) is None
-
-
 def test_the_most_crowded_keyframe_goes_and_old_ones_are_preferred() -> None:
     features = find_features(np.full((120, 160, 3), 50, np.uint8), np.ones((120, 160), np.float32), 10)
     made = KeyframeMap(capacity=4)
@@ -288,6 +223,26 @@ def test_the_most_crowded_keyframe_goes_and_old_ones_are_preferred() -> None:
 
 
 def test_same_images_same_poses_bit_for_bit() -> None:
-    frames = [as_image(f) for f in walk(noise=True)[:15]]
+    frames = [as_image(f) for f in walk(noisy=True)[:15]]
     one, other = (poses_of(follow(frames, started())) for _ in range(2))
     assert np.array_equal(one, other)
+
+
+def seen(T: Float64, gain: float = 1.0) -> UInt8:
+    """A far wall with blots on it, as seen by a camera that has turned."""
+    lens = CameraIntrinsics(264.0, 264.0, 159.5, 119.5, 320, 240)
+    blots = np.random.default_rng(3).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    wall = cv2.resize(blots, (960, 720), interpolation=cv2.INTER_CUBIC)
+    K = camera_matrix(lens)
+    wide = K.copy()
+    wide[:2, 2] = 479.5, 359.5
+    image = cv2.warpPerspective(wall, K @ T[:3, :3].T @ np.linalg.inv(wide), (320, 240))
+    return np.clip(image * gain, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.14, 0.0), (0.06, -0.1, 0.0), (0.0, 0.0, 0.0)])
+def test_the_turn_between_two_images_is_found_whatever_their_brightness(turn: tuple[float, float, float]) -> None:
+    T = rigid(turn)
+    found = find_turn(seen(T, gain=0.5), seen(np.eye(4)), CameraIntrinsics(264.0, 264.0, 159.5, 119.5, 320, 240))
+    assert found is not None and not found[:3, 3].any()
+    assert np.rad2deg(np.linalg.norm(rotation_vector(invert_pose(found) @ T))) < 1.5

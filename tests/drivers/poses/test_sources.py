@@ -8,13 +8,10 @@ from typing import Any
 
 import pytest
 
-from semantic_mapper.drivers.base import PoseSource
 from semantic_mapper.drivers.poses.board import BoardPoseSource
-from semantic_mapper.drivers.poses.config import IDENTITY, KINDS
+from semantic_mapper.drivers.poses.config import IDENTITY
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
-from semantic_mapper.drivers.poses.posed_camera import DiagnosticPoseSource
-from semantic_mapper.drivers.poses.sources import open_poses, read_pose_config
-from semantic_mapper.drivers.poses.still import DevicePoseSource, FixedPoseSource
+from semantic_mapper.drivers.poses.sources import DevicePoseSource, FixedPoseSource, open_poses, read_pose_config
 from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import ConfigError
 
@@ -23,23 +20,16 @@ from semantic_mapper.errors import ConfigError
     ("text", "kind"),
     [
         ('kind = "device"', DevicePoseSource),
-        ('kind = "fixed"\nT_world_camera = [[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]\nsigma = 0.1', FixedPoseSource),
-        ('kind = "topic"\nendpoint = "ipc:///tmp/robot"\n[cameras]\n', TopicPoseSource),
+        ('kind = "fixed"\nT_world_camera = [[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]', FixedPoseSource),
+        ('kind = "topic"\nendpoint = "ipc:///tmp/robot"', TopicPoseSource),
         ('kind = "board"\ncolumns = 5', BoardPoseSource),
-        ('kind = "rgbd"\nwidth = 160', OdometryPoseSource),
+        ('kind = "rgbd"\nloop_closure = false', OdometryPoseSource),
     ],
 )
 def test_a_section_of_a_launch_file_becomes_a_pose_source(text: str, kind: type) -> None:
     source = open_poses(tomllib.loads(text))
     assert isinstance(source, kind)
-    assert isinstance(source, PoseSource) and isinstance(source, DiagnosticPoseSource)
     assert source.warnings == () and not source.counters
-
-
-def test_every_kind_has_its_name() -> None:
-    assert set(KINDS) == {"device", "fixed", "topic", "board", "rgbd", "visual"}
-    for name, kind in KINDS.items():
-        assert name in str(kind.__annotations__["kind"])
 
 
 @pytest.mark.parametrize(
@@ -51,9 +41,8 @@ def test_every_kind_has_its_name() -> None:
         ({"kind": "board", "column": 3}, "did you mean `columns`"),
         ({"kind": "board", "square_m": 0.02}, "must be smaller than square_m"),
         ({"kind": "board", "rows": 1}, "at least 2 columns"),
-        ({"kind": "board", "pattern": "tags", "columns": 1, "rows": 1}, "min_corners = 6: the board has 4"),
         ({"kind": "fixed", "T_world_camera": [[1, 0], [0, 1]]}, "T_world_camera"),
-        ({"kind": "rgbd", "min_fitness": 1.5}, "min_fitness"),
+        ({"kind": "rgbd", "loop_closure": 1.5}, "loop_closure"),
     ],
 )
 def test_what_is_wrong_is_named(config: dict[str, Any], reason: str) -> None:
@@ -75,9 +64,6 @@ def test_matrices_must_be_rigid(kind: str, name: str) -> None:
                 if kind == "topic"
                 else {"kind": kind, name: rows}
             )
-    scaled = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
-    with pytest.raises(ConfigError, match=r"cameras\.left"):
-        read_pose_config({"kind": "topic", "endpoint": "ipc:///tmp/x", "cameras": {"left": scaled}})
 
 
 @pytest.mark.slow

@@ -1,18 +1,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
-from types import TracebackType
-from typing import Any, Self
 
 import numpy as np
 import pytest
 
-from research.scenes import TEST_SEEDS, CameraPathConfig, room_frames
-from research.scenes.config import PoseNoiseConfig
-from research.scenes.pose_noise import drifting_poses
-from semantic_mapper.config import PoseRefinerConfig
-from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.mounts import Mount
 from semantic_mapper.drivers.poses.config import VisualPoses, begins_world
 from semantic_mapper.drivers.poses.sources import open_poses
@@ -21,34 +14,24 @@ from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error
 from semantic_mapper.nodes.camera.live import with_poses
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float64, PosedFrame
-from tests.bundle.rooms import INTRINSICS, truth, walk, way_m
+from semantic_mapper.types import Float64
+from tests.bundle.rooms import truth, walk, way_m
 
 from .images import ListCamera, as_image
 
-CONFIG = VisualPoses(tracking=PoseRefinerConfig(corners=200))
+CONFIG = VisualPoses()
 
 
-class Wheels:
-    """Odometry that drifts by 2 %."""
-
-    warnings: tuple[str, ...] = ("a wheel squeaks",)
+class Wheels(PoseSource):
+    """Odometry whose ways are 2 % too long."""
 
     def __init__(self) -> None:
-        noise = PoseNoiseConfig(translation_share=0.02, rotation_deg_per_m=0.5, closure_frames=0)
-        poses = drifting_poses(truth(), 5, noise)
+        super().__init__()
+        self._warnings = ("a wheel squeaks",)
+        self._counters["messages"] = 7
+        poses = truth()
+        poses[:, :3, 3] = poses[0, :3, 3] + 1.02 * (poses[:, :3, 3] - poses[0, :3, 3])
         self._poses = {f.stamp_ns: T for f, T in zip(walk(), poses, strict=True)}
-        self.counters = {"messages": 7}
-        self.is_open = False
-
-    def __enter__(self) -> Self:
-        self.is_open = True
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.is_open = False
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         T = self._poses.get(image.stamp_ns)
@@ -67,12 +50,11 @@ def poses_of(estimates: list[PoseEstimate | None]) -> tuple[Float64, Float64]:
 
 
 def test_coarse_wheels_tell_the_scale_and_where_the_world_is() -> None:
-    wheels = Wheels()
-    source = VisualPoseSource(CONFIG, wheels)
+    source = VisualPoseSource(CONFIG, Wheels())
     assert source.scale == "awaited"
     estimates = follow(source, 30)
     found, true = poses_of(estimates)
-    assert len(found) > 8 and source.scale == "known" and not wheels.is_open
+    assert len(found) > 8 and source.scale == "known"
     assert absolute_trajectory_error(found, true).rmse_m < 0.03 * way_m()
     assert np.linalg.norm(found[0, :3, 3] - true[0, :3, 3]) < 0.1  # in the world of the wheels
     assert {e.source for e in estimates if e is not None} == {"visual"}
@@ -89,7 +71,8 @@ def test_without_anything_the_poses_are_up_to_scale_and_the_status_says_so() -> 
 
 def test_a_camera_announces_that_its_poses_are_not_in_metres() -> None:
     def announced(**config: object) -> StreamInfo:
-        return with_poses(ListCamera([]), {"kind": "visual", **config}, Mount(None, asked=False, camera="list")).info
+        mount = Mount(None, requested=False, camera="list")
+        return with_poses(ListCamera([]), {"kind": "visual", **config}, mount).info
 
     assert not announced().scale_known and announced().source == "list"
     assert announced(distance_m=2.0).scale_known and announced(scale={"kind": "board"}).scale_known
@@ -99,7 +82,7 @@ def test_a_typed_distance_tells_the_scale() -> None:
     depth = walk()[0].depth_m
     assert depth is not None
     middle = float(np.median(depth[80:160, 107:213]))
-    source = VisualPoseSource(replace_config(distance_m=middle))
+    source = VisualPoseSource(VisualPoses(distance_m=middle))
     found, true = poses_of(follow(source, 30))
     ways = [np.linalg.norm(np.diff(p[:, :3, 3], axis=0), axis=1).sum() for p in (found, true)]
     assert source.scale == "known" and "scale: unknown" not in " ".join(source.warnings)
@@ -107,39 +90,30 @@ def test_a_typed_distance_tells_the_scale() -> None:
     assert np.allclose(source.pose(as_image(walk()[29])) is not None, True)
 
 
-@cache
-def level_walk() -> tuple[PosedFrame, ...]:
-    path = CameraPathConfig(step_m=0.05, min_height_m=1.1, max_height_m=1.1)
-    return tuple(room_frames(TEST_SEEDS[1], 40, INTRINSICS, path=path))
-
-
 def test_the_height_over_a_floor_that_is_seen_tells_the_scale_and_where_the_floor_is() -> None:
-    start = tuple(tuple(row) for row in level_walk()[0].T_world_camera.tolist())
-    source = VisualPoseSource(replace_config(camera_height_m=1.1, T_world_start=start))
+    start = tuple(tuple(row) for row in walk()[0].T_world_camera.tolist())
+    height_m = float(walk()[0].T_world_camera[2, 3])
+    source = VisualPoseSource(VisualPoses(camera_height_m=height_m, T_world_start=start))
     assert source.scale == "awaited"
     with source:
-        estimates = [source.pose(as_image(f)) for f in level_walk()]
+        estimates = [source.pose(as_image(f)) for f in walk()]
     known = [i for i, e in enumerate(estimates) if e is not None]
     found = np.array([e.T_world_camera for e in estimates if e is not None])
-    true = np.array([level_walk()[i].T_world_camera for i in known])
+    true = np.array([walk()[i].T_world_camera for i in known])
     ways = [np.linalg.norm(np.diff(p[:, :3, 3], axis=0), axis=1).sum() for p in (found, true)]
     assert source.scale == "known" and len(known) >= 6 and known[-1] == len(estimates) - 1
     assert ways[0] == pytest.approx(ways[1], rel=0.1)
-    assert np.abs(found[:, 2, 3] - 1.1).max() < 0.1
+    assert np.abs(found[:, 2, 3] - true[:, 2, 3]).max() < 0.1
 
 
 def test_without_a_floor_in_sight_the_scale_is_awaited_and_the_status_says_for_what() -> None:
     turned = np.eye(4)
     turned[:3, :3] = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # as if the camera was held upside down: no floor under it
     start = tuple(tuple(row) for row in turned.tolist())
-    source = VisualPoseSource(replace_config(camera_height_m=1.1, T_world_start=start))
+    source = VisualPoseSource(VisualPoses(camera_height_m=1.1, T_world_start=start))
     with source:
-        estimates = [source.pose(as_image(f)) for f in level_walk()[:15]]
+        estimates = [source.pose(as_image(f)) for f in walk()[:15]]
     assert not any(estimates) and source.scale == "awaited" and "see the floor" in source.warnings[0]
-
-
-def replace_config(**changes: Any) -> VisualPoses:
-    return VisualPoses(tracking=CONFIG.tracking, **changes)
 
 
 def test_a_camera_that_is_lost_says_why() -> None:

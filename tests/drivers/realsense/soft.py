@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from semantic_mapper.drivers.realsense.library import load_realsense
+from semantic_mapper.drivers.realsense.devices import load_realsense
 from semantic_mapper.types import Float64, UInt8
 
 WIDTH, HEIGHT, FPS = 96, 72, 30

@@ -16,16 +16,17 @@ import numpy as np
 import pytest
 
 from semantic_mapper.config import convert_config
-from semantic_mapper.drivers.opencv.clock import DRIFT
-from semantic_mapper.drivers.realsense import devices
+from semantic_mapper.drivers import live
+from semantic_mapper.drivers.live import DRIFT
+from semantic_mapper.drivers.realsense import devices, frames
 from semantic_mapper.drivers.realsense.camera import RealSenseCamera
 from semantic_mapper.drivers.realsense.config import Config
-from semantic_mapper.drivers.realsense.images import read_intrinsics
-from semantic_mapper.drivers.realsense.library import load_realsense
+from semantic_mapper.drivers.realsense.devices import load_realsense
+from semantic_mapper.drivers.realsense.frames import read_intrinsics
 from semantic_mapper.errors import CameraError, DependencyError
-from semantic_mapper.types import UInt8
+from semantic_mapper.types import CameraIntrinsics, UInt8
+from tests.drawn_room import walk_frames
 from tests.drivers.realsense.soft import HEIGHT, SERIAL, WIDTH, Feed, SoftDevice, lens
-from tests.small import tiny_frames
 
 try:
     load_realsense()
@@ -33,7 +34,14 @@ except DependencyError as error:  # there are wheels for Linux on x86-64 only
     pytest.skip(str(error), allow_module_level=True)
 
 PATIENCE_S = 20.0
-FRAMES = tiny_frames(6)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "RETRY_S", 0.05)
+
+
+FRAMES = walk_frames(7, 6, CameraIntrinsics(66.0, 66.0, 47.5, 35.5, 96, 72))
 
 
 def picture(number: int) -> tuple[UInt8, np.ndarray]:
@@ -56,7 +64,7 @@ def camera_of(*found: SoftDevice, **settings: Any) -> RealSenseCamera:
                 return device
         raise CameraError("no RealSense camera is connected")
 
-    small = {"width": WIDTH, "height": HEIGHT, "depth_width": WIDTH, "depth_height": HEIGHT, "retry_s": 0.05}
+    small = {"width": WIDTH, "height": HEIGHT, "depth_width": WIDTH, "depth_height": HEIGHT}
     return RealSenseCamera(convert_config(small | settings, Config, "test"), "front", find)
 
 
@@ -139,16 +147,18 @@ def test_a_mode_that_is_not_offered_is_refused_with_those_that_are(settings: dic
         pass
 
 
-def test_a_device_that_gives_nothing_is_refused() -> None:
-    camera = camera_of(SoftDevice(), start_s=0.2)
+def test_a_device_that_gives_nothing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames, "START_S", 0.2)
+    camera = camera_of(SoftDevice())
     with pytest.raises(CameraError, match=r"was opened, but it has given no image with depth for 0.2 s"), camera:
         pass
 
 
 @pytest.mark.parametrize("how", ["unplugged", "stalled"])
-def test_a_device_that_goes_away_is_waited_for(how: str) -> None:
+def test_a_device_that_goes_away_is_waited_for(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames, "STALL_S", 0.3)
     first, second = SoftDevice(), SoftDevice()
-    with Feed(picture, first) as feed, camera_of(first, second, stall_s=0.3) as camera:
+    with Feed(picture, first) as feed, camera_of(first, second) as camera:
         images = iter(camera)
         before = list(islice(images, 3))[-1]
         feed.device = None

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from research.scenes import TEST_SEEDS, camera_path, make_room, render_view
-from semantic_mapper.drivers.stereo.calibration import StereoCalibration, save_stereo
+from semantic_mapper.drivers.calibration import StereoCalibration, save_stereo
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 HZ = 10

@@ -13,9 +13,9 @@ import pytest
 
 from research.scenes import render_view
 from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.calibration import load_stereo, save_stereo
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo import list_devices
-from semantic_mapper.drivers.stereo.calibration import load_stereo, save_stereo
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.types import Float64
@@ -114,15 +114,6 @@ def test_swapped_halves_are_put_right(film: Film, tmp_path: Path) -> None:
     assert swapped.depth_m is not None and (swapped.depth_m > 0).mean() > 0.85
 
 
-def test_narrower_images_have_their_own_intrinsics_and_the_same_depth(film: Film, tmp_path: Path) -> None:
-    file = pairs.write_pair(tmp_path / "pair.toml")
-    (large, *_), (small, *_) = images_of(film, file), images_of(film, file, width=240)
-    assert small.rgb.shape == (180, 240, 3) and small.intrinsics.fx == pytest.approx(large.intrinsics.fx / 2, rel=0.02)
-    assert small.depth_m is not None and large.depth_m is not None
-    a, b = (float(np.median(image[image > 0])) for image in (small.depth_m, large.depth_m))
-    assert a == pytest.approx(b, rel=0.05)
-
-
 def test_a_file_of_a_pair_reads_back_to_the_same_numbers(tmp_path: Path) -> None:
     lens = dataclasses.replace(pairs.LEFT, distortion=(-0.1, 0.02, 1e-4, -2e-4, 0.003))
     pair = dataclasses.replace(pairs.pair(swapped=True), left=lens)
@@ -156,7 +147,7 @@ def test_what_cannot_work_is_refused_before_the_device_is_opened(
 def test_a_pair_that_is_not_side_by_side_and_a_film_of_another_size_are_refused(film: Film, tmp_path: Path) -> None:
     turned = dataclasses.replace(pairs.pair(), T_right_left=shift(0.1))
     save_stereo(tmp_path / "turned.toml", turned, {})
-    with pytest.raises(ConfigError, match="the right camera is not beside the left one"):
+    with pytest.raises(ConfigError, match="the right camera is not next to the left one"):
         stereo(film.path, str(tmp_path / "turned.toml"))
     small = pairs.write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
     camera = stereo(small, pairs.write_pair(tmp_path / "pair.toml"))

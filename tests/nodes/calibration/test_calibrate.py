@@ -14,16 +14,14 @@ import pytest
 
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.solve import solve
+from semantic_mapper.drivers.calibrating.rig import solve
 from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer
-from semantic_mapper.drivers.calibration import load_calibration, load_mount
-from semantic_mapper.drivers.stereo.calibration import load_stereo
+from semantic_mapper.drivers.calibration import load_calibration, load_mount, load_stereo
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.nodes.calibration.report import CalibrationSettings, report, report_json, write_files
-from semantic_mapper.nodes.calibration.run import Gathering
-from semantic_mapper.nodes.calibration.sources import parse_sources
+from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
@@ -112,7 +110,7 @@ def test_a_live_camera_is_looked_through_until_nothing_is_lacking(tmp_path: Path
     assert len(gathering.cameras["camera"].kept) >= SETTINGS.calibration.min_views
 
 
-def test_a_camera_may_come_while_it_is_told_what_the_others_have() -> None:
+def test_a_camera_may_come_while_the_others_are_reported() -> None:
     stopped = threading.Event()
     gathering = Gathering(BOARD, CalibrationConfig())
 

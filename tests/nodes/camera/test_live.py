@@ -291,13 +291,13 @@ def test_frames_get_the_poses_that_the_launch_file_names(tmp_path: Path, monkeyp
         "kind": "opencv",
         "id": "wall",
         "config": {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")},
-        "poses": {"kind": "fixed", "T_world_camera": pose.tolist(), "sigma": 0.02},
+        "poses": {"kind": "fixed", "T_world_camera": pose.tolist()},
     }
     with running({"camera": camera}) as node:
         node.until(lambda m: isinstance(m, EndOfStream))
     frames = node.frames()
     assert node.error is None and [f.seq for f in frames] == list(range(COUNT))
-    assert all((f.camera_id, f.pose_source, f.pose_sigma) == ("wall", "fixed", 0.02) for f in frames)
+    assert all((f.camera_id, f.pose_source, f.pose_sigma) == ("wall", "fixed", 0.0) for f in frames)
     assert all(np.array_equal(f.T_world_camera, pose) for f in frames)
 
 

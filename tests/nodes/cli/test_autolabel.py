@@ -23,8 +23,8 @@ from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import is_measured
+from semantic_mapper.nodes.cli.info import autolabel_rows
 from semantic_mapper.nodes.cli.labelling import choose_keyframes
-from semantic_mapper.nodes.cli.log_info import autolabel_rows
 from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel import RENDERED_SPREAD, AutolabelReport, AutolabelRequest, autolabel_log
@@ -219,7 +219,7 @@ def test_a_player_and_a_recorder_pass_the_mark_on(new: Path, tmp_path: Path) -> 
     with LogReader(new) as log, LogWriter(tmp_path / "copy.mcap", log.info) as copy:
         for frame in log:
             copy.write_frame(frame)
-    done = run("recover", new, tmp_path / "recovered.mcap")
+    done = run("import", new, tmp_path / "recovered.mcap")
     assert done.returncode == 0, done.stderr
     for name in ("copy.mcap", "recovered.mcap"):
         with LogReader(tmp_path / name) as log:

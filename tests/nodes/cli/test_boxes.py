@@ -30,14 +30,14 @@ def file(tmp_path: Path) -> Path:
 
 def test_boxes_are_listed_for_people_and_programs(file: Path) -> None:
     text = file.read_bytes()
-    listed = json.loads(run("boxes", file, "--json").stdout)
+    listed = json.loads(run("info", file, "--json").stdout)
     assert [(b["id"], b["class"], b["thing"]) for b in listed["boxes"]] == [(2, "chair", True), (5, "wall", False)]
-    assert "chair" in run("boxes", file).stdout and file.read_bytes() == text
+    assert "chair" in run("info", file).stdout and file.read_bytes() == text
 
 
 def test_boxes_are_drawn_where_the_frames_show_them(file: Path, log: Path, tmp_path: Path) -> None:
     out = tmp_path / "boxes.jpg"
-    done = run("boxes", file, "--picture", log, "--out", out)
+    done = run("info", file, "--picture", log, "--out", out)
     assert out.read_bytes().startswith(b"\xff\xd8") and "1 of 2 boxes in view of its frames; written" in done.stdout
     color = np.array(ROOMS.colors[ROOMS.names.index("chair")])[::-1]
     tiles = np.asarray(cv2.imread(str(out)))[110 : 110 + 300, 24 : 24 + 3 * 512].astype(int)
@@ -52,9 +52,9 @@ def test_wrong_use_changes_nothing(file: Path, log: Path, tmp_path: Path) -> Non
         ("--picture", log, "--out", tmp_path / "b.gif"),
         ("--picture", tmp_path / "log.png", "--out", tmp_path / "log.png"),
     ):
-        assert run("boxes", file, *words).returncode == 2, words
+        assert run("info", file, *words).returncode == 2, words
     (tmp_path / "boxes.png").symlink_to(file)
-    done = run("boxes", file, "--picture", log, "--out", tmp_path / "boxes.png")
+    done = run("info", file, "--picture", log, "--out", tmp_path / "boxes.png")
     assert done.returncode == 1 and "is the file of boxes" in error_line(done.stderr)
     assert file.read_bytes() == text
 
@@ -63,7 +63,7 @@ def test_a_box_that_cannot_be_used_is_named(file: Path) -> None:
     data = json.loads(file.read_text())
     data["boxes"][1]["size"] = [1, 1, 1e-9]
     file.write_text(json.dumps(data))
-    done = run("boxes", file)
+    done = run("info", file)
     assert done.returncode == 1 and "box 2 (id 5): size must be at least" in error_line(done.stderr)
 
 
@@ -81,8 +81,8 @@ def test_xml_of_kitti360_is_listed_with_what_is_left_out(tmp_path: Path) -> None
     open_mesh = "<object3>" + shape.replace("0 4 5 1", "0 4 4 1") + "<label>car</label><index>8</index></object3>"
     still = f"<object1>{shape}<label>car</label><index>0</index><timestamp>-1</timestamp></object1>"
     xml.write_text(f"<a>{still}{moves}{open_mesh}</a>")
-    listed = run("boxes", xml, "--json")
+    listed = run("info", xml, "--json")
     assert "boxes_left_out" in listed.stderr and "box 3 (id 9): the surface is open" in listed.stderr
     found = json.loads(listed.stdout)
     assert [(b["frames"], b["stamps_ns"]) for b in found["boxes"]] == [([], []), ([3], [])]
-    assert "(id 9)" in found["bad"][0] and "1 frame: 3 to 3" in run("boxes", xml).stdout
+    assert "(id 9)" in found["bad"][0] and "1 frame: 3 to 3" in run("info", xml).stdout

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from tests.nodes.support import run, run_process
 
 
+@pytest.mark.slow  # 24 frames
 def test_demo_ends_with_a_map_a_picture_and_a_summary(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    done = run("demo", "--out", out, "--frames", "4", "--voxel-size", "0.05")
+    done = run("demo", "--out", out, "--voxel-size", "0.05", "--quality", "fast")
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["frames"]["fused"] == summary["frames"]["published"] == 4
+    assert summary["frames"]["fused"] == summary["frames"]["published"] > 10
     assert summary["metrics"]["miou"] is not None
-    for name in ("demo.mcap", "map.ply", "map.npz", "overview.png"):
+    for name in ("map.ply", "map.npz", "overview.png"):
         assert (out / name).stat().st_size > 0
         assert name in done.stdout
+    assert "demo.mcap" in done.stdout
 
 
 def test_doctor_finds_what_the_tests_themselves_need(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import typer
 
-from semantic_mapper.nodes.cli.film import film_options, is_film, write_film_report
+from semantic_mapper.nodes.cli.film import FilmFlags, is_film, write_film_report
 from semantic_mapper.replay.sfm.film import FilmNote, read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut, OtherModel
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
@@ -19,14 +19,14 @@ from tests.replay import recordings as rec
 
 
 def test_options_become_one_source_of_scale() -> None:
-    assert film_options(None, 0.0, 0.0, "", 0.0, None, 0.0).scale.factor is None
-    assert film_options(None, 500.0, 1.5, "", 0.0, None, 0.0, 1).scale.factor == 1.5
-    board = film_options(None, 0.0, 0.0, "", 39.6, None, 0.0).scale.board
+    assert FilmFlags().film_options(0).scale.factor is None
+    assert FilmFlags(focal_prior=500.0, scale=1.5).film_options(1).scale.factor == 1.5
+    board = FilmFlags(square_mm=39.6).film_options(0).scale.board
     assert board is not None and board.square_m == pytest.approx(0.0396)
     with pytest.raises(typer.BadParameter, match=r"--scale and --camera-height: .* one source"):
-        film_options(None, 0.0, 1.5, "", 0.0, None, 1.2)
+        FilmFlags(scale=1.5, camera_height=1.2).film_options(0)
     with pytest.raises(typer.BadParameter, match="--calibration and --focal-prior"):
-        film_options(Path("a.toml"), 500.0, 0.0, "", 0.0, None, 0.0)
+        FilmFlags(calibration=Path("a.toml"), focal_prior=500.0).film_options(0)
 
 
 def test_a_folder_of_pictures_is_a_film_unless_it_is_a_recording(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_a_stream_is_metric_unless_it_says_otherwise() -> None:
 
 def test_what_is_no_film_is_refused_by_the_verb(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"no film")
-    done = run_process("map", tmp_path / "a.mp4", "--out", tmp_path / "out")
+    done = run_process("replay", tmp_path / "a.mp4", "--out", tmp_path / "out")
     assert done.returncode == 1 and "no film that OpenCV can decode" in done.stderr
     assert done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1  # FFmpeg's own lines are not shown
     assert not (tmp_path / "out" / "a.mcap").exists()
@@ -110,7 +110,7 @@ def test_what_is_no_film_is_refused_by_the_verb(tmp_path: Path) -> None:
 
 def test_weights_that_are_not_there_are_told_before_the_film_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"no film")
-    done = run("map", tmp_path / "a.mp4", "--out", tmp_path / "out", "--weights", tmp_path / "nope.safetensors")
+    done = run("replay", tmp_path / "a.mp4", "--out", tmp_path / "out", "--weights", tmp_path / "nope.safetensors")
     assert done.returncode == 1 and "nope.safetensors" in done.stderr
 
 
@@ -122,7 +122,7 @@ def test_a_recording_without_any_depth_is_mapped_with_the_weights_for_computed_d
     if not depth:
         shutil.rmtree(folder / "depth")
     (folder / "color" / sorted(file.name for file in (folder / "color").iterdir())[1]).write_bytes(b"damaged")
-    done = run("map", folder, "--out", tmp_path / "out")
+    done = run("replay", folder, "--out", tmp_path / "out")
     said = done.stderr + capfd.readouterr().err
     assert ("rooms-computed-depth.safetensors" in said) != depth and "mapping" in said
     assert "frame left out: frame 1" in done.stdout  # what `import` says is not lost

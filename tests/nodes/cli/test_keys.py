@@ -49,8 +49,8 @@ def test_a_map_is_asked_from_another_machine(tmp_path: Path) -> None:
     "verb",
     [
         ("query", "tcp://192.0.2.1:5570", "info"),
-        ("top", "tcp://192.0.2.1:5570", "--once"),
-        ("weights", "tcp://192.0.2.1:5570"),
+        ("view", "--status", "tcp://192.0.2.1:5570", "--once"),
+        ("info", "tcp://192.0.2.1:5570"),
         ("label", "room.mcap", "--keyframes", "2", "--to", "tcp://0.0.0.0:5570"),
     ],
     ids=lambda verb: verb[0],

@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from semantic_mapper.nodes.cli.labelling_page import page_order
 
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.nodes.cli.labelling_page import page_order
 from semantic_mapper.replay.label_folder import make_label_folder
 from semantic_mapper.replay.log.sequence import open_log
 from tests.nodes.support import COMMAND, Running, error_line, run, run_here, write_log, write_weights

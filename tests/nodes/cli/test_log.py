@@ -143,9 +143,9 @@ def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> Non
     damaged.write_bytes(content[: len(content) * 9 // 10])
     told = run("info", damaged)
     assert told.returncode == 1
-    assert "damaged:" in told.stdout and "semantic-mapper recover" in told.stdout
+    assert "damaged:" in told.stdout and "semantic-mapper import" in told.stdout
     clean = tmp_path / "clean.mcap"
-    done = run("recover", damaged, clean)
+    done = run("import", damaged, clean)
     assert done.returncode == 0, done.stderr
     assert "lost:" in done.stdout
     found = json.loads(run("info", clean, "--json").stdout)
@@ -156,7 +156,7 @@ def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> Non
 def test_recover_never_writes_over_a_log(log: Path, tmp_path: Path) -> None:
     taken = tmp_path / "taken.mcap"
     taken.write_text("mine")
-    done = run("recover", log, taken)
+    done = run("import", log, taken)
     assert done.returncode == 1
     assert "taken.mcap: exists already" in error_line(done.stderr)
     assert taken.read_text() == "mine"

@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper import __version__
+from semantic_mapper.nodes.cli.main import VERBS as VERBS_AND_TEXTS
 from tests.contract import entry_points as api
 from tests.nodes.support import COMMAND, run, run_here, run_process
 
+LINES = 60  # of a help of 80 columns, at most
 VERBS = sorted(name for name, command in api.command_tree().commands.items() if not hasattr(command, "commands"))
 
 
@@ -30,6 +32,20 @@ def test_help_lists_all_verbs() -> None:
     assert all(f"  {verb} " in done.stdout for verb in VERBS)
     codes = " ".join(done.stdout.split()).partition("Exit codes: ")[2].partition(".")[0]
     assert [word for word in codes.replace(",", " ").split() if word.isdigit()] == ["0", "1", "2", "3", "130"]
+
+
+def test_the_list_of_verbs_says_what_each_says_of_itself() -> None:
+    for name, (_, text) in VERBS_AND_TEXTS.items():
+        said = " ".join((api.command_tree().commands[name].help or "").split())
+        assert said.startswith(text.rstrip(".")), name
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_fits_on_a_screen_and_rare_options_are_behind_help_all(verb: str) -> None:
+    short = run(verb, "--help").stdout
+    assert len(short.splitlines()) <= LINES
+    if "--help-all" in short:
+        assert len(run(verb, "--help-all").stdout) > len(short)
 
 
 def test_version_is_that_of_the_package() -> None:
@@ -84,8 +100,7 @@ def test_completion_of_bash_knows_verbs_and_options(tmp_path: Path) -> None:
         done = subprocess.run([str(COMMAND)], env=environment, capture_output=True, text=True, check=False)
         return done.stdout.split()
 
-    assert complete("semantic-mapper re") == ["replay", "record", "recover", "relocalize", "refine"]
-    assert complete("semantic-mapper launch ") == ["list", "show", "copy"]
+    assert complete("semantic-mapper re") == ["replay", "record", "relocalize", "refine"]
     assert "--voxel-size" in complete("semantic-mapper replay --vo")
     script = complete("", _SEMANTIC_MAPPER_COMPLETE="source_bash")
     assert "complete" in script and "semantic-mapper" in script

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,7 @@ from msgspec.structs import replace
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.query import Asked, Question, ask_file, ask_mapper, ask_tiles
-from semantic_mapper.queries.tiles import TiledMap
-from tests.mapping.files.tiled import make_tiles
+from semantic_mapper.nodes.cli.query import Question, Request, ask_file, ask_mapper
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import eventually, run, run_here
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
@@ -45,11 +42,11 @@ def test_info(map_file: Path) -> None:
 
 
 def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
-    info = Asked(Question.INFO)
+    info = Request(Question.INFO)
     assert ask_file(str(map_file.parent), info) == ask_file(str(map_file), info)
     code, said = run_here("info", map_file.parent)
     assert code == 0 and "blocks" in said
-    code, said = run_here("correct", map_file.parent, map_file)
+    code, said = run_here("query", map_file.parent, "correct", map_file)
     assert code == 1 and "a saved map keeps no frames to correct" in said
     code, said = run_here("eval", map_file)
     assert code == 1 and "is a map alone; give the folder" in said
@@ -116,14 +113,14 @@ def test_instances_of_a_saved_map_stand_as_its_floor_says(tmp_path: Path) -> Non
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # z becomes x
     VoxelMap(plain.config, plain.label_set).merged(plain, T).save(tmp_path / "map.npz")
-    found = ask_file(str(tmp_path), Asked(Question.INSTANCES))
+    found = ask_file(str(tmp_path), Request(Question.INSTANCES))
     np.testing.assert_allclose(found["up"], (1, 0, 0), atol=0.02)
     assert {thing["class"] for thing in found["instances"] if thing["voxels"] > 200} == {"table", "cup"}
 
 
 def answers(endpoint: str) -> bool:
     try:
-        ask_mapper(endpoint, Asked(Question.INFO, "", ()))
+        ask_mapper(endpoint, Request(Question.INFO, "", ()))
     except TransportError:
         return False
     return True
@@ -139,7 +136,7 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
             (Question.NEAREST, "lamp", (0.0, 0.0, 1.0)),
             (Question.INSTANCES, "", ()),
         ):
-            asked = Asked(question, name, point)
+            asked = Request(question, name, point)
             assert ask_mapper(service.endpoint, asked) == ask_file(str(map_file), asked)
         done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--out", folder / "live.json")
         assert done.returncode == 0 and "cup" in done.stdout, done.stderr
@@ -184,55 +181,3 @@ def test_graph_of_a_running_mapper_keeps_its_ids() -> None:
         first, again = c.graph(), c.graph()
         assert [room.id for room in first.rooms] == [room.id for room in again.rooms] == [1]
         assert first.room_of == again.room_of and [t.id for t in first.things] == [t.id for t in c.instances()]
-
-
-@pytest.fixture(scope="module")
-def tiles(map_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same map in tiles, with the whole of it in a file beside them."""
-    folder = tmp_path_factory.mktemp("tiles")
-    make_tiles([map_file], [np.eye(4)], folder, 6)
-    TiledMap.open(folder).load().save(folder / "whole.npz")
-    return folder
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        Asked(Question.INFO),
-        Asked(Question.AT, point=(0.75, 0.1, 0.4)),
-        Asked(Question.AT, point=(9.0, 9.0, 9.0)),
-        Asked(Question.NEAREST, "cup", (-0.5, 0.4, 0.2)),
-        Asked(Question.NEAREST, "lamp", (0.0, 0.0, 0.0)),
-        Asked(Question.INSTANCES),
-        Asked(Question.INSTANCES, up=(0.0, 1.0, 0.0)),
-        Asked(Question.GRAPH),
-    ],
-)
-@pytest.mark.parametrize("url", [False, True])
-def test_tiles_answer_as_the_whole_map(tiles: Path, asked: Asked, url: bool) -> None:
-    expected = ask_file(str(tiles / "whole.npz"), asked)
-    found = ask_tiles(f"file://{tiles}" if url else str(tiles), asked)
-    if asked.question is Question.INFO:
-        assert found.pop("tiles") > 4
-    assert found == expected
-
-
-def test_query_and_export_see_that_a_folder_holds_tiles(tiles: Path, tmp_path: Path) -> None:
-    code, said = run_here("query", tiles, "nearest", "cup", -0.5, 0.4, 0.2)
-    assert code == 0 and "distance m" in said
-    code, said = run_here("export", tiles, "--out", tmp_path / "points.ply")
-    assert code == 0 and "points" in said
-    code, said = run_here("relocalize", tiles, tmp_path)
-    assert code == 1 and "it holds a map in tiles, which `query` and `export` read" in said
-    code, said = run_here("query", "memory://nothing-there", "info")
-    assert code == 1 and "tiles.json: is missing" in said
-
-
-def test_a_damaged_tile_is_reported_with_its_name(tiles: Path, tmp_path: Path) -> None:
-    shutil.copytree(tiles, tmp_path / "tiles")
-    for file in (tmp_path / "tiles" / "tiles").iterdir():
-        file.write_bytes(file.read_bytes()[:-100])
-    code, said = run_here("query", tmp_path / "tiles", "nearest", "cup", 0, 0, 0)
-    assert code == 1 and ".npz: damaged" in said
-    code, said = run_here("query", tmp_path / "tiles", "info")
-    assert code == 0, "the manifest says it all"

@@ -12,8 +12,6 @@ from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.nodes.doctor import launch_file as doctor_launch
 from semantic_mapper.nodes.doctor.check import Check
-from semantic_mapper.nodes.doctor.robot import PORTS
-from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.transport.keys import allow, make_keys
 from tests.nodes.support import REPLAY_LAUNCH
 
@@ -26,15 +24,6 @@ def of(path: Path, *settings: str) -> dict[str, list[Check]]:
     for check in doctor_launch.launch_file(path, settings):
         found.setdefault(check.name, []).append(check)
     return found
-
-
-def test_ports_of_the_viewer_and_of_all_launch_files_are_looked_at() -> None:
-    assert {9090, 9876} < set(PORTS)
-    remote = ["keys=k", "kind=v4l2", "camera=webcam.toml", "poses=poses.toml"]
-    bridges = [(REMOTE.with_name(f"{kind}.toml"), remote[1:]) for kind in ("foxglove", "zenoh")]
-    for path, settings in ((ROBOT, []), (REMOTE, remote), *bridges):
-        for endpoint, _ in doctor_launch._listening(load_launch(path, settings)):
-            assert int(endpoint.rpartition(":")[2]) in PORTS
 
 
 def test_launch_file_that_up_would_refuse_is_bad(tmp_path: Path) -> None:
@@ -50,7 +39,7 @@ def test_addresses_are_told_with_who_has_them() -> None:
         taken = f"tcp://127.0.0.1:{other.getsockname()[1]}"
         found = of(ROBOT, f"query={taken}", "status=tcp://127.0.0.1:0", "publish=tcp://127.0.0.1:0")
         everywhere = taken.replace("127.0.0.1", "0.0.0.0")
-        assert doctor_launch.port_is_taken(int(taken.rpartition(":")[2]), "0.0.0.0")
+        assert doctor_launch._port_is_taken(int(taken.rpartition(":")[2]), "0.0.0.0")
     assert [(c.state, c.found) for c in found["address"]] == [
         ("ok", "tcp://127.0.0.1:0"),
         ("note", f"{taken} is in use (by this very launch, if it runs)"),

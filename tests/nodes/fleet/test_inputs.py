@@ -2,9 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pyarrow
 import pytest
-from pyarrow import parquet
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.fleet.inputs import find_inputs
@@ -53,19 +51,13 @@ def test_tags_of_a_manifest_go_before_a_plain_name(logs: Path) -> None:
     assert [item.tags for item in found] == [{"robot": "r1"}]
 
 
-def test_a_manifest_may_be_parquet(logs: Path) -> None:
-    table = pyarrow.table({"log": ["a.mcap", "b.mcap"], "run": [7, None]})
-    parquet.write_table(table, logs / "fleet.parquet")
-    assert [item.tags for item in find_inputs([str(logs / "fleet.parquet")], ".mcap")] == [{"run": "7"}, {}]
-
-
 @pytest.mark.parametrize(
     ("text", "why"),
     [
         ("path,robot\na.mcap,r1\n", "no column 'log'"),
-        ("log,robot\n,r1\n", "row 1 names no log"),
+        ("log,robot\n,r1\n", "line 2 names no log"),
         ("log,robot\na.mcap\n", "another number of columns"),
-        ("log,robot\n", "no rows"),
+        ("log,robot\n", "no logs are given"),
         ("", "no column 'log'"),
     ],
 )

@@ -240,11 +240,12 @@ def test_a_file_is_sent_from_the_command_line(weights, tmp_path):
         assert robot.fused(8)
         far = dataclasses.replace(frames[-1], stamp_ns=frames[-1].stamp_ns + 10**9)
         file = write_tum(tmp_path / "true.tum", [*frames[::2], far])
-        done = run("correct", robot.query, file, "--json")
+        done = run("query", robot.query, "correct", file, "--json")
         assert done.returncode == 0, done.stderr
         outcome = json.loads(done.stdout)
         assert (outcome["used"], outcome["left_out"], outcome["completed"], outcome["running"]) == (4, 1, 1, False)
-        wrong = run("correct", robot.query, write_tum(tmp_path / "far.tum", [far]), "--apply-until", "0.2", "--no-wait")
+        far_file = write_tum(tmp_path / "far.tum", [far])
+        wrong = run("query", robot.query, "correct", far_file, "--apply-until", "0.2", "--no-wait")
         assert wrong.returncode == 1
         assert "none of 1 poses was taken within 5 ms of a frame in the history (8 frames from 0.0" in wrong.stderr
         assert client.correction().completed == 1 and robot.end(8)["map"]["corrected_poses"] == 4

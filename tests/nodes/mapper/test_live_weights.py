@@ -115,7 +115,9 @@ def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp
             1,
             ["earlier", "earlier", "in use"],
         )
-        code, text = run_here("weights", learner.robot.query, "--rollback")
+        learner.client.return_to_weights(1)
+        assert eventually(lambda: learner.client.weights().in_use == 1)
+        code, text = run_here("info", learner.robot.query)
         assert code == 0 and "weights 1 in use; 2 times taken, 0 refused, 1 rolled back" in text, text
         state = learner.client.weights()
         assert (state.in_use, state.before, state.rolled_back) == (1, 0, 1)

@@ -26,7 +26,7 @@ from semantic_mapper.config import convert_config, load_mapper_config
 from semantic_mapper.errors import ConfigError, LogError, TransportError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.log_info import describe_log
+from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.nodes.cli.record import _join
 from semantic_mapper.nodes.frame_gaps import MAX_MISSED
 from semantic_mapper.nodes.node import NodeContext

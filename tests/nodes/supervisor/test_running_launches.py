@@ -28,7 +28,7 @@ def test_advice_fits_how_many_launches_run(tmp_path: Path, monkeypatch: pytest.M
         launch_folder(str(tmp_path / "missing"))
 
 
-@pytest.mark.parametrize("words", [("query", "MAP", "info"), ("weights", "MAP"), ("correct", "MAP", "poses.tum")])
+@pytest.mark.parametrize("words", [("query", "MAP", "info"), ("info", "MAP"), ("query", "MAP", "correct", "poses.tum")])
 def test_a_mapper_without_a_socket_is_not_asked(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

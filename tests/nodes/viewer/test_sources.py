@@ -24,6 +24,7 @@ import pytest
 import rerun.chunk
 
 from semantic_mapper.errors import MapError, TransportError
+from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.view import _find_live, _Page
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
@@ -253,7 +254,7 @@ def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:
         thread.start()
         try:
             assert eventually((Path(folder) / STATUS_SOCKET).exists, 20)
-            live = _find_live(folder, "query", "", None)
+            live = _find_live(folder, "query", Remote())
         finally:
             ended.set()
             thread.join()

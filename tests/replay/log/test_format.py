@@ -17,7 +17,7 @@ import pytest
 from semantic_mapper.drivers.base import FrameSource
 from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
-from semantic_mapper.nodes.cli.log_info import describe_log
+from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter, recover
 from semantic_mapper.transport.codec import encode, encode_frame, pack_parts
 from semantic_mapper.transport.messages import StreamInfo

@@ -7,8 +7,8 @@ from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair,
 from semantic_mapper.replay.sfm.film import FilmLook
 from semantic_mapper.replay.sfm.refusals import (
     FilmError,
-    doubt_baseline,
-    doubt_focal,
+    baseline_notes,
+    focal_note,
     refuse_features,
     refuse_look,
     refuse_outcome,
@@ -81,7 +81,7 @@ def test_what_does_not_hang_together_is_refused(found: Outcome, spans: list[rang
 
 def test_a_calibration_is_doubted_where_the_pictures_are_sure() -> None:
     def doubt(factor: float, sigmas: float) -> str:
-        return doubt_focal("film.mp4", "camera.toml", 500.0, FocalCheck(factor, sigmas))
+        return focal_note("film.mp4", "camera.toml", 500.0, FocalCheck(factor, sigmas))
 
     assert doubt(1.02, 40.0) == doubt(1.5, 3.0) == ""
     assert "camera.toml is 500 px" in doubt(1.08, 20.0) and "460 px" in doubt(0.92, 20.0)
@@ -91,10 +91,10 @@ def test_a_calibration_is_doubted_where_the_pictures_are_sure() -> None:
 
 
 def test_what_a_straight_way_tells_badly_is_noted() -> None:
-    assert doubt_baseline(False, 12.0, Sigmas(0.003, 0.004, 0.01)) == []
-    (ahead,) = doubt_baseline(True, 6.3, Sigmas(None, 0.0074, 0.011))
+    assert baseline_notes(False, 12.0, Sigmas(0.003, 0.004, 0.01)) == []
+    (ahead,) = baseline_notes(True, 6.3, Sigmas(None, 0.0074, 0.011))
     assert "straight ahead" in ahead and "6.3 degrees" in ahead and "1.1 % (median)" in ahead and "0.74 %" in ahead
-    assert "cannot be told" in doubt_baseline(False, 6.3, None)[0]
-    (lens,) = doubt_baseline(False, 12.0, Sigmas(0.047, 0.004, 0.01))
+    assert "is unknown" in baseline_notes(False, 6.3, None)[0]
+    (lens,) = baseline_notes(False, 12.0, Sigmas(0.047, 0.004, 0.01))
     assert "exact to 4.7 % only" in lens and "--calibration" in lens
-    assert "57 %" in doubt_baseline(True, 6.3, Sigmas(0.57, 0.01, 0.01))[1]
+    assert "57 %" in baseline_notes(True, 6.3, Sigmas(0.57, 0.01, 0.01))[1]

@@ -1,0 +1,289 @@
+"""Focal length, principal point and lens distortion of one camera, and a picture of how well they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.views import (
+    CELLS,
+    MIN_TILT_DEG,
+    BoardView,
+    area_counts,
+    shortfalls,
+    tilt_degrees,
+)
+from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
+from semantic_mapper.errors import CameraError, FrameError
+from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.plots import BAD, DIM_TEXT, GOOD, PANEL, SMALL_PT, TITLE_PT, WARN, cut, new_figure, rendered
+from semantic_mapper.types import CameraIntrinsics, Float64
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+OUTLIER = 3.0  # times the median error of a view: it was blurred, or the board was bent
+OUTLIER_FLOOR_PX = 0.3
+MAX_LEFT_OUT = 0.2  # fraction of the views
+MAX_FOCAL_SIGMA = 0.005  # one sigma of the focal length, as a fraction of it
+_LONGEST = 0.03  # of the image's width, for the 95th percentile of the residuals in the picture
+_MAX_TILT_DEG = 60
+_GOOD, _BAD, _WARN, _DIM, _PANEL = (tuple(v / 255 for v in c) for c in (GOOD, BAD, WARN, DIM_TEXT, PANEL))
+_FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraCalibration:
+    """A calibrated camera and how it came about.
+
+    Args:
+        intrinsics: With distortion.
+        estimated: False where they were given, and only compared with the views.
+        rms_px: Root mean square of the distances of corners, seen and predicted.
+        sigmas: One-sigma uncertainty by name (fx, fy, cx, cy, k1, ...); empty where they were given.
+        views: Those used.
+        residuals: (N, 2) a view, seen minus predicted, pixels.
+        errors_px: RMS of each view.
+        tilts: (V, 2) degrees; counts: corners a cell; see ``views``.
+        left_out: Names of views that did not fit the others.
+    """
+
+    intrinsics: CameraIntrinsics
+    estimated: bool
+    rms_px: float
+    sigmas: dict[str, float]
+    views: tuple[BoardView, ...]
+    residuals: tuple[Float64, ...]
+    errors_px: tuple[float, ...]
+    tilts: Float64
+    counts: NDArray[np.int64]
+    left_out: tuple[str, ...] = ()
+
+
+def calibrate_camera(
+    camera_id: str, views: Sequence[BoardView], size: tuple[int, int], config: CalibrationConfig
+) -> CameraCalibration:
+    """Calibrate from views that are unlike each other.
+
+    Raises:
+        CameraError: the views cover too little, do not fit each other, or leave the focal length open; says which.
+    """
+    counts = area_counts([v.pixels for v in views], size)
+    early = shortfalls(config, len(views), counts, None)
+    if early:
+        raise _refusal(camera_id, early)
+    left_out: list[str] = []
+    used = list(views)
+    found = _calibrate(used, size, config)
+    for _ in range(2):
+        errors = np.array(found.errors_px)
+        limit = max(OUTLIER * float(np.median(errors)), OUTLIER_FLOOR_PX)
+        worst = [i for i in np.argsort(-errors) if errors[i] > limit]
+        worst = worst[: int(MAX_LEFT_OUT * len(views)) - len(left_out)]
+        if not worst:
+            break
+        left_out += [used[i].name for i in worst]
+        used = [view for i, view in enumerate(used) if i not in worst]
+        found = _calibrate(used, size, config)
+    _check(camera_id, found, config)
+    return replace(found, left_out=tuple(left_out))
+
+
+def compare_camera(
+    camera_id: str, views: Sequence[BoardView], intrinsics: CameraIntrinsics, config: CalibrationConfig
+) -> CameraCalibration:
+    """How well a camera that is calibrated already fits its views.
+
+    Raises:
+        CameraError: no view, or they do not fit.
+    """
+    ideal = CameraIntrinsics(
+        intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.width, intrinsics.height
+    )
+    poses: list[Float64] = []
+    residuals: list[Float64] = []
+    used: list[BoardView] = []
+    for view in views:
+        found = board_poses(view.points, ideal_pixels(view.pixels, intrinsics), ideal)
+        if found:
+            poses.append(pose_of_vector(found[0][1]))
+            residuals.append(view.pixels - _project(view.points, found[0][1], intrinsics))
+            used.append(view)
+    if not used:
+        raise _refusal(camera_id, ("the board was seen in none of its images",))
+    result = _gather(intrinsics, False, {}, used, residuals, poses)
+    _check_error(camera_id, result, config)
+    return result
+
+
+def ideal_pixels(pixels: Float64, intrinsics: CameraIntrinsics) -> Float64:
+    """(N, 2) -> where a camera without distortion, otherwise the same, would see them."""
+    if not any(intrinsics.distortion):
+        return pixels
+    K = camera_matrix(intrinsics)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+    ideal = cv2.undistortImagePoints(pixels[:, None], K, np.array(intrinsics.distortion), None, criteria)
+    return np.asarray(ideal, np.float64).reshape(-1, 2)
+
+
+def _calibrate(views: Sequence[BoardView], size: tuple[int, int], config: CalibrationConfig) -> CameraCalibration:
+    points = [v.points.astype(np.float32) for v in views]
+    pixels = [v.pixels.astype(np.float32)[:, None] for v in views]
+    start: Float64 = np.eye(3)
+    try:
+        _, K, lens, turns, shifts, sigmas, _, _ = cv2.calibrateCameraExtended(
+            points, pixels, size, start, np.zeros(5), flags=_FLAGS[config.coefficients]
+        )
+    except cv2.error as error:
+        raise CameraError(
+            f"the views allow no calibration: {error.err}; are board and its sizes the right ones?"
+        ) from error
+    distortion = tuple(float(v) for v in np.ravel(lens)[: config.coefficients])
+    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    if not np.isfinite((fx, fy, cx, cy, *distortion)).all() or not (0 < cx < size[0] and 0 < cy < size[1]):
+        raise CameraError(
+            f"the views lead to an impossible camera (fx {fx:.0f}, centre {cx:.0f}, {cy:.0f}); are board and its sizes "
+            "the right ones, and is it flat?"
+        )
+    try:
+        intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size, distortion)
+    except FrameError as error:
+        raise CameraError(f"the views lead to an impossible camera: {error}; are board and its sizes right?") from error
+    names = ("fx", "fy", "cx", "cy", *COEFFICIENT_NAMES[: config.coefficients])
+    sigma_by_name: dict[str, float] = dict(zip(names, (float(v) for v in np.ravel(sigmas)), strict=False))
+    vectors = [
+        np.concatenate((np.ravel(r), np.ravel(t))).astype(np.float64) for r, t in zip(turns, shifts, strict=True)
+    ]
+    residuals = [v.pixels - _project(v.points, pose, intrinsics) for v, pose in zip(views, vectors, strict=True)]
+    return _gather(intrinsics, True, sigma_by_name, views, residuals, [pose_of_vector(v) for v in vectors])
+
+
+def _gather(
+    intrinsics: CameraIntrinsics,
+    estimated: bool,
+    sigmas: dict[str, float],
+    views: Sequence[BoardView],
+    residuals: Sequence[Float64],
+    poses: Sequence[Float64],
+) -> CameraCalibration:
+    errors = tuple(float(np.sqrt((r**2).sum(axis=1).mean())) for r in residuals)
+    return CameraCalibration(
+        intrinsics,
+        estimated,
+        float(np.sqrt((np.concatenate(list(residuals)) ** 2).sum(axis=1).mean())),
+        sigmas,
+        tuple(views),
+        tuple(residuals),
+        errors,
+        np.array([tilt_degrees(T) for T in poses]),
+        area_counts([v.pixels for v in views], (intrinsics.width, intrinsics.height)),
+    )
+
+
+def _project(points: Float64, pose: Float64, intrinsics: CameraIntrinsics) -> Float64:
+    lens = np.array(intrinsics.distortion or (0.0,) * 4, np.float64)
+    seen, _ = cv2.projectPoints(points, pose[:3], pose[3:], camera_matrix(intrinsics), lens)
+    return np.asarray(seen, np.float64).reshape(-1, 2)
+
+
+def _check(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> None:
+    lacks = shortfalls(config, len(found.views), found.counts, found.tilts)
+    if lacks:
+        raise _refusal(camera_id, lacks)
+    _check_error(camera_id, found, config)
+    fraction = max(found.sigmas["fx"] / found.intrinsics.fx, found.sigmas["fy"] / found.intrinsics.fy)
+    if fraction > MAX_FOCAL_SIGMA:
+        lack = (
+            f"the focal length is known to {100 * fraction:.2f} % only (one sigma; {100 * MAX_FOCAL_SIGMA:g} % is "
+            "needed): show the board nearer, and lean it further, in more images"
+        )
+        raise _refusal(camera_id, (lack,))
+
+
+def _check_error(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> None:
+    if found.rms_px > config.max_error_px:
+        lack = (
+            f"corners are off by {found.rms_px:.2f} px (RMS; {config.max_error_px:g} are allowed): check the sizes of "
+            "the board, glue it to something flat, hold it still, and use sharp images"
+        )
+        raise _refusal(camera_id, (lack,))
+
+
+def _refusal(camera_id: str, lacks: Sequence[str]) -> CameraError:
+    return CameraError(f"camera '{camera_id}' cannot be calibrated from these images: {'; '.join(lacks)}")
+
+
+@rendered
+def draw_calibration(camera_id: str, found: CameraCalibration) -> Figure:
+    """Residuals of all corners, the error of each view, and the tilts of the board."""
+    figure = new_figure(1400, 760, layout="constrained")
+    title = f"{cut(camera_id, 700, TITLE_PT)}: {len(found.views)} views, {found.rms_px:.3f} px RMS"
+    figure.suptitle(title, x=0.012, ha="left")
+    grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1))
+    _draw_residuals(figure.add_subplot(grid[:, 0]), found)
+    _draw_errors(figure.add_subplot(grid[0, 1]), found)
+    _draw_tilts(figure.add_subplot(grid[1, 1]), found)
+    return figure
+
+
+def _draw_residuals(axes: Axes, found: CameraCalibration) -> None:
+    """The image with its cells, the corners, and their residuals enlarged."""
+    i = found.intrinsics
+    values = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy}
+    sigmas = {name: f" ± {found.sigmas[name]:.2f}" if name in found.sigmas else "" for name in values}
+    axes.set_title(",  ".join(f"{name} {value:.2f}{sigmas[name]}" for name, value in values.items()))
+    right, bottom = i.width - 0.5, i.height - 0.5
+    edges = np.linspace(-0.5, right, CELLS + 1), np.linspace(-0.5, bottom, CELLS + 1)
+    seen = np.where(found.counts > 0, 0.12, 0.0)
+    axes.imshow(np.dstack([np.ones((CELLS, CELLS, 3)), seen]), extent=(-0.5, right, bottom, -0.5), aspect="equal")
+    label = {"color": _DIM, "zorder": 5, "bbox": {"facecolor": _PANEL, "linewidth": 0, "pad": 1}}
+    for (row, column), count in np.ndenumerate(found.counts):
+        place = edges[0][column], edges[1][row]
+        axes.annotate(str(count), place, (4, -4), textcoords="offset points", va="top", fontsize=SMALL_PT, **label)
+    pixels = np.concatenate([view.pixels for view in found.views])
+    residuals = np.concatenate(found.residuals)
+    lengths = np.linalg.norm(residuals, axis=1)
+    longest = max(float(np.percentile(lengths, 95)), 1e-6)
+    enlarged = _LONGEST * i.width / longest
+    colors = np.where((lengths <= longest)[:, None], _GOOD, _BAD)
+    style = {"angles": "xy", "scale_units": "xy", "width": 0.0015, "headwidth": 1, "headlength": 0, "headaxislength": 0}
+    axes.quiver(*pixels.T, *residuals.T, color=colors, scale=1 / enlarged, **style)
+    axes.plot(*pixels.T, ".", color="white", markersize=2.5)
+    axes.set(xticks=edges[0], yticks=edges[1], xlim=(-0.5, right), ylim=(bottom, -0.5))
+    axes.tick_params(length=0, labelbottom=False, labelleft=False)
+    axes.set_axisbelow(False)
+    axes.grid(color=_PANEL, linewidth=1.5)
+    note = f"lines: seen minus predicted, {enlarged:.0f} times enlarged, orange: the longest 5 %\n"
+    axes.set_xlabel(f"{note}numbers: corners in a cell; dark cells: none", loc="left")
+
+
+def _draw_errors(axes: Axes, found: CameraCalibration) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    left_out = f", {len(found.left_out)} left out" if found.left_out else ""
+    axes.set(title=f"error of each view{left_out}", xlabel="view", ylabel="px RMS")
+    axes.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=_GOOD)
+    axes.axhline(found.rms_px, color=_WARN, label=f"all corners: {found.rms_px:.2f}")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(0, max(1.25 * max(found.errors_px), 1e-6))
+    axes.legend(loc="upper right")
+
+
+def _draw_tilts(axes: Axes, found: CameraCalibration) -> None:
+    """How the board leaned in each view, and how far it has to have leaned at least once."""
+    up, side = np.clip(found.tilts, -_MAX_TILT_DEG, _MAX_TILT_DEG).T
+    least, ticks = MIN_TILT_DEG, range(-_MAX_TILT_DEG, _MAX_TILT_DEG + 1, 20)
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * least
+    axes.plot(*square.T, "-", color=_WARN, linewidth=1, label=f"needed: beyond {least:g}° each way")
+    axes.plot(side, up, "o", color=_GOOD)
+    axes.set(title="how the board leaned", xlabel="to a side, degrees", ylabel="up or down, degrees")
+    axes.set(xlim=(-65, 65), ylim=(65, -65), xticks=ticks, yticks=ticks, aspect="equal")
+    axes.legend(loc="upper center", handlelength=1)

@@ -1,0 +1,72 @@
+"""Which V4L2 cameras are connected, under names that stay the same when one is plugged in again."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from semantic_mapper.drivers.registry import FoundCamera
+from semantic_mapper.drivers.v4l2 import ioctls
+
+SHOWN_FORMATS = 8
+WIDER = 2.4  # width over height, of two images side by side; the widest single ones are 21:9
+DEVICES = Path("/dev")
+LINKS = (Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path"))  # by model and serial number; by the port it hangs on
+
+
+def stable_path(device: Path) -> Path:
+    """The link that udev keeps for a device, by-id where there is one; the device's own path where there is none."""
+    if any(device.parent == folder for folder in LINKS):
+        return device
+    for folder in LINKS:
+        for link in sorted(folder.glob("*")) if folder.is_dir() else ():
+            if link.resolve() == device.resolve():
+                return link
+    return device
+
+
+def video_nodes() -> list[Path]:
+    """All /dev/video* in the order of their numbers."""
+    nodes = [p for p in DEVICES.glob("video*") if re.fullmatch(r"video\d+", p.name)]
+    return sorted(nodes, key=lambda p: int(p.name.removeprefix("video")))
+
+
+def list_devices() -> list[FoundCamera]:
+    """One row for each device that gives images; what cannot be opened is listed with the reason."""
+    rows = [_describe(node) for node in video_nodes()]
+    return [row for row in rows if row is not None]
+
+
+def _describe(node: Path) -> FoundCamera | None:
+    """None where it is no camera: the metadata of one, a codec, or gone again."""
+    try:
+        with ioctls.opened(node) as fd:
+            who = ioctls.query_capability(fd)
+            formats = ioctls.list_formats(fd) if who.captures else ()
+    except FileNotFoundError:
+        return None
+    except PermissionError:
+        return FoundCamera("v4l2", "?", str(node), "no permission: add yourself to the group `video` and log in again")
+    except OSError as error:
+        return FoundCamera("v4l2", "?", str(node), f"does not answer: {error.strerror}")
+    if not who.captures:
+        return None
+    note = f"{node.name}; {' '.join(formats[:SHOWN_FORMATS]) or 'no formats'}; {who.driver} at {who.bus}"
+    return FoundCamera("v4l2", who.card, str(stable_path(node)), note)
+
+
+def list_stereo() -> list[FoundCamera]:
+    """Cameras with images as wide as two side by side; one that cannot be opened is in ``list_devices``."""
+    found: list[FoundCamera] = []
+    for node in video_nodes():
+        try:
+            with ioctls.opened(node) as fd:
+                who = ioctls.query_capability(fd)
+                sizes = ioctls.list_sizes(fd) if who.captures else ()
+        except OSError:
+            continue
+        wide = [f"{width}x{height}" for width, height in sizes if width > WIDER * height]
+        if wide:
+            note = f"{node.name}; side by side {' '.join(wide)}"
+            found.append(FoundCamera("stereo", who.card, str(stable_path(node)), note))
+    return found

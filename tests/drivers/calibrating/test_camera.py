@@ -1,0 +1,165 @@
+"""A known camera is found again from pictures of a board; what cannot be believed is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from semantic_mapper.drivers.calibrating import camera
+from semantic_mapper.drivers.calibrating.camera import calibrate_camera, compare_camera, draw_calibration, ideal_pixels
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.views import (
+    MIN_CORNERS,
+    REGIONS,
+    BoardView,
+    ViewGatherer,
+    area_counts,
+    missing_regions,
+)
+from semantic_mapper.errors import CameraError
+from semantic_mapper.geometry import camera_matrix, project
+from semantic_mapper.types import CameraIntrinsics, Float64
+from tests.figures import figure_of, misplaced_texts
+
+from .boards import BOARD, LENS, corners_of, image, shown, views
+
+SIZE = (LENS.width, LENS.height)
+CONFIG = CalibrationConfig()
+
+
+@pytest.fixture(scope="module")
+def gathered() -> ViewGatherer:
+    gatherer = ViewGatherer(BOARD, CONFIG, stream=False)
+    for seq, (_, picture) in enumerate(shown()):
+        gatherer.take(picture, f"{seq}.png")
+    return gatherer
+
+
+def made_up(poses: list[Float64], noise_px: float = 0.1, seed: int = 0) -> list[BoardView]:
+    """What finding corners in pictures would give, without the pictures."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for number, T in enumerate(poses):
+        points, pixels = corners_of(T, LENS)
+        inside = ((pixels > 2) & (pixels < np.array(SIZE) - 3)).all(axis=1)
+        seen = pixels[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))
+        found.append(BoardView(str(number), number, points[inside], seen))
+    return [v for v in found if len(v.points) >= MIN_CORNERS]
+
+
+def rays(intrinsics: CameraIntrinsics) -> Float64:
+    """Where pixels all over the image look, (N, 2) at depth 1."""
+    u, v = np.meshgrid(np.linspace(20, 619, 9), np.linspace(20, 459, 7))
+    pixels = np.stack((u.ravel(), v.ravel()), axis=1)
+    ideal = ideal_pixels(pixels, intrinsics)
+    return (ideal - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
+
+
+def test_a_known_camera_is_found_from_pictures(gathered: ViewGatherer) -> None:
+    assert gathered.seen == 20 and gathered.lacks() == ()
+    found = calibrate_camera("cam", gathered.kept, SIZE, CONFIG)
+    assert found.rms_px < 0.15 and found.estimated
+    for name, truth in (("fx", LENS.fx), ("fy", LENS.fy)):
+        value = getattr(found.intrinsics, name)
+        assert abs(value / truth - 1) < 0.005
+        assert abs(value - truth) < 5 * found.sigmas[name] and found.sigmas[name] / truth < 0.002
+    # Focal length, centre and distortion may trade against each other; where pixels look is what counts.
+    off_px = np.linalg.norm(rays(found.intrinsics) - rays(LENS), axis=1) * LENS.fx
+    turned = off_px.mean()  # a shift of the centre is a small turn of the camera
+    assert off_px.max() < 1.5 and turned < 0.8
+    assert list(found.sigmas) == ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
+    assert len(found.errors_px) == len(found.views) == len(found.residuals) == len(found.tilts)
+    picture = draw_calibration("cam", found)
+    assert picture.dtype == np.uint8 and picture.shape[2] == 3
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50  # corners, lines and bars, not an empty panel
+    assert not misplaced_texts(figure_of(draw_calibration, "cam", found))
+
+
+@pytest.mark.parametrize("coefficients", [4, 5, 8])
+def test_as_many_coefficients_as_requested(coefficients: int) -> None:
+    config = CalibrationConfig(coefficients=coefficients)  # type: ignore[arg-type]
+    found = calibrate_camera("cam", made_up(views(20), 0.02), SIZE, config)
+    assert len(found.intrinsics.distortion) == coefficients
+    assert np.abs(rays(found.intrinsics) - rays(LENS)).max() * LENS.fx < (1.0 if coefficients == 8 else 0.6)
+
+
+def test_a_blurred_view_is_left_out_and_named() -> None:
+    good = made_up(views(20))
+    rng = np.random.default_rng(5)
+    bad = dataclasses.replace(
+        good[3], name="blurred.png", pixels=good[3].pixels + rng.normal(0, 3, (len(good[3].pixels), 2))
+    )
+    found = calibrate_camera("cam", [*good[:3], bad, *good[4:]], SIZE, CONFIG)
+    assert found.left_out == ("blurred.png",) and found.rms_px < 0.2
+
+
+def test_views_in_the_middle_alone_are_refused_with_what_is_missing() -> None:
+    with pytest.raises(CameraError, match="not seen in these parts of the image: top left, ") as caught:
+        calibrate_camera("front", made_up(views(20, aside=0.0)), SIZE, CONFIG)
+    assert "camera 'front'" in str(caught.value)
+    left = [v for v in made_up(views(24)) if v.pixels[:, 0].max() < 420]
+    few = CalibrationConfig(min_views=4)
+    with pytest.raises(CameraError, match="parts of the image: top right, right, bottom right;"):
+        calibrate_camera("front", left, SIZE, few)
+
+
+def test_a_board_that_never_leaned_is_refused() -> None:
+    with pytest.raises(CameraError, match="never leaned up or down by 15 degrees"):
+        calibrate_camera("cam", made_up(views(20, tilted=False), 0.02), SIZE, CONFIG)
+
+
+def test_too_few_views_wrong_sizes_and_open_focal_lengths_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CameraError, match="5 views that differ from each other, 10 are needed"):
+        calibrate_camera("cam", made_up(views(20))[:5], SIZE, CONFIG)
+    bent = [dataclasses.replace(v, pixels=v.pixels + 4 * np.sin(v.points[:, :1] * 60)) for v in made_up(views(20))]
+    with pytest.raises(CameraError, match=r"corners are off by \d.*check the sizes"):
+        calibrate_camera("cam", bent, SIZE, CONFIG)
+    monkeypatch.setattr(camera, "MAX_FOCAL_SIGMA", 1e-4)
+    with pytest.raises(CameraError, match=r"known to \d.\d\d % only"):
+        calibrate_camera("cam", made_up(views(20), 0.5), SIZE, CONFIG)
+
+
+def test_a_camera_that_is_calibrated_is_compared_only() -> None:
+    found = compare_camera("cam", made_up(views(12), 0.2), LENS, CONFIG)
+    assert found.intrinsics is LENS and not found.estimated and found.sigmas == {}
+    assert found.rms_px == pytest.approx(0.2 * np.sqrt(2), rel=0.15)
+    wrong = dataclasses.replace(LENS, distortion=())
+    with pytest.raises(CameraError, match="corners are off by"):
+        compare_camera("cam", made_up(views(12)), wrong, CONFIG)
+
+
+def test_ideal_pixels_are_those_of_the_pinhole_camera() -> None:
+    T = views(1)[0]
+    points, pixels = corners_of(T, LENS)
+    at = points @ T[:3, :3].T + T[:3, 3]
+    assert np.abs(ideal_pixels(pixels, LENS) - project(at, LENS)).max() < 1e-6
+    assert camera_matrix(LENS)[0, 0] == LENS.fx
+
+
+def test_streams_give_a_view_only_where_the_board_is_held_still() -> None:
+    first, second = views(2)
+    moving = first.copy()
+    moving[0, 3] += 0.02
+    gatherer = ViewGatherer(BOARD, CONFIG, stream=True)
+    shown = (first, moving, moving, moving, second, second)
+    assert [gatherer.take(image(seq, T)) for seq, T in enumerate(shown)] == [False, False, True, False, False, True]
+    assert gatherer.seen == 6 and len(gatherer.steady) == 3 and len(gatherer.kept) == 2
+
+
+def test_images_without_a_board_and_of_another_size_are_told() -> None:
+    gatherer = ViewGatherer(BOARD, CONFIG, stream=False)
+    assert gatherer.lacks() == ("no image has come yet",)
+    blank = dataclasses.replace(shown()[0][1], rgb=np.full((480, 640, 3), 90, np.uint8))
+    assert not gatherer.take(blank) and gatherer.seen == 0
+    assert len(gatherer.lacks()) == 4 and "0 views" in gatherer.lacks()[0]
+    small = CameraIntrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
+    with pytest.raises(CameraError, match="160x120 among those of"):
+        gatherer.take(dataclasses.replace(blank, rgb=np.zeros((120, 160, 3), np.uint8), intrinsics=small))
+
+
+def test_parts_of_the_image_have_their_names() -> None:
+    assert missing_regions(area_counts([], SIZE)) == REGIONS
+    left_half = np.array([(x, y) for x in range(0, 320, 20) for y in range(0, 480, 20)], np.float64)
+    assert missing_regions(area_counts([left_half], SIZE)) == ("top right", "right", "bottom right")

@@ -1,0 +1,205 @@
+"""Runs of a fleet: what a worker makes of one log, and the driver on a real Ray cluster in this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError
+from semantic_mapper.nodes.fleet import run
+from semantic_mapper.nodes.fleet.cluster import connected
+from semantic_mapper.nodes.fleet.inputs import LogInput
+from semantic_mapper.nodes.fleet.operations import read_settings
+from semantic_mapper.nodes.fleet.run import OtherCodeError, Resources, RunReport, Task, run_fleet, run_task, task_key
+from semantic_mapper.nodes.fleet.store import Store, TaskResult
+from semantic_mapper.replay.summary import read_summary
+from tests.nodes.fleet.tasks import do_as_named
+
+SMALL = Resources(memory_bytes=1 << 20)
+
+
+def task_of(operation: str, out: Path, log: Path, weights: Path, config: Path | None = None, *sets: str) -> Task:
+    return replace(run.make_template(operation, str(out), str(weights), sets, config), log=LogInput(str(log)))
+
+
+def done(task: Task) -> TaskResult:
+    """The result of a task that is done in this process, with all of its files."""
+    assert run_task(task)
+    store = Store(task.store)
+    (found,) = (result for result in store.results() if result.operation == task.operation)
+    assert found.findings.metrics and store.local is not None
+    for name, file in found.files.items():
+        assert hashlib.sha256((store.local / found.folder / name).read_bytes()).hexdigest() == file.sha256
+    return found
+
+
+def test_a_replay_of_the_fleet_is_that_of_the_verb(
+    tmp_path: Path, log: Path, weights: Path, config: Path, replayed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = task_of("replay", tmp_path / "store", log, weights, config)
+    found = done(task)
+    assert set(found.files) >= {"map.npz", "summary.json", "report.html", "overview.png"}
+    assert found.files["map.npz"].sha256 == run.file_digest(replayed / "map.npz")
+    summary = read_summary(replayed)
+    assert found.findings.metrics["miou"] == summary["metrics"]["miou"]
+    assert found.findings.metrics["frames_fused"] == summary["frames"]["fused"] == 6
+    (scores,) = found.findings.scores
+    assert scores.iou == summary["metrics"]["per_class"]
+    assert sum(sum(part[1]) for part in scores.stretches) == summary["metrics"]["pixels"]
+
+    monkeypatch.setattr(run, "_commit", lambda *args: pytest.fail("done again"))
+    copied = Path(shutil.copy(log, tmp_path / "other-name.mcap"))  # the content counts, not the name
+    assert not run_task(replace(task, log=LogInput(str(copied))))
+    monkeypatch.setattr(run, "file_digest", lambda path: pytest.fail("read again"))
+    assert not run_task(task)
+
+
+def test_other_settings_weights_content_or_code_are_another_result(tmp_path: Path, log: Path, weights: Path) -> None:
+    task = task_of("replay", tmp_path, log, weights)
+    others = [replace(task, weights_digest="other"), replace(task, code="other"), replace(task, operation="eval")]
+    others.append(task_of("replay", tmp_path, log, weights, None, "max_frames=2"))
+    keys = {task_key(task, "digest"), task_key(task, "other"), *(task_key(other, "digest") for other in others)}
+    assert len(keys) == 6
+    assert task_key(task_of("replay", tmp_path, log, weights, None, "max_frames=0"), "digest") in keys
+
+
+@pytest.mark.parametrize(
+    ("operation", "sets", "file", "metric"),
+    [
+        ("eval", ("max_frames=2",), "eval.html", ("frames_scored", 2)),
+        ("autolabel", ("max_frames=2",), "labelled.mcap", ("frames", 2)),
+        ("finetune", ("keyframes=2", "steps=1", "seconds=0", "width=96"), "weights.safetensors", ("steps", 1)),
+    ],
+)
+def test_operations_leave_their_files_and_figures(
+    tmp_path: Path,
+    log: Path,
+    weights: Path,
+    config: Path,
+    operation: str,
+    sets: tuple[str, ...],
+    file: str,
+    metric: tuple[str, float],
+) -> None:
+    found = done(task_of(operation, tmp_path, log, weights, None if operation == "finetune" else config, *sets))
+    assert file in found.files and found.findings.metrics[metric[0]] == metric[1]
+    if operation == "eval":
+        assert found.findings.scores[0].method == "sray"
+        assert found.findings.metrics["miou"] == found.findings.metrics["miou sray"]
+
+
+def test_refine_takes_maps(tmp_path: Path, replayed: Path) -> None:
+    found = done(task_of("refine", tmp_path, replayed / "map.npz", Path("smoothed"), None, "up=z"))
+    assert set(found.files) == {"map.npz"} and (found.findings.metrics["surface"] or 0) > 0
+
+
+def test_what_a_worker_cannot_do_says_why(tmp_path: Path, log: Path, weights: Path) -> None:
+    task = task_of("replay", tmp_path / "store", log, weights)
+    with pytest.raises(OtherCodeError, match="install the same everywhere"):
+        run_task(replace(task, code="other"))
+    with pytest.raises(LogError, match="no such log"):
+        run_task(replace(task, log=LogInput(str(tmp_path / "none.mcap"))))
+    with pytest.raises(LogError, match="a folder without logs"):
+        run_task(replace(task, log=LogInput(str(tmp_path))))
+    with pytest.raises(StoreError, match="--out must be a bucket"):
+        run_task(replace(task, store=str(tmp_path / "none")))
+    for name in Store(task.store).names("weights"):
+        for file in (tmp_path / "store" / "weights" / name).iterdir():
+            file.write_bytes(b"damaged")
+    with pytest.raises(StoreError, match=r"the weights \S+ in it are damaged"):
+        run_task(task)
+    assert not list(Store(task.store).results())
+
+
+@pytest.mark.parametrize(
+    ("operation", "text", "why"),
+    [
+        ("replay", "max_frame=3", "did you mean `max_frames`"),
+        ("finetune", "second=3", "did you mean `seconds`"),
+        ("finetune", "kind=panoptic", "kind"),
+        ("replay", "voxel_map.voxel_size=3", "voxel_size_m"),
+        ("replay", "quality", "NAME=VALUE"),
+        ("replay", "max_frames=many", "max_frames"),
+    ],
+)
+def test_settings_that_cannot_be_used_say_why(operation: str, text: str, why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        read_settings(operation, [text])
+
+
+def test_a_store_is_not_made_for_what_cannot_be_run(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        run.make_template("replay", str(tmp_path / "store"), None, ["no=1"])
+    assert not (tmp_path / "store").exists()
+    with pytest.raises(StoreError, match=r"none\.safetensors: is missing"):
+        run.make_template("replay", str(tmp_path / "store"), str(tmp_path / "none.safetensors"))
+
+
+# The driver
+
+
+@pytest.fixture(scope="module")
+def _cluster() -> Iterator[None]:
+    with connected(None, cpus=2):
+        yield
+
+
+def run_logs(folder: Path, *logs: str, **options: Any) -> RunReport:
+    (folder / "traces").mkdir(exist_ok=True)
+    template = Task("replay", Store(str(folder / "store"), create=True).url, {}, {}, "", "", False, "", LogInput(""))
+    inputs = [LogInput(log, {"traces": str(folder / "traces")}) for log in logs]
+    return run_fleet(template, inputs, SMALL, function=do_as_named, **options)
+
+
+def traces(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "traces").iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_cluster")
+def test_every_log_is_done_once_and_the_rest_goes_on_without_those_that_fail(tmp_path: Path) -> None:
+    names = [f"log{n:02}" for n in range(20)]
+    report = run_logs(tmp_path, *names, "exists", "bad", "away-once", "dies-once", "dies")
+    assert (report.total, report.done, report.existing, len(report.failures)) == (25, 22, 1, 2)
+    expected = [*(f"{name}.0" for name in names), "exists.0", "bad.0"]
+    expected += ["away-once.0", "away-once.1", "dies-once.0", "dies-once.1", *(f"dies.{n}" for n in range(4))]
+    assert traces(tmp_path) == sorted(expected)
+    failures = {failure.log: failure.error for failure in Store(str(tmp_path / "store")).failures()}
+    assert failures["bad"] == "LogError: bad: cannot be read"
+    assert "the process of the task died 4 times" in failures["dies"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_cluster")
+def test_the_same_command_tries_failed_logs_again_and_forgets_what_went_wrong(tmp_path: Path) -> None:
+    assert len(run_logs(tmp_path, "bad-once").failures) == 1
+    assert run_logs(tmp_path, "bad-once").done == 1
+    assert not list(Store(str(tmp_path / "store")).failures())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_cluster")
+def test_a_stop_ends_tasks_at_once(tmp_path: Path) -> None:
+    report = run_logs(tmp_path, "sleeps1", "sleeps2", "sleeps3", stopped=lambda: len(traces(tmp_path)) == 2)
+    assert report.over == 0
+    assert run_logs(tmp_path, "log").done == 1, "the processors are free again"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_cluster")
+@pytest.mark.parametrize(
+    ("resources", "what"), [(Resources(cpus=64), "64 CPUs"), (Resources(gpus=1), "1 GPUs"), (Resources(), "2.15 GB")]
+)
+def test_what_no_node_has_is_refused_at_once(tmp_path: Path, resources: Resources, what: str) -> None:
+    template = Task("replay", Store(str(tmp_path), create=True).url, {}, {}, "", "", False, "", LogInput(""))
+    if what == "2.15 GB":
+        resources = replace(resources, memory_bytes=1 << 50)
+        what = "GB of memory"
+    with pytest.raises(FleetError, match=what):
+        run_fleet(template, [LogInput("a")], resources, function=do_as_named)
