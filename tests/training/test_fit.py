@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from semantic_mapper.training.fit import BestWeights, Budget, FitProgress, HeldOut, budget_fraction, cosine_rate, fit
-from semantic_mapper.training.fit import fit as fitting
 
 
 def held_out(losses: list[float], patience: int = 0) -> HeldOut:
@@ -72,7 +71,7 @@ def test_where_nothing_is_held_out_the_last_weights_are_kept() -> None:
 
 def test_a_time_budget_holds_all_of_it_the_last_look_included(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(fitting.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr("semantic_mapper.training.fit.time.monotonic", lambda: now[0])
 
     def spend(seconds: float) -> float:
         now[0] += seconds
