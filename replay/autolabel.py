@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, LabelError, LogError, WeightsError
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger

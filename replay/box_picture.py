@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.upright import camera_up, ceiling_height, plan_rotation
-from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.geometry import invert_pose, nearest_pixels, project, transform, unproject
 from semantic_mapper.imaging import resize_depth, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet, make_label_set

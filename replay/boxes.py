@@ -25,7 +25,7 @@ from msgspec import Meta
 
 from semantic_mapper.config import Config, convert_config
 from semantic_mapper.errors import ConfigError, PoseError
-from semantic_mapper.fields.primitives import Primitive, ShapeName, centred
+from semantic_mapper.fields.scene.primitives import Primitive, ShapeName, centred
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.geometry import MAX_TRANSLATION_M, check_pose
 from semantic_mapper.labels import STUFF_NAMES, LabelSet

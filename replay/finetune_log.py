@@ -24,9 +24,9 @@ from semantic_mapper.fields.checkpoint import (
     save_checkpoint,
     shipped_checkpoint,
 )
-from semantic_mapper.fields.irt import IRT
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.panoptic import Panoptic, box_config
+from semantic_mapper.fields.scene.irt import IRT
+from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet
@@ -38,8 +38,9 @@ from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.replay.run_folder import prepare_file
-from semantic_mapper.training.boxes_in_view import boxes_in_view
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
+from semantic_mapper.training.boxes import boxes_in_view
+from semantic_mapper.training.config import FinetuneConfig
+from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.fitters import FITTERS, fitter_of
 from semantic_mapper.training.frame_rays import usable_frames
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
@@ -203,7 +204,7 @@ def _fit(
     """
     monitor.start(100)
 
-    def on_progress(progress: FinetuneProgress) -> None:
+    def on_progress(progress: FitProgress) -> None:
         note = f"step {progress.step}"
         if math.isfinite(progress.held_out_loss):
             note += f" held-out loss {progress.held_out_loss:.3f}"

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.fields.panoptic import Panoptic
+from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.files import write_bytes, write_json
 from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.types import PosedFrame, UInt8

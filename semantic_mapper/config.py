@@ -42,6 +42,7 @@ Layers = Annotated[int, msgspec.Meta(ge=0, le=64)]
 Samples = Annotated[int, msgspec.Meta(ge=1, le=1024)]
 SamplesOfTwo = Annotated[int, msgspec.Meta(ge=2, le=1024)]
 Metres = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+DeviceName = Literal["auto", "cpu", "cuda"]  # "auto": a GPU where there is one
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -76,18 +77,11 @@ class SRayConfig(Config, frozen=True):
     heads: Channels = 4  # H; d_k = C / H
     encoder: EncoderConfig = EncoderConfig(depth=True)
     # What attention and view weights work on: one token a view, at the surface that the ray meets (untrained, a vote of
-    # the views); or, as in the paper, one token a view and sample
+    # the views); or, as in the paper, one token a view and sample. "surface" also compares the views' colours, and
+    # takes a lens's focal length into account where it predicts depth
     tokens: Literal["surface", "samples"] = "surface"
-    tau: float = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
-    positional_encoding: bool = False  # sinusoid along the ray; the paper uses none
-    intra_view_attention: bool = False  # Eq. 6 to 9; without effect on tokens at the surface
+    intra_view_attention: bool = False  # Eq. 6 to 9, in the paper's order
     cross_view_attention: bool = True  # Eq. 10
-    occlusion: bool = True  # views count by how much they see a sample; False = all alike, as in the paper
-    source_labels: bool = True  # known labels of source views (finetuning keyframes) are part of their features
-    colour_moments: bool = True  # the density of a sample depends on mean and variance of the views' colours, too
-    depth_by_focal: bool = True  # depth predicted from a picture is proportional to the focal length
-    attention_residual: bool = True  # M + f(M) instead of f(M) in Eq. 9 and 10; trains faster
-    parity: Literal["paper", "published"] = "paper"  # "published": depart from the paper where its code does
 
 
 class UNetFieldConfig(Config, frozen=True):
@@ -126,12 +120,6 @@ class IRTConfig(GridFieldConfig, frozen=True):
     # B: each point by itself. RT: the points of a ray attend to each other. RTT: with a token of the image's texture.
     # BC, RTC: texture beside the composited points. RTTC: token and texture
     variant: IRTVariant = "BC"
-    texture: Literal["cnn", "colour"] = "cnn"  # what tells the texture: three convolutions, or the pixel's colour alone
-    select: Literal["weight", "density"] = "weight"  # which points of a ray are looked at; the paper takes the densest
-    points: Annotated[int, msgspec.Meta(ge=1, le=64)] = 6  # of a ray
-    width: Channels = 64  # of points in the transformer
-    heads: Channels = 4
-    layers: Layers = 2
     # Labelled frames whose labels are carried over to where their surface is seen again, and the size of their images;
     # 0 = labels only teach
     carried: NotNegative = 0
@@ -158,12 +146,10 @@ class PanopticConfig(GridFieldConfig, frozen=True):
 
     features: Annotated[int, msgspec.Meta(ge=1, le=64)] = 16
     trunk_width: Channels = 64
-    head_width: Channels = 64
     # What may be outside of all boxes. stuff: the classes that are no things, and those that no box has that stands
     # still. empty: nothing
     uncovered: Literal["stuff", "empty"] = "stuff"
     classes: Literal["learned", "fixed"] = "learned"  # what is rendered; fixed: what the boxes say, as an ablation
-    samples: Literal["march", "uniform"] = "march"  # of a ray; uniform: evenly from near to far, as an ablation
     boxes: tuple[BoxConfig, ...] = ()
     merge: dict[str, tuple[str, ...]] = {}  # by class of the pseudo labels: those that they cannot tell from it
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from semantic_mapper.config import MapperConfig, convert_config, load_config, to_plain, with_quality
 from semantic_mapper.fields.base import SemanticField
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, find_checkpoint, load_checkpoint
-from semantic_mapper.fields.device import choose_device
-from semantic_mapper.fields.device_field import DeviceField
+from semantic_mapper.fields.device import DeviceField, choose_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -88,7 +87,7 @@ def make_field(model: LearnedField, config: MapperConfig) -> SemanticField:
     """
     if config.render.device == "cuda":
         return DeviceField(model, choose_device("cuda", 0), config.sampling, bfloat16=config.render.bfloat16)
-    if isinstance(model, SRay) and config.sampling.mode == "streaming" and compiled_covers(model):
+    if isinstance(model, SRay) and config.sampling.mode == "streaming":
         return StreamingSRay(model, config.sampling)
     model.sampling = config.sampling
     return model

@@ -127,7 +127,7 @@ def test_a_file_that_is_not_toml_is_named(tmp_path: Path, content: bytes) -> Non
 
 
 @pytest.mark.parametrize(
-    "config", [MapperConfig(seed=5), SRayConfig(tau=0.1, encoder=EncoderConfig(channels=(8, 16), blocks=(1, 2)))]
+    "config", [MapperConfig(seed=5), SRayConfig(heads=2, encoder=EncoderConfig(channels=(8, 16), blocks=(1, 2)))]
 )
 def test_plain_data_converts_back_to_the_same_config(config: Config) -> None:
     assert convert_config(to_plain(config), type(config), "plain") == config

@@ -21,8 +21,7 @@ from semantic_mapper.drivers.poses.config import KINDS
 from semantic_mapper.nodes.launcher.launch_file import LaunchFile
 from semantic_mapper.nodes.options import OPTIONS
 from semantic_mapper.setting_docs import Setting, settings_of
-from semantic_mapper.training.finetune import FinetuneConfig
-from semantic_mapper.training.online import OnlineConfig
+from semantic_mapper.training.config import FinetuneConfig, OnlineConfig
 
 PAGE = Path(__file__).parents[1] / "docs" / "settings.md"
 HEAD = """# Settings

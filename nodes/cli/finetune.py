@@ -170,7 +170,7 @@ def finetune(
     must_be_there(log)
     output = Output.guarded()
     from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
-    from semantic_mapper.training.finetune import FinetuneConfig
+    from semantic_mapper.training.config import FinetuneConfig
     from semantic_mapper.training.fitters import FITTERS
 
     if kind is not None and kind not in FITTERS:
@@ -216,7 +216,7 @@ def finetune(
 
 def finetune_lines(result: FinetuneResult, request: FinetuneRequest) -> list[str]:
     """What was learned, for a reader."""
-    from semantic_mapper.fields.primitive_rays import MAX_INTERVALS
+    from semantic_mapper.fields.scene.boxes import MAX_INTERVALS
 
     checkpoint, chosen = result.checkpoint, result.chosen
     recipe, out, log = checkpoint.recipe, request.out, request.log.name

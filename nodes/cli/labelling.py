@@ -28,8 +28,7 @@ from semantic_mapper.replay.label_folder import (
     read_classes,
 )
 from semantic_mapper.replay.log.sequence import Log, open_log
-from semantic_mapper.training.select import Candidate, candidate_from_frame
-from semantic_mapper.training.suggest import Suggestion, suggest_frames
+from semantic_mapper.training.select import Candidate, Suggestion, candidate_from_frame, suggest_frames
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe
 from semantic_mapper.transport.sockets import Publisher

@@ -56,7 +56,7 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
             return _weights(options.weights)
         case FinetunerOptions() as options:
             from semantic_mapper.config import load_config
-            from semantic_mapper.training.online import OnlineConfig
+            from semantic_mapper.training.config import OnlineConfig
 
             if options.config:
                 load_config(Path(options.config), OnlineConfig)

@@ -11,9 +11,10 @@ import structlog
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.nodes.process import run_when_idle
-from semantic_mapper.training.finetune import FinetuneProgress
+from semantic_mapper.training.config import OnlineConfig
+from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.keyframe_pool import KeyframeSplit
-from semantic_mapper.training.online import OnlineConfig, OnlineResult, learn
+from semantic_mapper.training.online import OnlineResult, learn
 
 _log = structlog.get_logger(__name__)
 
@@ -88,7 +89,7 @@ class FinetuneRound:
             lines = str(error).strip().splitlines()
             self.failure = f"{type(error).__name__}: {lines[0] if lines else 'no more is known'}"
 
-    def _on_progress(self, progress: FinetuneProgress) -> None:
+    def _on_progress(self, progress: FitProgress) -> None:
         self.step = progress.step
         self._rest()
 

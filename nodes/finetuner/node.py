@@ -28,7 +28,7 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     from semantic_mapper.fields.checkpoint import default_checkpoint_path, find_checkpoint, load_checkpoint
     from semantic_mapper.memory import keep_freed_memory
     from semantic_mapper.nodes.finetuner.finetuner import Finetuner
-    from semantic_mapper.training.online import OnlineConfig
+    from semantic_mapper.training.config import OnlineConfig
     from semantic_mapper.transport.messages import digest_of
     from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 

@@ -41,7 +41,7 @@ from semantic_mapper.replay.jobs import (
     replay_log,
 )
 from semantic_mapper.replay.summary import dig, notes
-from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.training.config import FinetuneConfig
 
 MAX_EVENTS = 200  # of one log
 _SCORES = ("miou", "total_accuracy", "average_accuracy", "coverage")

@@ -18,7 +18,7 @@ from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix
 from semantic_mapper.evaluation.panoptic import PanopticImage
 from semantic_mapper.evaluation.segments import Segments
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.panoptic import Panoptic
+from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field

@@ -16,6 +16,7 @@ from research.suites.config import MAP_WIDTH, SuiteConfig, camera_of_width, sett
 from research.suites.records import InstanceRecord, MapRecord
 from research.suites.rooms import as_given
 from research.suites.scoring import as_calibration, as_panoptic, as_rows
+from research.train.computed_depth import DELAY_FRAMES
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.instances import FoundInstances, match_instances
@@ -37,7 +38,6 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.refine import refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.evaluate.thing_surface import ThingSurface
-from semantic_mapper.training.computed_depth import DELAY_FRAMES
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 NEAR_M = 0.05  # a map point this near to the true surface speaks for it

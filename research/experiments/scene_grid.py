@@ -27,15 +27,15 @@ from research.scenes import VALIDATION_SEEDS, NoiseConfig
 from research.scenes.sequence import room_views
 from semantic_mapper.config import GridFieldConfig, SamplingConfig
 from semantic_mapper.fields.checkpoint import anchor_from_frame
-from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.finetune import FinetuneConfig, finetune
-from semantic_mapper.training.grid_fit import OPACITY, GridFitConfig, fit_grid, psnr_of
-from semantic_mapper.training.scene_fit import fit_scene
+from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
+from semantic_mapper.training.finetune import finetune
+from semantic_mapper.training.grid_fit import OPACITY, fit_grid, fit_scene, psnr_of
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
@@ -53,7 +53,7 @@ def measure_objects(seed: int, out: Path | None, settings: GridFitConfig) -> str
     held_out = frames[70:]
     own = {"box_m": BOX_M, "near_m": 1.0, "exposure": False, "held_out": 0}
     began = time.process_time()
-    fit = fit_grid(frames[:70], msgspec.structs.replace(settings, **own))
+    fit = fit_grid(frames[:70], FinetuneConfig(seconds=0, grid=msgspec.structs.replace(settings, **own)))
     seconds = time.process_time() - began
     field = _as_field(fit.grid.state_dict(), GridFieldConfig(grid=fit.grid.config), fit.steps)
     renders = [_render(field, f) for f in held_out]

@@ -20,15 +20,18 @@ from torch.nn import functional
 from research.peers.config import NeuRayConfig
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.contextual import contextual_space, visibility_share
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.ray_render import composite_render, weighted_moments
-from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views, spread_at, sure_depth
-from semantic_mapper.fields.sray import CUES
-from semantic_mapper.fields.view_weights import softmax_weights
-from semantic_mapper.fields.volume import composite, compositing_weights
+from semantic_mapper.fields.source_views import check_views, depth_at, encoded_views, spread_at, sure_depth
+from semantic_mapper.fields.sray_layers import (
+    CUES,
+    LEAST_VISIBILITY,
+    DensityNet,
+    GeometryInit,
+    contextual_space,
+    softmax_weights,
+)
+from semantic_mapper.fields.volume import composite, composite_render, compositing_weights, weighted_moments
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -119,3 +122,9 @@ class NeuRay(LearnedField):
         logits = functional.linear(rendered, self.classifier.weight) + weights.sum(1)[:, None] * self.classifier.bias
         known = space.valid.flatten(2).any(2).any(0)
         return composite_render(weights, z, colour, logits, known), weights
+
+
+def visibility_share(visibility: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Weights of the views at each sample, in proportion to their visibility: (m, R, N), sum 1 over valid views."""
+    weight = (visibility + LEAST_VISIBILITY) * valid
+    return weight / weight.sum(0).clamp_min(1e-6)

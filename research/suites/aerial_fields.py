@@ -26,7 +26,7 @@ from research.suites.aerial import (
     training_frames,
 )
 from research.suites.aerial_grids import FIT_NEAR_M, NEAR_M, TownGrid, grid_depths, town_grid
-from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.baselines import WarpBaseline
 from semantic_mapper.training.finetune import held_out_blocks

@@ -27,11 +27,12 @@ from research.suites.aerial import (
 )
 from research.suites.kept import NPZ_ERRORS, warn_unreadable
 from semantic_mapper.config import GridConfig, to_plain
-from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.grid_fit import GridFitConfig, fit_grid, held_out_psnr, render_frame
+from semantic_mapper.training.grid_fit import fit_grid, held_out_psnr, render_frame
 from semantic_mapper.types import Float32, PosedFrame
 
 _log = get_logger(__name__)
@@ -64,28 +65,24 @@ class TownGrid:
     seconds: float
 
 
-def grid_settings(config: AerialConfig, town: int) -> GridFitConfig:
+def grid_settings(config: AerialConfig, town: int) -> FinetuneConfig:
     """How the grid of a town is fitted."""
     plan = cached_town(town).plan
     x, y = plan.xs[-1] + _MARGIN_M, plan.ys[-1] + _MARGIN_M
-    return GridFitConfig(
-        steps=config.grid_steps,
-        width=config.width,
+    grid = GridFitConfig(
         voxel_m=config.voxel_m,
         box_m=(-x, -y, _LOW_M, x, y, _HIGH_M),
         near_m=FIT_NEAR_M,
         opacity=0.0,
         exposure=False,
-        trunk_steps=config.trunk_steps,
         held_out=0,
-        seed=config.seed,
     )
+    return FinetuneConfig(seconds=0.0, steps=config.grid_steps, width=config.width, seed=config.seed, grid=grid)
 
 
 def grid_digest(config: AerialConfig, town: int) -> str:
     """What tells files apart that were made in another way: 16 hex digits."""
     plain = to_plain(grid_settings(config, town)) | {"town": town, "views": config.train_views}
-    del plain["trunk_steps"]
     plain |= {"suite_version": AERIAL_SUITE.version, "version": VERSION}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -9,6 +9,7 @@ import json
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -36,15 +37,14 @@ from research.suites.aerial_grids import (
     town_grid,
 )
 from semantic_mapper.config import IRTConfig, IRTVariant
-from semantic_mapper.fields.grid.field import RaySamples
-from semantic_mapper.fields.irt import IRT
+from semantic_mapper.fields.scene.grid import RaySamples
+from semantic_mapper.fields.scene.irt import IRT, TEXTURE, TextureNet
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.training.config import FinetuneConfig
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.grid_fit import GridFit
+from semantic_mapper.training.grid_fit import GridFit, fit_trunk
 from semantic_mapper.training.irt import ClassFit, labelled_rays
-from semantic_mapper.training.scene_fit import fit_trunk
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
@@ -60,6 +60,18 @@ def irt_arms(folder: Path) -> dict[str, Arm]:
     return {name: scored(fit) for name, fit in irt_fits(folder).items()}
 
 
+class ColourNet(TextureNet):
+    """A network of each pixel's colour in place of its patch's texture."""
+
+    layers, kernel = (3, 16, TEXTURE), 1
+
+
+class ColourIRT(IRT):
+    """With the colour of a pixel in place of its texture."""
+
+    texture_net = ColourNet
+
+
 def irt_fits(folder: Path) -> dict[str, Fit]:
     """Fits by name; grids and trunks are kept in ``folder``, and in memory where the views' rays meet a grid."""
     marched: dict[tuple[int, int, int], list[RaySamples]] = {}  # by town, view and distance of pixels
@@ -72,21 +84,18 @@ def irt_fits(folder: Path) -> dict[str, Fit]:
         colour: bool = False,
         stage_1: bool = True,
     ) -> Fit:
-        texture = "colour" if colour else "cnn"
-
         def fit(config: AerialConfig, episode: Episode) -> Predict:
             start = town_grid(config, episode.town, folder)
             frames = labelled_frames(config, episode)
             shape = IRTConfig(
                 grid=start.grid.config,
                 variant=variant,
-                texture=texture,
-                points=points,
                 carried=len(frames) if carry else 0,
                 carried_size=(config.width, config.width) if carry else (1, 1),
             )
             torch.manual_seed(config.seed)
-            field = IRT(shape, AERIAL_SUITE.label_set)
+            field = (ColourIRT if colour else IRT)(shape, AERIAL_SUITE.label_set)
+            field.points_of_ray = points
             field.fitted_steps += 1
             if stage_1:
                 _load_trunk(config, episode, field, start, folder)
@@ -122,22 +131,15 @@ def fit_classes(config: AerialConfig, episode: Episode, field: IRT, frames: list
     """Stage 2: classes from the labelled views; one block in eight of these chooses the weights."""
     settings = finetune_settings(config, episode.town)
     fit = ClassFit(field, labelled_rays(frames, AERIAL_SUITE.label_set, settings), settings)
-    best = fit.run(0.0, None, bool)
+    best, _ = fit.run(0.0)
     field.eval()
     _log.info("irt_fitted", variant=field.shape.variant, step=best.step, accuracy=round(best.accuracy, 4))
 
 
 def finetune_settings(config: AerialConfig, town: int) -> FinetuneConfig:
     """How classes are learned."""
-    grid = grid_settings(config, town)
-    return FinetuneConfig(
-        seconds=0.0,
-        steps=config.irt_steps,
-        width=config.width,
-        held_out_fraction=HELD_OUT_FRACTION,
-        seed=config.seed,
-        grid=grid,
-    )
+    fit = grid_settings(config, town)
+    return msgspec.structs.replace(fit, steps=config.irt_steps, held_out_fraction=HELD_OUT_FRACTION)
 
 
 def march_frame(field: IRT, frame: PosedFrame, every: int) -> list[RaySamples]:
@@ -168,7 +170,7 @@ def _load_trunk(config: AerialConfig, episode: Episode, field: IRT, start: TownG
     """Grid and trunk of a town into ``field``; the trunk is fitted once and kept in ``folder``."""
     field.grid.load_state_dict(start.grid.state_dict())
     assert field.trunk is not None
-    settings = grid_settings(config, episode.town)
+    settings = msgspec.structs.replace(grid_settings(config, episode.town), steps=config.trunk_steps)
     shape = (field.shape.features, field.shape.trunk_width)
     plain = [grid_digest(config, episode.town), *shape, config.trunk_steps, VERSION]
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
@@ -179,6 +181,6 @@ def _load_trunk(config: AerialConfig, episode: Episode, field: IRT, start: TownG
     frames = training_frames(config, episode)
     gains: Float32 = np.ones((len(frames), 3), np.float32)
     fit = GridFit(field.grid, config.grid_steps, 0.0, start.psnr, math.nan, tuple(frames), gains)
-    psnr = fit_trunk(field, field.trunk, fit, settings)
+    psnr = fit_trunk(field, fit, settings)
     _log.info("trunk_fitted", town=episode.town, psnr=round(psnr, 2))
     write_bytes(path, save({name: tensor.contiguous() for name, tensor in field.trunk.state_dict().items()}))

@@ -25,9 +25,7 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
-from semantic_mapper.training.finetune import FinetuneConfig
-from semantic_mapper.training.grid_fit import GridFitConfig
-from semantic_mapper.training.step import StepConfig
+from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
 RECORD_VERSION = 9  # raised by a change of what a record means or how views are rendered: older ones are made again
@@ -109,9 +107,7 @@ class SceneBudget(Config, frozen=True):
     steps: NotNegative = 0  # 0 = only seconds count
     learning_rate: Positive = FinetuneConfig().learning_rate
     encoder_rate: Fraction = FinetuneConfig().encoder_rate  # see ``FinetuneConfig``
-    linear_probe_steps: NotNegative = FinetuneConfig().linear_probe_steps  # see ``FinetuneConfig``
     frozen_encoder_fraction: Fraction = FinetuneConfig().frozen_encoder_fraction  # see ``FinetuneConfig``
-    hard_example_fraction: Fraction = StepConfig().hard_example_fraction  # see ``StepConfig``
     patience: NotNegative = 0  # see ``FinetuneConfig``; by default a budget is spent to its end
     shares: tuple[float, ...] = (0.0625, 0.125, 0.25, 0.5, 1.0)  # of the budget; a run, and a point of the curve, each
 
@@ -190,12 +186,10 @@ def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         learning_rate=scene.learning_rate,
         encoder_rate=scene.encoder_rate,
         patience=scene.patience,
-        linear_probe_steps=scene.linear_probe_steps,
         frozen_encoder_fraction=scene.frozen_encoder_fraction,
         step=StepConfig(
             sampling=sampling,
             samples_without_depth=suite.tier.blind.guided,
-            hard_example_fraction=scene.hard_example_fraction,
             known_labels=scene.labelled_sources,
         ),
         seed=suite.seed,

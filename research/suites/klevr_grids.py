@@ -20,7 +20,8 @@ from research.suites.kept import NPZ_ERRORS, warn_unreadable
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, Config, GridConfig, NotNegative, to_plain
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.grid_fit import OPACITY, GridFitConfig, fit_grid, held_out_psnr
+from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
+from semantic_mapper.training.grid_fit import OPACITY, fit_grid, held_out_psnr
 
 _log = get_logger(__name__)
 
@@ -69,17 +70,15 @@ def scene_density(config: KlevrGridConfig, scene: int, folder: Path) -> SceneDen
     path = folder / f"klevr-{scene}-{grid_digest(config, scene)}.npz"
     if (found := _read(path)) is not None:
         return found
-    settings = GridFitConfig(
-        steps=config.steps,
-        width=config.width,
+    grid = GridFitConfig(
         long_side=config.long_side,
         box_m=(*BOX_LOW_M, *BOX_HIGH_M),
         near_m=NEAR_M,
         opacity=OPACITY,
         exposure=False,
         held_out=0,
-        seed=scene,
     )
+    settings = FinetuneConfig(seconds=0.0, steps=config.steps, width=config.width, seed=scene, grid=grid)
     numbers = [*range(config.views), *range(config.checked_from, config.checked_from + config.checked_views)]
     views = klevr_views(scene, numbers, klevr_camera(config.width), variant=config.variant)
     frames = [replace(view.frame, depth_m=None, label=None) for view in views]

@@ -50,7 +50,7 @@ from research.train.grid_nesf import (
 )
 from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
-from semantic_mapper.fields.grid.scene_grid import SceneGrid, grid_box
+from semantic_mapper.fields.scene.grid import SceneGrid, grid_box
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import Float32, UInt8

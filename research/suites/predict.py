@@ -16,9 +16,9 @@ from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import render_image
-from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
+from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.volume import around_computed
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_rgb
 from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -80,7 +80,7 @@ def _renderer(field: LearnedField, sampling: SamplingConfig, device: torch.devic
     """The compiled renderer for S-Ray where it covers the case (it gives the same answer), else the field itself."""
     field.sampling = sampling
     # Exactly this class: a kind derived from it renders in its own way.
-    if type(field) is SRay and device.type == "cpu" and sampling.mode == "streaming" and compiled_covers(field):
+    if type(field) is SRay and device.type == "cpu" and sampling.mode == "streaming":
         return StreamingSRay(field, sampling)
     return field
 

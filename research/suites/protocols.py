@@ -37,7 +37,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.baselines import WarpBaseline
-from semantic_mapper.training.finetune import FinetuneProgress
+from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -207,9 +207,7 @@ def _fit_and_score(
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
     device = next(field.parameters()).device
     if suite.scene.seconds > 0:  # what the first step of a process costs more is no part of any budget
-        one_step = msgspec.structs.replace(
-            fit_config(suite, 1.0), seconds=0, steps=1, linear_probe_steps=1, held_out_rays=64
-        )
+        one_step = msgspec.structs.replace(fit_config(suite, 1.0), seconds=0, steps=1, held_out_rays=64)
         fit(frames, room.label_set, _start(entry, suite, views, room.label_set), one_step)
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
@@ -227,7 +225,7 @@ def _fit_and_score(
 
 def _progress(
     on_fit: Callable[[float], None] | None, spent: float, share: float, whole: float
-) -> Callable[[FinetuneProgress], None] | None:
+) -> Callable[[FitProgress], None] | None:
     """What one of the runs of the curve tells of itself, as a share of all of them."""
     return None if on_fit is None else lambda p: on_fit((spent + p.fraction * share) / whole)
 

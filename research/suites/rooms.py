@@ -18,10 +18,10 @@ from research.scenes import (
 from research.scenes.scene import Scene
 from research.scenes.shots import motion_between, sequence_shots
 from research.suites.config import SuiteConfig, camera_of_width
+from research.train.computed_depth import DELAY_FRAMES, ComputedDepth, compute_depth
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.imaging import resize_depth, resize_spread
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.computed_depth import DELAY_FRAMES, ComputedDepth, compute_depth
 from semantic_mapper.types import Float64, PosedFrame
 
 CLEAN = "clean"

@@ -40,8 +40,8 @@ from semantic_mapper.config import AtLeastOne, Config, Fraction, NotNegative, Po
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, nearest_points
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
-from semantic_mapper.fields.primitive_rays import PrimitiveSet
-from semantic_mapper.fields.primitives import Primitive, ShapeName
+from semantic_mapper.fields.scene.boxes import PrimitiveSet
+from semantic_mapper.fields.scene.primitives import Primitive, ShapeName
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
@@ -67,7 +67,6 @@ class StreetsConfig(Config, frozen=True):
     voxel_m: Positive = 0.25  # of fields' grids
     field_steps: AtLeastOne = 600  # of geometry and colours, and as many of all together
     field_depth: bool = True  # fields get measured depth
-    semantics: Positive = 0.05  # weight of the semantic losses of fields
     seed: NotNegative = 0  # of networks
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import msgspec
 import numpy as np
 import torch
 
+from research.peers.uniform_panoptic import UniformPanoptic
 from research.scenes.suite import STREETS_SUITE
 from research.suites.scene_runs import ViewScores
 from research.suites.streets import (
@@ -29,11 +31,11 @@ from research.suites.streets import (
 )
 from semantic_mapper.config import PanopticConfig, to_plain
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.panoptic import Panoptic, box_config, ray_share
+from semantic_mapper.fields.scene.grid import ray_fraction
+from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.rays import pixel_grid, pixel_rays
-from semantic_mapper.training.finetune import FinetuneConfig, PanopticFitConfig
-from semantic_mapper.training.grid_fit import GridFitConfig
+from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig
 from semantic_mapper.training.panoptic import fit_panoptic
 from semantic_mapper.types import PosedFrame
 
@@ -47,6 +49,7 @@ _AT_ONCE = 4096  # rays of a picture
 
 STILL = "panoptic-still"  # boxes that move are left out, as if nothing moved; where cars drive
 ALLOWED = "panoptic-allowed"  # the fit of "panoptic"; only classes that boxes allow are rendered
+NO_DEPTH = "panoptic-no-depth"  # no frame has measured depth
 UNIFORM = "panoptic-uniform"  # samples evenly along rays
 GRID_LABELS = "grid-labels"  # no boxes: the predicted labels alone teach, as in Semantic-NeRF
 
@@ -56,7 +59,7 @@ LEFT_OUT: dict[str, dict[str, Any]] = {
     STILL: {},
     "panoptic-no-fixed-2d": {"fixed": 0.0},
     "panoptic-no-3d": {"points": 0.0},
-    "panoptic-no-depth": {"depth": 0.0},
+    NO_DEPTH: {},
     UNIFORM: {},
     GRID_LABELS: {"fixed": 0.0, "points": 0.0},
 }
@@ -82,18 +85,14 @@ def panoptic_arms(folder: Path, *, moving: bool = False) -> dict[str, Arm]:
 def fit_settings(config: StreetsConfig, street: Drive, name: str) -> FinetuneConfig:
     """How an arm's field is fitted."""
     left_out = LEFT_OUT[name]
-    depth = {} if config.field_depth and "depth" not in left_out else {"depth": 0.0, "start_from_depth": False}
     cameras = np.array([view.T_world_camera[:3, 3] for view in street.left])
     ahead = np.array([view.T_world_camera[:3, 2] for view in street.left])[-1]
     ends = np.concatenate((cameras - _BEHIND_M * ahead, cameras + _AHEAD_M * ahead))[:, :2]
     aside = _ASIDE_M * np.abs(ahead[[1, 0]])
     low, high = ends.min(axis=0) - aside, ends.max(axis=0) + aside
     box = (float(low[0]), float(low[1]), _LOW_M, float(high[0]), float(high[1]), _HIGH_M)
-    grid = GridFitConfig(voxel_m=config.voxel_m, box_m=box, near_m=NEAR_M, held_out=0, **depth)
-    weights: dict[str, Any] = (
-        {"semantics": config.semantics} | left_out | ({} if config.field_depth else {"depth": 0.0})
-    )
-    losses = PanopticFitConfig(**weights)
+    grid = GridFitConfig(voxel_m=config.voxel_m, box_m=box, near_m=NEAR_M, held_out=0)
+    losses = PanopticFitConfig(**left_out)
     return FinetuneConfig(
         seconds=0.0, steps=config.field_steps, width=config.width, grid=grid, panoptic=losses, seed=config.seed
     )
@@ -104,7 +103,7 @@ def field_shape(street: Drive, name: str) -> PanopticConfig:
     if name == GRID_LABELS:
         return PanopticConfig()
     boxes = tuple(box_config(primitive(b)) for b in street.boxes if name != STILL or b.stamps is None)
-    return PanopticConfig(boxes=boxes, uncovered="empty", samples="uniform" if name == UNIFORM else "march")
+    return PanopticConfig(boxes=boxes, uncovered="empty")
 
 
 def street_field(config: StreetsConfig, street: Drive, name: str, folder: Path) -> Panoptic:
@@ -114,8 +113,11 @@ def street_field(config: StreetsConfig, street: Drive, name: str, folder: Path) 
     path = folder / f"{name}-{street.seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.safetensors"
     if path.is_file():
         return _of(load_checkpoint(path))
-    start = Panoptic(field_shape(street, name), STREETS_SUITE.label_set)
+    field_type = UniformPanoptic if name == UNIFORM else Panoptic
+    start = field_type(field_shape(street, name), STREETS_SUITE.label_set)
     frames = [*street.frames(), *(view.frame for view in street.right)]
+    if name == NO_DEPTH or not config.field_depth:
+        frames = [replace(frame, depth_m=None) for frame in frames]
     began = time.process_time()
     checkpoint = fit_panoptic(frames, STREETS_SUITE.label_set, start, settings)
     seconds = round(time.process_time() - began, 1)
@@ -141,7 +143,7 @@ def render_answer(field: Panoptic, frame: PosedFrame, *, allowed: bool = False) 
             points = boxes.allowed_of(points) if allowed else points
             points = field.of_movers(samples, points)
             channel = field.composited(samples, points, boxes).argmax(1)
-            depth = (ray_share(samples) * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)
+            depth = (ray_fraction(samples) * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)
             depth = torch.where(samples.opacity > 0.5, depth, 0.0)
             found.append((channel.numpy(), field.instances(rays, channel).numpy(), depth.numpy()))
     channel, instance, depth = (np.concatenate(parts).reshape(k.height, k.width) for parts in zip(*found, strict=True))

@@ -24,7 +24,7 @@ from research.peers.grid_nesf import (
 )
 from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, Fraction, NotNegative, Positive
 from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays
 from semantic_mapper.types import Float32, PosedFrame, UInt8

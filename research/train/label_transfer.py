@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from semantic_mapper.fields.primitive_rays import PrimitiveSet
+from semantic_mapper.fields.scene.boxes import PrimitiveSet
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.rays import pixel_grid, pixel_rays

@@ -45,8 +45,8 @@ from semantic_mapper.fields.nesf import (
 from semantic_mapper.fields.sparse_conv import pack_cells
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.fit import budget_fraction
 from semantic_mapper.training.losses import RAREST
-from semantic_mapper.training.schedule import budget_fraction
 
 STATE_FILE = "state.safetensors"
 CUBE_M = 1.0

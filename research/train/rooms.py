@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 
 from research.scenes import TRAIN_SEEDS, RoomConfig, room_frames
 from research.train.cameras import CameraDraw, draw_camera
+from research.train.computed_depth import ComputedDepth, compute_depth, draw_computed_depth
+from research.train.images import ImageBatch, ImageStepConfig, image_batch
 from research.train.room_feed import FeedMaker, open_feed
+from research.train.view_draws import cropped_view
 from semantic_mapper.config import Config, Fraction
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.imaging import resize_depth, resize_spread, working_intrinsics
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.computed_depth import ComputedDepth, compute_depth, draw_computed_depth
-from semantic_mapper.training.images import ImageBatch, ImageStepConfig, image_batch
 from semantic_mapper.training.losses import IGNORE
-from semantic_mapper.training.views import LabelledView, cropped_view, mirrored_view, view_from_frame
+from semantic_mapper.training.views import LabelledView, mirrored_view, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame, UInt8
 
 CPU = torch.device("cpu")

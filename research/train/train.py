@@ -18,11 +18,13 @@ from torch.nn.parallel import DistributedDataParallel
 
 from research.scenes import SUITE_VERSION
 from research.train.folder_lock import sole_use_of
+from research.train.images import ImageBatch, images_loss
 from research.train.ranks import Ranks, joined, ranks_from_environment
 from research.train.recipe import provenance, rooms_before
 from research.train.room_feed import FeedMaker, open_feed
 from research.train.rooms import RoomPool, RoomViews, draw_images
-from research.train.start import start_from_imagenet, take_over, take_over_encoder
+from research.train.start import grow_depth, start_from_imagenet, take_over, take_over_encoder
+from research.train.step import StepBatch, batch_loss, draw_batch, pick_views_on_path
 from research.train.train_checks import check_field, check_nothing_is_overwritten, check_settings
 from research.train.train_config import TrainConfig
 from research.train.train_log import TrainLog
@@ -37,15 +39,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.images import ImageBatch, images_loss
-from semantic_mapper.training.optimiser import make_optimiser, set_rates
-from semantic_mapper.training.schedule import budget_fraction, cosine_rate
-from semantic_mapper.training.step import (
-    StepBatch,
-    batch_loss,
-    draw_batch,
-    pick_views_on_path,
-)
+from semantic_mapper.training.fit import budget_fraction, cosine_rate, make_optimiser, set_rates
 from semantic_mapper.training.views import stack_sources
 
 STATE_FILE = "state.safetensors"
@@ -318,7 +312,7 @@ class _Run:
         """From now on images bring their depth; the network that sees it begins where the one for colours is."""
         encoder = self.field.image_encoder
         if not self.progress.depth_grown and encoder is not None and encoder.depth_net and self._colours_until() > 0:
-            encoder.grow_depth()
+            grow_depth(encoder)
             _log.info("depth_network_grown", step=self.progress.step)
         self.progress.depth_grown = True
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import torch
 
 from research.scenes import TRAIN_SEEDS
+from research.train.images import encoder_for_images
+from research.train.step import encodes_views_separately
 from research.train.train_config import TrainConfig
 from research.train.train_state import unfinished_step
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.device import check_parts, to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.training.images import encoder_for_images
-from semantic_mapper.training.step import encodes_views_separately
 from semantic_mapper.types import SourceViews
 
 

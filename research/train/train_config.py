@@ -6,13 +6,11 @@ from typing import Any, Literal
 
 import msgspec
 
+from research.train.images import ImageStepConfig
 from research.train.rooms import RoomPoolConfig
+from research.train.step import LossConfig, StepConfig
 from research.train.validation import ValidationConfig
-from semantic_mapper.config import AtLeastOne, Config, Fraction
-from semantic_mapper.fields.device import DeviceName
-from semantic_mapper.training.images import ImageStepConfig
-from semantic_mapper.training.losses import LossConfig
-from semantic_mapper.training.step import StepConfig
+from semantic_mapper.config import AtLeastOne, Config, DeviceName, Fraction
 
 
 class TrainStepConfig(StepConfig, frozen=True):

@@ -12,12 +12,12 @@ import torch
 from research.scenes import VALIDATION_SEEDS
 from research.train.ranks import Ranks
 from research.train.rooms import RoomPoolConfig, RoomViews, render_room
+from research.train.step import StepConfig
 from semantic_mapper.config import Config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
-from semantic_mapper.training.step import StepConfig
+from semantic_mapper.fields.volume import sample_guided, sample_inverse_depth
 from semantic_mapper.training.views import LabelledView, query_rays, stack_sources
 
 

@@ -23,7 +23,7 @@ class EncodedViews:
     Args:
         feature: (m, C, h, w) image features, the F_j of S-Ray Eq. 5.
         rgb: (m, 3, h, w) in [0, 1], at feature resolution.
-        geometry: (m, 5, h, w) mixture of logistics along each view ray; see ``fields.geometry_net``.
+        geometry: (m, 5, h, w) mixture of logistics along each view ray; see ``sray_layers``.
         K: (m, 3, 3) in pixels of (h, w).
         T_camera_world: (m, 4, 4).
         channel: (m, H, W) int16 known labels at the resolution of the images that were encoded, -1 = none.

@@ -24,7 +24,6 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import SemanticMapperError, WeightsError
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
-from semantic_mapper.fields.sray import SRay
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
@@ -156,10 +155,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
         label_set = label_set_from_plain(json.loads(metadata["label_set"]))
         recipe = _checked_recipe(json.loads(metadata["recipe"]))
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
-        kind = metadata.get("field", SRay.kind)
+        kind = metadata["field"]
         if kind == MAP_KIND:
             raise ValueError("they refine saved maps (`refine --weights`) and label no frames")
-        model = build_field(kind, _of_its_time(kind, json.loads(metadata["model_config"])), label_set)
+        model = build_field(kind, json.loads(metadata["model_config"]), label_set)
     except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:MESSAGE]
         raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
@@ -203,12 +202,6 @@ def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     return tensors, metadata
 
 
-def _of_its_time(kind: str, config: dict[str, Any]) -> dict[str, Any]:
-    """The config of a file that was written before some settings existed: what they were then."""
-    then = {"tokens": "samples", "depth_by_focal": False, "colour_moments": False}
-    return then | config if kind == SRay.kind else config
-
-
 def check_same_shape(path: Path, like: Checkpoint) -> None:
     """Make sure that a file holds weights of the same network and classes, before anything is made as it says.
 
@@ -219,8 +212,8 @@ def check_same_shape(path: Path, like: Checkpoint) -> None:
         with safe_open(path, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
         label_set = label_set_from_plain(json.loads(metadata["label_set"]))
-        kind = metadata.get("field", SRay.kind)
-        shape = kind, _of_its_time(kind, json.loads(metadata["model_config"]))
+        kind = metadata["field"]
+        shape = kind, json.loads(metadata["model_config"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, SemanticMapperError) as error:
         raise WeightsError(f"{path.name}: not readable as weights of this project ({error})") from error
     if shape != (like.model.kind, json.loads(json.dumps(to_plain(like.model.config)))):

@@ -1,9 +1,18 @@
-"""The shared image encoder: light residual U-Nets that give the F_j of S-Ray Eq. 5."""
+"""The shared image encoder: light residual U-Nets that give the F_j of S-Ray Eq. 5.
+
+Where it sees depth, it sees the geocentric encoding of Gupta et al. ("Learning Rich Features from RGB-D Images", ECCV
+2014): inverse depth, height above the lowest point in view, and the angle of the surface to gravity. Gravity is found
+in each image by itself, so neither the world's axes nor the mounting of the camera have to be known.
+
+Its backbone may be EfficientNet-Lite0 (M. Tan and Q. Le, ICML 2019; inverted residuals without squeeze and excitation,
+and ReLU6), a network that has seen photographs before it sees rooms.
+"""
 
 from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import math
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,14 +24,47 @@ from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.efficientnet import WIDTHS, EfficientNetLite0
-from semantic_mapper.fields.source_maps import sure_depth
-from semantic_mapper.fields.surface import SURFACE_CHANNELS, surface_maps
+from semantic_mapper.fields.source_views import sure_depth
 from semantic_mapper.types import SourceViews
 
 COLOURS = 3
 COLOUR_MEAN, COLOUR_DEVIATION = 0.45, 0.25
-MEASURED_SHARE = 0.05  # of the pixels: with less measured depth a view counts as one without
+MEASURED_FRACTION = 0.05  # of the pixels: with less measured depth a view counts as one without
+
+BACKBONE_STAGES = (  # blocks of one output stride: (channels in, channels out, kernel, stride, expansion) of each
+    ((32, 16, 3, 1, 1),),
+    ((16, 24, 3, 2, 6), (24, 24, 3, 1, 6)),
+    ((24, 40, 5, 2, 6), (40, 40, 5, 1, 6)),
+    (
+        (40, 80, 3, 2, 6),
+        (80, 80, 3, 1, 6),
+        (80, 80, 3, 1, 6),
+        (80, 112, 5, 1, 6),
+        (112, 112, 5, 1, 6),
+        (112, 112, 5, 1, 6),
+    ),
+    ((112, 192, 5, 2, 6), (192, 192, 5, 1, 6), (192, 192, 5, 1, 6), (192, 192, 5, 1, 6)),
+)
+BACKBONE_WIDTHS = tuple(stage[-1][1] for stage in BACKBONE_STAGES)  # channels at strides 2, 4, 8, 16, 32
+BACKBONE_STEM = 32
+BACKBONE_MEAN, BACKBONE_DEVIATION = 127 / 255, 128 / 255  # of the colours in [0, 1] that the published weights expect
+NORM_EPSILON = 1e-3
+
+SURFACE_CHANNELS = 5
+NORMAL_REACH = 2  # pixels to either side between which a normal is taken, at 160 pixels of width
+REFERENCE_WIDTH = 160
+GRAVITY_COLUMNS = 40  # columns of the coarse grid that gravity and the lowest point are found on
+LOWEST_FRACTION = 0.02  # of the points lie below the one that counts as the lowest
+NEAREST_M = 0.2
+GRAVITY_STEPS_DEG = (
+    45.0,
+    45.0,
+    45.0,
+    15.0,
+    15.0,
+    15.0,
+    15.0,
+)  # how far from level or plumb a surface may be, step by step
 
 
 class ResidualBlock(nn.Module):
@@ -96,10 +138,80 @@ class ResidualUNet(nn.Module):
         return self.head(x)
 
 
+def _norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, eps=NORM_EPSILON)
+
+
+class StridedConvolution(nn.Conv2d):
+    """Of stride 2, padded as TensorFlow's "SAME" pads: one pixel more after the image than before where that is odd."""
+
+    def __init__(self, c_in: int, c_out: int, kernel: int, groups: int) -> None:
+        super().__init__(c_in, c_out, kernel, 2, 0, groups=groups, bias=False)
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:  # noqa: A002 - as the base class names it
+        """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2), sizes rounded up."""
+        height, width = (self.kernel_size[0] - 2 + size % 2 for size in input.shape[-2:])
+        padded = functional.pad(input, (width // 2, width - width // 2, height // 2, height - height // 2))
+        return super().forward(padded)
+
+
+class InvertedResidual(nn.Module):
+    """Expand, convolve each channel by itself, project; with a shortcut where shapes allow."""
+
+    def __init__(self, c_in: int, c_out: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        inner = c_in * expansion
+        self.expand = nn.Conv2d(c_in, inner, 1, bias=False) if expansion > 1 else None
+        self.expand_norm = _norm(inner) if expansion > 1 else None
+        self.depthwise = (
+            StridedConvolution(inner, inner, kernel, inner)
+            if stride == 2
+            else nn.Conv2d(inner, inner, kernel, 1, kernel // 2, groups=inner, bias=False)
+        )
+        self.depthwise_norm = _norm(inner)
+        self.project = nn.Conv2d(inner, c_out, 1, bias=False)
+        self.project_norm = _norm(c_out)
+        self.shortcut = stride == 1 and c_in == c_out
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, c_in, H, W) -> (B, c_out, H / stride, W / stride), sizes rounded up."""
+        y = x
+        if self.expand is not None and self.expand_norm is not None:
+            y = functional.relu6(self.expand_norm(self.expand(y)))
+        y = functional.relu6(self.depthwise_norm(self.depthwise(y)))
+        y = self.project_norm(self.project(y))
+        return x + y if self.shortcut else y
+
+
+class EfficientNetLite0(nn.Module):
+    """Colours in [0, 1] (B, 3, H, W) -> features at strides 2, 4, ... of ``BACKBONE_WIDTHS`` channels.
+
+    Args:
+        stages: How many of the five; the classifier of the published network and its last block are not built.
+    """
+
+    def __init__(self, stages: int = len(BACKBONE_STAGES)) -> None:
+        super().__init__()
+        self.stem = StridedConvolution(3, BACKBONE_STEM, 3, 1)
+        self.stem_norm = _norm(BACKBONE_STEM)
+        self.stages = nn.ModuleList(
+            nn.Sequential(*(InvertedResidual(*block) for block in stage)) for stage in BACKBONE_STAGES[:stages]
+        )
+
+    def forward(self, rgb: torch.Tensor) -> list[torch.Tensor]:
+        """One feature map a stage, the finest first."""
+        x = functional.relu6(self.stem_norm(self.stem((rgb - BACKBONE_MEAN) / BACKBONE_DEVIATION)))
+        maps: list[torch.Tensor] = []
+        for stage in self.stages:
+            x = stage(x)
+            maps.append(x)
+        return maps
+
+
 class PretrainedUNet(nn.Module):
     """The same shapes as ``ResidualUNet``, with EfficientNet-Lite0 in the place of its deeper stages.
 
-    The backbone sees colours alone. Beside it a slim residual encoder sees all inputs, depth among them: where colours
+    The backbone sees colours alone. Next to it a slim residual encoder sees all inputs, depth among them: where colours
     are not those of the training rooms, in photographs, depth is what a view can be known by. ``channels`` are the
     widths of that encoder and of the decoder, finest first, ``blocks`` the residual blocks of both at each stage; the
     coarsest stage is the backbone's alone.
@@ -120,7 +232,7 @@ class PretrainedUNet(nn.Module):
             for i, out in enumerate(channels[:-1])
         )
         self.backbone = EfficientNetLite0(len(channels))
-        self.laterals = nn.ModuleList(nn.Conv2d(WIDTHS[i], out, 1) for i, out in enumerate(channels))
+        self.laterals = nn.ModuleList(nn.Conv2d(BACKBONE_WIDTHS[i], out, 1) for i, out in enumerate(channels))
         self.ups = nn.ModuleList(
             UpBlock(channels[i + 1], channels[i], refine=config.blocks[i]) for i in reversed(range(len(channels) - 1))
         )
@@ -145,12 +257,12 @@ class ImageEncoder(nn.Module):
     """U-Nets of either kind, shared by all views; each view is encoded by itself.
 
     Where the config asks for depth there are two: one for views with measured depth, which sees what
-    ``surface.surface_maps`` makes of it beside the colours, and one for views without, which sees colours alone. Both
+    ``surface_maps`` makes of it next to the colours, and one for views without, which sees colours alone. Both
     give features of one kind. A single network that has to do with and without gives away much of what each can do.
 
     Batch norm, because on a CPU it costs half of what group norm does and learns faster. Its statistics come from the
     images only inside ``batch_statistics`` (where the encoder is trained on many different images at once); everywhere
-    else, in training mode too, they are constants, so that a view's features do not depend on the views beside it.
+    else, in training mode too, they are constants, so that a view's features do not depend on the views next to it.
 
     Args:
         config: Shape, and whether depth that was computed from pictures is shown to it.
@@ -170,9 +282,9 @@ class ImageEncoder(nn.Module):
                 "encoder: channels and blocks need one positive number a stage each, and feature_dim has to be "
                 f"positive; got {list(channels)}, {list(blocks)} and {feature_dim}"
             )
-        if pretrained and (not 2 <= len(channels) <= len(WIDTHS) or blocks[-1] != 0):
+        if pretrained and (not 2 <= len(channels) <= len(BACKBONE_WIDTHS) or blocks[-1] != 0):
             raise ConfigError(
-                f"encoder: this backbone has 2 to {len(WIDTHS)} stages, the last one without blocks (0); got "
+                f"encoder: this backbone has 2 to {len(BACKBONE_WIDTHS)} stages, the last one without blocks (0); got "
                 f"{list(channels)} and {list(blocks)}"
             )
         unet = PretrainedUNet if pretrained else ResidualUNet
@@ -202,19 +314,6 @@ class ImageEncoder(nn.Module):
         without = self.colour_net(rgb[~measured])
         place = torch.cat((measured.nonzero()[:, 0], (~measured).nonzero()[:, 0]))
         return torch.cat((with_depth, without))[place.argsort()]
-
-    def grow_depth(self) -> None:
-        """Let the network that sees depth start as the one that does not: its first layer ignores depth for now.
-
-        Raises:
-            ConfigError: an encoder without such a network.
-        """
-        if self.depth_net is None:
-            raise ConfigError("this encoder sees colours alone; set depth = true in [field.encoder]")
-        grown = self.colour_net.state_dict()
-        stem = torch.zeros_like(self.depth_net.stem.weight)
-        stem[:, :COLOURS] = grown["stem.weight"]
-        self.depth_net.load_state_dict(grown | {"stem.weight": stem})
 
     @property
     def uncalibrated(self) -> bool:
@@ -281,7 +380,7 @@ def _is_fresh(norm: nn.BatchNorm2d) -> bool:
 
 def has_depth(depth_m: torch.Tensor) -> torch.Tensor:
     """(m,) bool: whether enough of each view (m, H, W) is measured to be worth looking at."""
-    return (depth_m > 0).flatten(1).float().mean(1) >= MEASURED_SHARE
+    return (depth_m > 0).flatten(1).float().mean(1) >= MEASURED_FRACTION
 
 
 def calibrate(encoder: ImageEncoder, views: SourceViews) -> None:
@@ -298,3 +397,113 @@ def calibrate(encoder: ImageEncoder, views: SourceViews) -> None:
             encoder(views if measured else replace(views, depth_m=torch.ones_like(views.depth_m)))
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
+
+
+def surface_maps(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+    """Maps of the surface (m, 5, H, W) at each pixel; all 0 where depth is not measured.
+
+    Channels: inverse depth (1 / m), 1 where depth is measured, height above the lowest point in view (m), cosine of
+    the normal with up, cosine of the normal with the viewing axis (0 beside holes, where there is no normal).
+
+    Args:
+        depth_m: (m, H, W), 0 = none.
+        K: (m, 3, 3) in pixels of (H, W).
+    """
+    # Not in bfloat16, whose mantissa of 8 bits would make steps of centimetres.
+    with torch.no_grad(), torch.autocast(depth_m.device.type, enabled=False):
+        if not bool((depth_m > 0).any()):  # also spares a field without depth the work
+            return depth_m.new_zeros(len(depth_m), SURFACE_CHANNELS, *depth_m.shape[1:])
+        measured = depth_m > 0
+        points = _camera_points(depth_m, K)
+        reach = max(1, round(NORMAL_REACH * depth_m.shape[-1] / REFERENCE_WIDTH))
+        normal, known = surface_normals(points, measured, reach)
+        stride = max(1, depth_m.shape[-1] // GRAVITY_COLUMNS)
+        up = up_direction(normal[..., ::stride, ::stride], known[:, ::stride, ::stride])
+        height = torch.einsum("mihw,mi->mhw", points, up)
+        lowest = _lowest(height[:, ::stride, ::stride], measured[:, ::stride, ::stride])
+        maps = (
+            torch.where(measured, 1 / depth_m.clamp_min(NEAREST_M), 0),
+            measured.to(depth_m.dtype),
+            torch.where(measured, height - lowest[:, None, None], 0),
+            torch.einsum("mihw,mi->mhw", normal, up),
+            normal[:, 2],
+        )
+        return torch.stack(maps, dim=1)
+
+
+def surface_normals(points: torch.Tensor, measured: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Normals from central differences, towards the camera: (m, 3, H, W), and where there is one (m, H, W).
+
+    Args:
+        points: (m, 3, H, W) camera coordinates, metres.
+        measured: (m, H, W) bool.
+        reach: Pixels between a pixel and the ones that its differences are taken from.
+    """
+    r = reach
+    height, width = measured.shape[-2:]
+    normal = torch.zeros_like(points)
+    known = torch.zeros_like(measured)
+    if min(height, width) <= 2 * r:
+        return normal, known
+    middle = (..., slice(r, -r), slice(r, -r))
+    du = points[..., r:-r, 2 * r :] - points[..., r:-r, : -2 * r]
+    dv = points[..., 2 * r :, r:-r] - points[..., : -2 * r, r:-r]
+    # Written out, because torch's cross product and norm are slow along any but the last axis.
+    (ax, ay, az), (bx, by, bz) = dv.unbind(1), du.unbind(1)
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    length = torch.sqrt(x * x + y * y + z * z).clamp_min(1e-9)
+    known[middle] = (
+        measured[..., r:-r, r:-r]
+        & measured[..., r:-r, 2 * r :]
+        & measured[..., r:-r, : -2 * r]
+        & measured[..., 2 * r :, r:-r]
+        & measured[..., : -2 * r, r:-r]
+    )
+    normal[middle] = torch.stack((x / length, y / length, z / length), dim=1)
+    return normal * known[:, None], known
+
+
+def up_direction(normal: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """Up (m, 3) in camera axes: what most surfaces are level or plumb to.
+
+    Gupta et al., "Perceptual Organization and Recognition of Indoor Scenes" (CVPR 2013), section 3: starting from the
+    camera's own up, take the normals near to and near to square with it, and turn up to fit them; then the same with
+    closer bounds. The camera may be inclined by up to 45 degrees.
+
+    Args:
+        normal: (m, 3, h, w) unit normals in camera axes (y down).
+        known: (m, h, w) bool.
+    """
+    n = normal.flatten(2)  # (m, 3, P)
+    weight = known.flatten(1).to(n.dtype)
+    up = n.new_tensor((0.0, -1.0, 0.0)).expand(len(n), 3)
+    identity = torch.eye(3, dtype=n.dtype, device=n.device)
+    # Keeps up where it is in every direction that no surface speaks of.
+    hold = 1e-3 * weight.sum(1).clamp_min(1)[:, None, None]
+    for bound_deg in GRAVITY_STEPS_DEG:
+        cosine = torch.einsum("mip,mi->mp", n, up).abs()
+        level = cosine > math.cos(math.radians(bound_deg))
+        plumb = cosine < math.sin(math.radians(bound_deg))
+        vote = weight * (plumb.to(n.dtype) - level.to(n.dtype))
+        spread = (n * vote[:, None]) @ n.transpose(1, 2) + hold * (identity - up[:, :, None] * up[:, None, :])
+        axis = torch.linalg.eigh(spread.double())[1][:, :, 0].to(n.dtype)
+        up = torch.where((axis * up).sum(1, keepdim=True) < 0, -axis, axis)
+    return up
+
+
+def _camera_points(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+    """(m, 3, H, W) camera coordinates of the pixels; 0 where depth is not measured."""
+    height, width = depth_m.shape[-2:]
+    u = torch.arange(width, dtype=depth_m.dtype, device=depth_m.device)
+    v = torch.arange(height, dtype=depth_m.dtype, device=depth_m.device)
+    x = (u[None, None, :] - K[:, 0, 2, None, None]) / K[:, 0, 0, None, None]
+    y = (v[None, :, None] - K[:, 1, 2, None, None]) / K[:, 1, 1, None, None]
+    return torch.stack((x * depth_m, y * depth_m, depth_m), dim=1)
+
+
+def _lowest(height: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
+    """(m,) height that only ``LOWEST_FRACTION`` of the measured points lie below; 0 where nothing is measured."""
+    flat = torch.where(measured, height, torch.inf).flatten(1).sort(dim=1).values
+    count = measured.flatten(1).sum(1)
+    found = flat.gather(1, (count * LOWEST_FRACTION).long()[:, None])[:, 0]
+    return torch.where(count > 0, found, 0)

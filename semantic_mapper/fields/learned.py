@@ -13,7 +13,7 @@ from torch import nn
 from semantic_mapper.config import Config, SamplingConfig
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.sampling import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
+from semantic_mapper.fields.volume import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -69,14 +69,6 @@ class LearnedField(nn.Module, ABC):
     def source_logits(self, sources: EncodedViews) -> torch.Tensor | None:
         """Logits (m, L, h, w) of the source images by themselves, for a dense loss; None where a kind has none."""
         return None
-
-    def image_classifier(self) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Weight (L, C) and bias (L,) of a classifier of relu(image features); None where a kind has another one."""
-        return None
-
-    def start_from_classifier(self, weight: torch.Tensor, bias: torch.Tensor) -> bool:
-        """Classify images as an ``image_classifier`` of another field does; False where a kind cannot."""
-        return False
 
     def weigh_own_view(self, factor: float, without_depth: float) -> bool:
         """Let the query's own image count ``factor`` times as much among the views, and ``without_depth`` times on rays

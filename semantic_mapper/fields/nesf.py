@@ -13,7 +13,9 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,8 +36,16 @@ from semantic_mapper.fields.checkpoint import (
     open_weights,
     save_tensors,
 )
-from semantic_mapper.fields.map_unet import LEVELS, MapUNet
-from semantic_mapper.fields.sparse_conv import OFFSETS, CellLevel, cell_levels, find_rows, pack_cells
+from semantic_mapper.fields.sparse_conv import (
+    OFFSETS,
+    CellLevel,
+    Down,
+    SubmanifoldConv,
+    Up,
+    cell_levels,
+    find_rows,
+    pack_cells,
+)
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
 
@@ -49,6 +59,9 @@ SAME_SLOPE = 0.3  # cells whose normal . up differs by more belong to another su
 LOG_SCALE = 0.25  # log-probabilities reach -12, other channels 1
 FARTHEST_M = 0.3  # ways to the centre of an object are learned up to here
 MOST_VOTES = 8.0  # further ones tell nothing new
+LEVELS = 4
+WIDTHS = (1, 2, 4, 4)  # of the levels, times the width
+BLOCKS = (1, 2, 2, 2)  # on the way down; one on the way up
 
 
 class NesfConfig(Config, frozen=True):
@@ -152,6 +165,66 @@ def smoothed(cells: Cells, level: CellLevel) -> torch.Tensor:
 
 def _padded(x: torch.Tensor) -> torch.Tensor:
     return torch.cat((x, x.new_zeros(1, x.shape[1])))
+
+
+class Block(nn.Module):
+    """``x + linear(relu(conv(norm(x))))``; the linear layer starts at zero."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(channels)
+        self.conv = SubmanifoldConv(channels, channels)
+        self.linear = nn.Linear(channels, channels)
+        nn.init.zeros_(self.linear.weight)
+        nn.init.zeros_(self.linear.bias)
+
+    def forward(self, x: torch.Tensor, level: CellLevel) -> torch.Tensor:
+        """Features (N, C) of the level's cells -> (N, C)."""
+        return x + self.linear(torch.relu(self.conv(self.norm(x), level)))
+
+
+class MapUNet(nn.Module):
+    """A 3D U-Net over the occupied cells of a map, of four levels that all have residual blocks.
+
+    Against the paper's U-Net it is narrow at the finest level, where nearly all cells are, and one level deeper: it
+    sees 1.9 m far at half the cost. Each block normalises the features of a cell on their own, so that what surrounds a
+    tile does not matter.
+
+    Args:
+        channels_in: C.
+        channels_out: K, of a last linear layer, which starts at zero.
+        width: Features at the finest level.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int, width: int = 16) -> None:
+        super().__init__()
+        widths = [width * times for times in WIDTHS]
+        pairs = list(pairwise(widths))
+        self.stem = nn.Linear(channels_in, widths[0])
+        self.encoder = nn.ModuleList(
+            nn.ModuleList(Block(w) for _ in range(count)) for w, count in zip(widths, BLOCKS, strict=True)
+        )
+        self.down = nn.ModuleList(Down(fine, coarse) for fine, coarse in pairs)
+        self.up = nn.ModuleList(Up(coarse, fine) for fine, coarse in pairs)
+        self.decoder = nn.ModuleList(Block(fine) for fine, _ in pairs)
+        self.norm = nn.LayerNorm(widths[0])
+        self.head = nn.Linear(widths[0], channels_out)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, x: torch.Tensor, levels: Sequence[CellLevel]) -> torch.Tensor:
+        """Features (N, C) of the cells of ``cell_levels(cells, LEVELS)`` -> (N, K)."""
+        x = self.stem(x)
+        kept: list[torch.Tensor] = []
+        for n, blocks in enumerate(self.encoder):
+            for block in blocks:  # pyright: ignore[reportGeneralTypeIssues]
+                x = block(x, levels[n])
+            if n + 1 < LEVELS:
+                kept.append(x)
+                x = self.down[n](x, levels[n])
+        for n in reversed(range(LEVELS - 1)):
+            x = self.decoder[n](self.up[n](x, levels[n]) + kept[n], levels[n])
+        return self.head(torch.relu(self.norm(x)))
 
 
 class Nesf(nn.Module):

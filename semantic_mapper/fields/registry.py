@@ -35,9 +35,9 @@ class FieldKind(NamedTuple):
 KINDS: dict[str, FieldKind] = {
     "sray": FieldKind(SRayConfig, "semantic_mapper.fields.sray", "SRay"),
     "unet": FieldKind(UNetFieldConfig, "semantic_mapper.fields.unet_field", "UNetField"),
-    "grid": FieldKind(GridFieldConfig, "semantic_mapper.fields.grid.field", "GridField"),
-    "irt": FieldKind(IRTConfig, "semantic_mapper.fields.irt", "IRT"),
-    "panoptic": FieldKind(PanopticConfig, "semantic_mapper.fields.panoptic", "Panoptic"),
+    "grid": FieldKind(GridFieldConfig, "semantic_mapper.fields.scene.grid", "GridField"),
+    "irt": FieldKind(IRTConfig, "semantic_mapper.fields.scene.irt", "IRT"),
+    "panoptic": FieldKind(PanopticConfig, "semantic_mapper.fields.scene.panoptic", "Panoptic"),
 }
 GROUP = "semantic_mapper.fields"  # entry points of other packages, each a ``FieldKind``
 
@@ -56,7 +56,6 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "sray-none": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": False}),
     "sray-intra": ("sray", _PAPER | {"intra_view_attention": True, "cross_view_attention": False}),
     **{f"irt-{name.lower()}": ("irt", {"variant": name}) for name in ("B", "BC", "RT", "RTT", "RTC", "RTTC")},
-    "irt-colour": ("irt", {"variant": "RTTC", "texture": "colour"}),
     "sray-cross": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": True}),
 }
 

@@ -7,7 +7,11 @@ Read top to bottom beside section 3 of the paper: ``encode`` gives the F_j, ``co
 compositing. ``tokens = "surface"`` composites first, each view by itself, so that attention and blending work on one
 token a view; the tokens go through the semantic MLP before they are blended, and what is learned beyond that starts
 without effect. So with trained image features, and nothing else trained, it is a vote of its views, weighted by
-what they see.
+what they see. Beyond the paper, its density also depends on whether the views' colours agree, and depth that it
+predicts from an image is proportional to the focal length.
+
+In both orders attention adds to the features (M + f(M) in Eq. 9 and 10, which trains faster), and views count by how
+much they see of a sample.
 """
 
 from __future__ import annotations
@@ -15,7 +19,6 @@ from __future__ import annotations
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import nn
@@ -23,27 +26,35 @@ from torch.nn import functional
 
 from semantic_mapper.config import SamplingConfig, SRayConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.attention import (
-    MultiHeadAttention,
-    cross_view_attention,
-    positional_encoding,
-    radial_attention,
-)
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.contextual import CUES, SURFACE_CUES, ContextualSpace, contextual_space, surface_space
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.geometry_net import COLOUR_SCALE, LEAST_VISIBILITY, DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views, spread_at, sure_depth
-from semantic_mapper.fields.view_weights import ViewWeightNet, constrained_weights, softmax_weights
-from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights
+from semantic_mapper.fields.source_views import check_views, depth_at, encoded_views, spread_at, sure_depth
+from semantic_mapper.fields.sray_layers import (
+    COLOUR_SCALE,
+    CUES,
+    LEAST_VISIBILITY,
+    SURFACE_CUES,
+    ContextualSpace,
+    DensityNet,
+    GeometryInit,
+    MultiHeadAttention,
+    ViewWeightNet,
+    constrained_weights,
+    contextual_space,
+    cross_view_attention,
+    radial_attention,
+    softmax_weights,
+    surface_space,
+)
+from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights, field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
+TAU = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
 LABEL_LOGIT = 8.0  # what full agreement of the labelled views on a class adds to its logit before any training
 HIDDEN = 0.05  # visibility below which a view is left out where another one sees the sample
-OWN_VIEW_FACTOR = "own_view_factor"
-DOUBT = 0.05  # hit probability at which a label that a view carries over counts by half
+LABEL_UNCERTAINTY = 0.05  # hit probability at which a label that a view carries over counts by half
 
 
 class SRay(LearnedField):
@@ -64,14 +75,13 @@ class SRay(LearnedField):
         super().__init__(config, label_set, sampling)
         _check(config)
         dim = config.feature_dim
-        published = config.parity == "published"
         self.config: SRayConfig = config
+        self.at_surface = config.tokens == "surface"
         self.encoder = ImageEncoder(config.encoder, dim)
         self.geometry_init = GeometryInit(dim)
-        self.density = DensityNet(dim + 3 if config.colour_moments else dim)
-        self.radial = MultiHeadAttention(dim, config.heads, published=published)
-        self.cross = MultiHeadAttention(dim, config.heads, published=published)
-        self.at_surface = config.tokens == "surface"
+        self.density = DensityNet(dim + 3 if self.at_surface else dim)
+        self.radial = MultiHeadAttention(dim, config.heads)
+        self.cross = MultiHeadAttention(dim, config.heads)
         self.weights = ViewWeightNet(dim, SURFACE_CUES if self.at_surface else CUES)
         self.semantic = nn.Sequential(nn.Linear(dim, 2 * dim), nn.ReLU(), nn.Linear(2 * dim, dim))
         self.classifier = nn.Linear(dim, len(label_set))
@@ -84,8 +94,7 @@ class SRay(LearnedField):
             # measured depth and for those without, whose views may look at different things. Not learned by
             # gradients: on the pixels that it was trained on, the own image is always right.
             self.own_view_factor: torch.Tensor
-            self.register_buffer(OWN_VIEW_FACTOR, torch.ones(2))
-            self.register_load_state_dict_pre_hook(_before_own_view_factor)
+            self.register_buffer("own_view_factor", torch.ones(2))
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode each view by itself: features F_j and the depth distribution of every pixel.
@@ -96,19 +105,19 @@ class SRay(LearnedField):
         check_views(views)
         views = sure_depth(views, computed=self.config.encoder.computed_depth)
         feature = self.encoder(views)
-        focal = views.K[:, 0, 0] / views.rgb.shape[-1] if self.config.depth_by_focal else None
+        focal = views.K[:, 0, 0] / views.rgb.shape[-1] if self.at_surface else None
         size = (feature.shape[-2], feature.shape[-1])
         geometry = self.geometry_init(feature, depth_at(views, *size), focal, spread_at(views, *size))
         encoded = encoded_views(views, feature, geometry)
-        if views.channel is None or not self.config.source_labels:
+        if views.channel is None:
             return encoded
         return replace(encoded, channel=views.channel.to(torch.int16))
 
     def find_density(self, space: ContextualSpace) -> torch.Tensor:
-        """sigma (R, N) in 1 / m, from what the views hold at the samples: where features, and with ``colour_moments``
-        colours, agree, there is the surface."""
+        """sigma (R, N) in 1 / m, from what the views hold at the samples: where features (of tokens at the surface also
+        colours) agree, there is the surface."""
         values = space.feature
-        if self.config.colour_moments:
+        if self.at_surface:
             values = torch.cat((values, COLOUR_SCALE * space.rgb), dim=-1)
         return self.density(values, space.hit, space.visibility, space.valid, space.delta)
 
@@ -122,30 +131,12 @@ class SRay(LearnedField):
         votes = weight.new_zeros(*weight.shape[1:], len(self.label_set))
         index = space.channel.clamp_min(0).permute(1, 2, 0)
         votes = votes.scatter_add(2, index, weight.permute(1, 2, 0))
-        return votes / (weight.sum(0) + DOUBT)[..., None]
+        return votes / (weight.sum(0) + LABEL_UNCERTAINTY)[..., None]
 
     def source_logits(self, sources: EncodedViews) -> torch.Tensor:
         """Logits (m, L, h, w) of the image features by themselves."""
         s = sources.feature.permute(0, 2, 3, 1)
         return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
-
-    def start_from_classifier(self, weight: torch.Tensor, bias: torch.Tensor) -> bool:
-        """Classify semantic rays as relu(features) were: s + relu(-s) = relu(s), so half of the residual MLP fits it
-        exactly; the other half begins without effect."""
-        if weight.shape != self.classifier.weight.shape:
-            return False
-        hidden, out = self.semantic[0], self.semantic[2]
-        assert isinstance(hidden, nn.Linear) and isinstance(out, nn.Linear)
-        dim = self.config.feature_dim
-        with torch.no_grad():
-            hidden.weight[:dim] = -torch.eye(dim)
-            hidden.bias[:dim] = 0
-            out.weight.zero_()
-            out.bias.zero_()
-            out.weight[:, :dim] = torch.eye(dim)
-            self.classifier.weight.copy_(weight)
-            self.classifier.bias.copy_(bias)
-        return True
 
     def weigh_own_view(self, factor: float, without_depth: float) -> bool:
         """Set ``own_view_factor``, where tokens are at the surface."""
@@ -165,12 +156,10 @@ class SRay(LearnedField):
         Not in the paper, which leaves it to the attention to find out. A hidden view shows another surface at that
         pixel, and within the bounds of Eq. 12 it would still weigh up to tau of a seen one.
         """
-        if not self.config.occlusion or self.config.parity == "published":
-            return space
         clear = space.valid & (space.visibility >= HIDDEN)
         return replace(space, valid=torch.where(clear.any(0), clear, space.valid))
 
-    def without_faint(self, space: ContextualSpace, weights: torch.Tensor, least: float) -> ContextualSpace:
+    def pruned(self, space: ContextualSpace, weights: torch.Tensor, least: float) -> ContextualSpace:
         """M without the samples whose fraction of the compositing weights (R, N) of their ray is below ``least``."""
         return replace(space, valid=space.valid & (weights >= least * weights.sum(1, keepdim=True)))
 
@@ -178,13 +167,10 @@ class SRay(LearnedField):
         """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
         x = space.feature.transpose(0, 1)  # (R, m, N, C)
         valid = space.valid.transpose(0, 1)
-        if self.config.positional_encoding or self.config.parity == "published":
-            x = x + positional_encoding(x.shape[2], x.shape[3], x)
-        keep = 1.0 if self.config.attention_residual else 0.0
         if self.config.intra_view_attention:
-            x = keep * x + radial_attention(self._normalised(x), valid, self.radial)
+            x = x + radial_attention(self._normalised(x), valid, self.radial)
         if self.config.cross_view_attention and not self.at_surface:
-            x = keep * x + cross_view_attention(x, valid, self.cross)
+            x = x + cross_view_attention(x, valid, self.cross)
         return x.transpose(0, 1)
 
     def attend_at_surface(self, space: ContextualSpace) -> torch.Tensor:
@@ -192,8 +178,7 @@ class SRay(LearnedField):
         if not self.config.cross_view_attention:
             return space.feature
         x = space.feature.transpose(0, 1)
-        keep = 1.0 if self.config.attention_residual else 0.0
-        x = keep * x + cross_view_attention(self._normalised(x), space.valid.transpose(0, 1), self.cross)
+        x = x + cross_view_attention(self._normalised(x), space.valid.transpose(0, 1), self.cross)
         return x.transpose(0, 1)
 
     def blend_views(
@@ -205,8 +190,7 @@ class SRay(LearnedField):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3).
 
-        With ``occlusion`` the weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see
-        the sample alike.
+        The weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see the sample alike.
 
         Args:
             content: (m, R, N, C) what is blended, where that is not what the weights are made of.
@@ -214,16 +198,11 @@ class SRay(LearnedField):
         """
         semantic_score, colour_score = self.weights(self._normalised(refined), space.cues)
         colour_weight = softmax_weights(colour_score, space.valid)
-        if self.config.parity == "published":
-            semantic_weight = colour_weight
-        else:
-            semantic_weight = constrained_weights(semantic_score, space.valid, self.config.tau)
-            if self.config.occlusion or self.at_surface:
-                semantic_weight = semantic_weight * (space.visibility + LEAST_VISIBILITY)
-                if own_factor is not None:
-                    is_own = space.cues[..., CUES] > 0
-                    semantic_weight = semantic_weight * torch.where(is_own, own_factor[:, None], 1)
-                semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
+        semantic_weight = constrained_weights(semantic_score, space.valid, TAU) * (space.visibility + LEAST_VISIBILITY)
+        if own_factor is not None:
+            is_own = space.cues[..., CUES] > 0
+            semantic_weight = semantic_weight * torch.where(is_own, own_factor[:, None], 1)
+        semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
         if self.at_surface:
             colour_weight = colour_weight * (space.visibility + LEAST_VISIBILITY)
             colour_weight = colour_weight / colour_weight.sum(0).clamp_min(1e-12)
@@ -235,7 +214,7 @@ class SRay(LearnedField):
         return functional.layer_norm(x, x.shape[-1:]) if self.at_surface else x
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
-        """As every field renders; streaming, without what ``sampling.sample_weight_threshold`` calls faint."""
+        """As every field renders; streaming, without samples below ``sampling.sample_weight_threshold``."""
         least = self.sampling.sample_weight_threshold if self.sampling.mode == "streaming" else 0.0
         return self.render_samples(rays, self.sample(rays, sources), sources, least)[0]
 
@@ -249,20 +228,19 @@ class SRay(LearnedField):
         """
         space = contextual_space(rays, z, sources)
         sigma = self.find_density(space)
-        interval = torch.ones_like(space.delta) if self.config.parity == "published" else space.delta
-        weights = compositing_weights(sigma, interval)
+        weights = compositing_weights(sigma, space.delta)
         opacity = weights.sum(dim=1)
         known = space.valid.flatten(2).any(2).any(0)
-        looked_at = weights
+        kept = weights
         seen = space if self.at_surface else self.mask_occluded(space)
         if sample_weight_threshold > 0:
-            seen = self.without_faint(seen, weights, sample_weight_threshold)
-            looked_at = weights * seen.valid.any(0)
-            looked_at = looked_at * (opacity / looked_at.sum(1).clamp_min(1e-12))[:, None]
+            seen = self.pruned(seen, weights, sample_weight_threshold)
+            kept = weights * seen.valid.any(0)
+            kept = kept * (opacity / kept.sum(1).clamp_min(1e-12))[:, None]
         refined = self.attend(seen)
         if self.at_surface:
             seen = replace(seen, feature=refined)
-            seen = self.mask_occluded(surface_space(seen, looked_at, rays, sources, occlusion=self.config.occlusion))
+            seen = self.mask_occluded(surface_space(seen, kept, rays, sources))
             token = self.attend_at_surface(seen)
             content, own_factor = token + self.semantic(token), self.own_view_factors(rays)
             s, colour = (blended[:, 0] for blended in self.blend_views(token, seen, content, own_factor))
@@ -270,28 +248,12 @@ class SRay(LearnedField):
         else:
             s, colour = self.blend_views(refined, seen)
             # The classifier is linear, so logits of blended features equal blended logits: classify once a ray.
-            rendered = composite(looked_at, s + self.semantic(s))
-            colour = composite(looked_at, colour)
+            rendered = composite(kept, s + self.semantic(s))
+            colour = composite(kept, colour)
             logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
-        if self.config.source_labels:
-            logits = logits + self.label_logit * composite(weights, self.propagate_labels(space))
-        logits = logits * known[:, None]
-        log_p = torch.log_softmax(logits, dim=-1)
-        render = FieldRender(
-            logits=logits,
-            depth_m=composite_depth(weights, z),
-            opacity=opacity,
-            rgb=colour,
-            entropy=-(log_p.exp() * log_p).sum(-1),
-            known=known,
-        )
-        return render, weights
-
-
-def _before_own_view_factor(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Files from before there was such a factor: the own view is one among others. Older ones have one for all rays."""
-    stored = state_dict.get(prefix + OWN_VIEW_FACTOR, torch.ones(()))
-    state_dict[prefix + OWN_VIEW_FACTOR] = stored.expand(2).clone()
+        logits = logits + self.label_logit * composite(weights, self.propagate_labels(space))
+        depth = composite_depth(weights, z)
+        return field_render(logits=logits, depth_m=depth, opacity=opacity, rgb=colour, known=known), weights
 
 
 def _check(config: SRayConfig) -> None:
@@ -299,7 +261,3 @@ def _check(config: SRayConfig) -> None:
         raise ConfigError(
             f"feature_dim must be a multiple of 4 and of heads ({config.heads}), got {config.feature_dim}"
         )
-    if config.parity == "published" and config.tokens != "samples":
-        raise ConfigError('parity = "published" needs tokens = "samples": the published code has no others')
-    if not 0 < config.tau < 1:
-        raise ConfigError(f"tau must lie between 0 and 1 (Eq. 12), got {config.tau}")

@@ -19,13 +19,10 @@ from semantic_mapper.config import SamplingConfig, UNetFieldConfig
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.projection import gather, reproject
-from semantic_mapper.fields.ray_render import field_render
-from semantic_mapper.fields.source_maps import check_views, encoded_views
+from semantic_mapper.fields.source_views import check_views, encoded_views, gather, own_view, reproject
+from semantic_mapper.fields.volume import field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
-
-SAME_CAMERA = 1e-3  # metres between the centres plus the error of a unit depth: float32 poses agree far better
 
 
 class UNetField(LearnedField):
@@ -61,11 +58,6 @@ class UNetField(LearnedField):
         """Logits (m, L, h, w) of the source images: what ``encode`` made of them."""
         return sources.feature
 
-    def image_classifier(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """See ``LearnedField``."""
-        assert self.classifier.bias is not None
-        return self.classifier.weight[:, :, 0, 0], self.classifier.bias
-
     def predict_image(self, views: SourceViews) -> torch.Tensor:
         """Logits (m, L, H, W) of m images; what rays through their own pixels render to."""
         size = views.rgb.shape[-2:]
@@ -92,19 +84,3 @@ class UNetField(LearnedField):
 
     def _logits(self, views: SourceViews) -> torch.Tensor:
         return self.classifier(functional.relu(self.encoder(views)))
-
-
-def own_view(rays: RayBatch, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
-    """The source view that each ray was taken from, if any.
-
-    A ray starts at the centre of its camera, and its direction has depth 1 in its camera, so a view that turned on the
-    spot is distinguished too.
-
-    Returns:
-        index (R,) int64 of the best view, same (R,) bool: whether that view's camera is the ray's.
-    """
-    R_camera_world, t_camera_world = sources.T_camera_world[:, :3, :3], sources.T_camera_world[:, :3, 3]
-    start = torch.einsum("mij,rj->mri", R_camera_world, rays.origin) + t_camera_world[:, None]  # (m, R, 3)
-    unit_depth = torch.einsum("mj,rj->mr", R_camera_world[:, 2], rays.direction)
-    mismatch, index = (start.norm(dim=-1) + (unit_depth - 1).abs()).min(dim=0)
-    return index, mismatch < SAME_CAMERA

@@ -1,10 +1,98 @@
-"""Volume rendering as pure functions (S-Ray Eq. 2 and 13)."""
+"""Samples along rays, and volume rendering (S-Ray Eq. 2 and 13), as pure functions.
+
+Sample positions are ascending z depths (R, N) in metres.
+"""
 
 from __future__ import annotations
 
+import msgspec
 import torch
 
+from semantic_mapper.config import SamplingConfig
 from semantic_mapper.geometry import expect_shape
+from semantic_mapper.types import FieldRender, RayBatch
+
+COMPUTED_GUIDED = 8  # samples round a depth prior that was computed from pictures
+COMPUTED_SIGMA = 0.05  # half width of their interval, as a fraction of depth
+
+
+def sample_inverse_depth(
+    near_m: torch.Tensor, far_m: torch.Tensor, count: int, generator: torch.Generator | None = None
+) -> torch.Tensor:
+    """Samples uniform in 1 / z between near and far, (R,) -> (R, count).
+
+    Interval midpoints without a generator; with one, a random place in each interval (stratified).
+    """
+    steps = torch.arange(count, dtype=near_m.dtype, device=near_m.device)
+    if generator is None:
+        fraction = (steps + 0.5)[None, :].expand(len(near_m), count) / count
+    else:
+        noise = torch.rand(len(near_m), count, generator=generator, dtype=near_m.dtype, device=near_m.device)
+        fraction = (steps + noise) / count
+    near_inv, far_inv = 1 / near_m[:, None], 1 / far_m[:, None]
+    return 1 / (near_inv + fraction * (far_inv - near_inv))
+
+
+def sample_guided(rays: RayBatch, config: SamplingConfig) -> torch.Tensor:
+    """Samples round the depth prior of each ray; uniform in inverse depth for rays without one.
+
+    ``config.free_space`` of the ``config.guided`` samples lie between near and the guided interval: they find what
+    stands before a prior that is out of date.
+    """
+    prior = rays.prior_depth_m
+    has_prior = prior > 0
+    z_prior = torch.where(has_prior, prior, torch.ones_like(prior))
+    half = config.guided_sigma * z_prior + config.guided_floor_m
+    count = config.guided - config.free_space
+    offset = torch.linspace(-1, 1, count, dtype=prior.dtype, device=prior.device)
+    start = torch.maximum(z_prior - half, rays.near_m * 0.5)
+    around = start[:, None] + (offset[None, :] + 1) * half[:, None]
+    if config.free_space > 0:
+        near = torch.minimum(rays.near_m, start * 0.5)
+        before = sample_inverse_depth(near, start, config.free_space)
+        around = torch.cat((before, around), dim=1)
+    blind = sample_inverse_depth(rays.near_m, rays.far_m, config.guided)
+    return torch.where(has_prior[:, None], around, blind)
+
+
+def around_computed(config: SamplingConfig) -> SamplingConfig:
+    """The settings for depth priors that were computed from pictures: these may be farther off than a sensor's."""
+    return msgspec.structs.replace(
+        config,
+        guided=max(COMPUTED_GUIDED, config.guided),
+        guided_sigma=max(COMPUTED_SIGMA, config.guided_sigma),
+    )
+
+
+def sample_from_weights(
+    z: torch.Tensor, weights: torch.Tensor, count: int, generator: torch.Generator | None = None
+) -> torch.Tensor:
+    """Draw ``count`` depths from the piecewise-constant distribution that ``weights`` (R, N) put on intervals round z.
+
+    Inverse-CDF sampling in inverse depth, evenly spaced quantiles without a generator. Not differentiable.
+    """
+    inv = 1 / z
+    mid = (inv[:, 1:] + inv[:, :-1]) / 2
+    edges = torch.cat((inv[:, :1], mid, inv[:, -1:]), dim=1)  # (R, N + 1)
+    pdf = weights.detach() + 1e-5
+    cdf = torch.cumsum(pdf / pdf.sum(dim=1, keepdim=True), dim=1)
+    cdf = torch.cat((torch.zeros_like(cdf[:, :1]), cdf), dim=1)  # (R, N + 1)
+    shape = (len(z), count)
+    if generator is None:
+        u = (torch.arange(count, dtype=z.dtype, device=z.device) + 0.5).expand(shape) / count
+    else:
+        u = torch.rand(shape, generator=generator, dtype=z.dtype, device=z.device)
+    upper = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, z.shape[1])
+    lower = upper - 1
+    c0, c1 = cdf.gather(1, lower), cdf.gather(1, upper)
+    e0, e1 = edges.gather(1, lower), edges.gather(1, upper)
+    drawn = e0 + (u - c0) / (c1 - c0).clamp_min(1e-8) * (e1 - e0)
+    return (1 / drawn).sort(dim=1).values
+
+
+def merge_samples(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Sorted union of two sample sets of each ray: (R, N), (R, M) -> (R, N + M)."""
+    return torch.cat((a, b), dim=1).sort(dim=1).values
 
 
 def interval_lengths(z: torch.Tensor, direction_norm: torch.Tensor) -> torch.Tensor:
@@ -47,3 +135,50 @@ def composite_depth(weights: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
     """Expected z of what the ray hits, (R,); 0 where the ray is transparent."""
     opacity = weights.sum(dim=1)
     return (weights * z).sum(dim=1) / opacity.clamp_min(1e-6) * (opacity > 1e-3)
+
+
+def composite_render(
+    weights: torch.Tensor, z: torch.Tensor, colour: torch.Tensor, logits: torch.Tensor, known: torch.Tensor
+) -> FieldRender:
+    """Depth and colour composited, logits as they are: explicit zeros where nothing is known.
+
+    Args:
+        weights: (R, N) compositing weights, 0 on rays that are not known.
+        z: (R, N) metres.
+        colour: (R, N, 3) in [0, 1].
+        logits: (R, L), already composited.
+        known: (R,) bool.
+    """
+    return field_render(
+        logits=logits,
+        depth_m=composite_depth(weights, z),
+        opacity=weights.sum(dim=1),
+        rgb=composite(weights, colour),
+        known=known,
+    )
+
+
+def field_render(
+    *, logits: torch.Tensor, depth_m: torch.Tensor, opacity: torch.Tensor, rgb: torch.Tensor, known: torch.Tensor
+) -> FieldRender:
+    """A ``FieldRender`` with zero logits, hence full entropy, where ``known`` (R,) is False."""
+    logits = logits * known[:, None]
+    log_p = torch.log_softmax(logits, dim=-1)
+    return FieldRender(
+        logits=logits,
+        depth_m=depth_m,
+        opacity=opacity,
+        rgb=rgb,
+        entropy=-(log_p.exp() * log_p).sum(-1),
+        known=known,
+    )
+
+
+def weighted_moments(values: torch.Tensor, fraction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and variance over the views, (R, N, C) each, of values (m, R, N, C) that count by share (m, R, N).
+
+    Shares add up to 1 over the views, or are all 0 where no view counts; then both moments are 0.
+    """
+    mean = torch.einsum("mrn,mrnc->rnc", fraction, values)
+    square = torch.einsum("mrn,mrnc->rnc", fraction, values * values)
+    return mean, (square - mean * mean).clamp_min(0)

@@ -11,8 +11,7 @@ import numpy as np
 
 from semantic_mapper.bundle.refiner import PoseRefiner
 from semantic_mapper.config import DepthConfig
-from semantic_mapper.depth_from_motion import DepthFromMotion
-from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
+from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS, DepthFromMotion
 from semantic_mapper.depth_from_motion.views import DepthEstimate
 from semantic_mapper.errors import FrameError
 from semantic_mapper.mapping.picture_check import PictureCheck

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -18,6 +17,7 @@ from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.geometry import NEAREST_Z_M, invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.fit import Budget, cosine_rate, fit
 from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, SourceViews, UInt8
@@ -61,15 +61,10 @@ class UNetBaseline:
         views = [view_from_frame(f, self.label_set, self.config.width) for f in frames]
         generator = torch.Generator().manual_seed(self.config.seed)
         optimiser = torch.optim.AdamW(self.net.parameters(), self.config.learning_rate, weight_decay=1e-4)
-        began, steps = time.monotonic(), 0
 
-        def spent() -> float:
-            return steps / self.config.steps if self.config.steps else (time.monotonic() - began) / self.config.seconds
-
-        while (fraction := spent()) < 1:
-            span = self.config.learning_rate - self.config.final_learning_rate
+        def learn(fraction: float) -> float:
             for group in optimiser.param_groups:
-                group["lr"] = self.config.final_learning_rate + span * 0.5 * (1 + float(np.cos(np.pi * fraction)))
+                group["lr"] = cosine_rate(fraction, self.config.learning_rate, self.config.final_learning_rate)
             order = torch.randperm(len(views), generator=generator).tolist()[: self.config.batch]
             batch = [views[i] for i in order]
             if float(torch.rand(1, generator=generator)) < 0.5:
@@ -84,28 +79,17 @@ class UNetBaseline:
             optimiser.zero_grad()
             loss.backward()  # pyright: ignore[reportUnknownMemberType]
             optimiser.step()
-            steps += 1
-            if on_progress is not None:
-                on_progress(min(fraction, 1.0))
+            return float(loss.detach())
+
+        budget = Budget(0.0 if self.config.steps else self.config.seconds, self.config.steps)
+        steps = fit(learn, budget, None if on_progress is None else lambda p: on_progress(p.fraction))
         self.net.eval()
         return steps
 
     def predict(self, frame: PosedFrame) -> UInt8:
         """Class ids (H, W) of one image at full size."""
-        view = view_from_frame(
-            PosedFrame(
-                stamp_ns=frame.stamp_ns,
-                seq=frame.seq,
-                camera_id=frame.camera_id,
-                rgb=frame.rgb,
-                depth_m=None,
-                label=None,
-                intrinsics=frame.intrinsics,
-                T_world_camera=frame.T_world_camera,
-            ),
-            self.label_set,
-            self.config.width,
-        )
+        plain = replace(frame, depth_m=None, depth_sigma_m=None, label=None)
+        view = view_from_frame(plain, self.label_set, self.config.width)
         with torch.inference_mode():
             logits = self.net.predict_image(to_device(stack_sources([view]), self.device))
             full = functional.interpolate(logits, size=frame.rgb.shape[:2], mode="bilinear", align_corners=False)

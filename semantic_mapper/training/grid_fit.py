@@ -1,4 +1,8 @@
-"""Fit a scene grid to posed images: coarse to fine, with Adam; started from depth where there is some."""
+"""Fit a scene grid to posed images, and the fields that stand on one: coarse to fine, from depth if there is some.
+
+A field of one scene is fitted in stages: geometry and colours for every kind (``fit_geometry``), features where it has
+some (``fit_trunk``), then what is its own.
+"""
 
 from __future__ import annotations
 
@@ -6,95 +10,57 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import msgspec
 import numpy as np
 import torch
+from torch import nn
 
-from semantic_mapper.config import (
-    AtLeastOne,
-    AtLeastZero,
-    Config,
-    Fraction,
-    GridConfig,
-    Metres,
-    NotNegative,
-    Positive,
-)
-from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.grid.kernels import (
+from semantic_mapper.config import GridConfig, GridFieldConfig, to_plain
+from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.registry import build_field, field_config
+from semantic_mapper.fields.scene.grid import HAZE, NOTHING, GridField, SceneGrid, at_resolution, sky_texels
+from semantic_mapper.fields.scene.march import (
+    BIAS,
     LossWeights,
     RayResults,
     SampleLists,
     TargetArrays,
     adam_grid,
     add_total_variation,
+    fuse_grid_depth,
+    most_samples,
     photometric_rays,
     scatter_grid,
 )
-from semantic_mapper.fields.grid.march import most_samples
-from semantic_mapper.fields.grid.scene_grid import NOTHING, SceneGrid, at_resolution, grid_box, sky_texels
-from semantic_mapper.log_events import get_logger
+from semantic_mapper.geometry import invert_pose
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.config import FinetuneConfig
+from semantic_mapper.training.fit import Budget, OnProgress, fit, part_of, time_left
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.grid_depth import depth_bounds, grid_of_depth, image_bounds
-from semantic_mapper.training.schedule import budget_fraction
+from semantic_mapper.training.scene_box import check_parallax, scene_box
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 
 BETA1, BETA2 = 0.9, 0.99
+LEARNING_RATE, FINAL_FRACTION = 0.2, 0.3  # of density and colour at the start, and what is left of it in the end
 SKY_RATE, GAIN_RATE = 0.02, 2e-3
+DENSITY_VARIATION, COLOUR_VARIATION = 1e-5, 1e-6  # weights of the total variation, a ray
+OPACITY = 1e-2  # weight of what stops light, of scenes with depth
 PRUNE_EVERY = 200  # steps
 WARM_UP = 200  # steps before anything is pruned
 COARSE = ((0.0, 3), (0.3, 1.5), (0.6, 1))  # fraction of the steps, and how much coarser the grid is until the next
-MIN_PARALLAX = 1e-3  # distance of cameras as a fraction of the box, below which poses only turn
 MIN_FRAMES = 2
-LONG_SIDE, OPACITY = 96, 1e-2  # of scenes with depth
-VOXELS = 2.5e6  # of a grid without depth: its box is flat, or has much air
 PSNR_VIEWS = 4  # of those that are held out, evenly spread: rendering costs as much as hundreds of steps
 MIN_GAIN_DB = 1.0  # over the mean colour; the sky's colours alone, with poses that mean nothing, gain half of it
-_log = get_logger(__name__)
-
-
-class GridFitConfig(Config, frozen=True):
-    """How a scene grid is fitted."""
-
-    steps: AtLeastOne = 1200
-    seconds: AtLeastZero = 0.0  # wall-clock bound; 0 = only steps count (then a run repeats bit for bit)
-    rays: AtLeastOne = 2048  # a step
-    width: AtLeastOne = 320  # working width of the images
-    # Vertices along the box's longest side; None = 96, and where no frame has depth as many as make 2.5 M in all
-    long_side: Annotated[int, msgspec.Meta(ge=8, le=2048)] | None = None
-    voxel_m: Positive | None = None  # sets their distance instead
-    # Lower corner, then upper corner of the box in metres of the world; None = what depth reaches; without depth, what
-    # matched features show; where these are too few, what the cameras can see up to ``far_m``
-    box_m: tuple[float, float, float, float, float, float] | None = None
-    near_m: AtLeastZero = 0.1
-    far_m: Metres = 8.0
-    learning_rate: Positive = 0.2  # of density and colour at the start
-    final_rate: Fraction = 0.3  # what is left of it in the end
-    density_variation: AtLeastZero = 1e-5  # weight of the total variation, a ray
-    colour_variation: AtLeastZero = 1e-6
-    point_colour: AtLeastZero = 0.1  # weight of the colour of each sample
-    # Weight of what stops light: clears haze of the sky's colour. None = 0.01 where depth of frames is used, else 0:
-    # without depth the sky's colours explain surface
-    opacity: AtLeastZero | None = None
-    depth: AtLeastZero = 0.1  # weight of what lies off the measured depth, where frames have some
-    start_from_depth: bool = True  # where frames have some
-    exposure: bool = True  # a gain a frame and channel, for cameras whose exposure drifts
-    trunk_steps: NotNegative = 600  # of features and colours that depend on the direction, where a field has them
-    held_out: NotNegative = 8  # every n-th frame is held out, for the PSNR; 0 = none
-    seed: NotNegative = 0
-
-
-@dataclass(frozen=True, slots=True)
-class GridFitProgress:
-    """State after a step; ``loss`` is the mean squared error of its rays."""
-
-    step: int
-    fraction: float
-    loss: float
+TRUNCATION = 3.0  # voxels
+BETA = 0.5  # voxels: spread of the Laplace distribution that turns distance into density
+TRUNK_RAYS, TRUNK_SAMPLES, TRUNK_STEPS = 1024, 8, 600
+FEATURE_RATE, TRUNK_RATE = 2e-2, 2e-3
+GRID_UNTIL = 0.6  # fraction of the time, where features are fitted to the grid afterwards
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,8 +89,8 @@ class GridFit:
 
 def fit_grid(
     frames: Sequence[PosedFrame],
-    config: GridFitConfig = GridFitConfig(),
-    on_progress: Callable[[GridFitProgress], None] | None = None,
+    config: FinetuneConfig,
+    on_progress: OnProgress | None = None,
     stopped: Callable[[], object] = bool,
     box: GridConfig | None = None,
     leave_out: Callable[[Sequence[PosedFrame], FrameRays], Bool] | None = None,
@@ -133,9 +99,9 @@ def fit_grid(
 
     Args:
         frames: Of a scene that stands still; sizes and cameras may differ. Frames with impossible poses are left out.
-        config: Budget, box and resolution.
-        on_progress: Called after every step.
-        stopped: Asked before every step; once it says so (anything true), the grid so far is the result.
+        config: Budget, box and resolution; without ``steps`` those of ``config.grid``.
+        on_progress: Called after every step with the mean squared error of its rays.
+        stopped: Called before every step; once it returns anything true, the grid so far is the result.
         box: Instead of the one that ``config`` describes.
         leave_out: Which pixels (P,) of the frames show something else than the scene.
 
@@ -144,28 +110,23 @@ def fit_grid(
             colour.
         ConfigError: a box that cannot be.
     """
-    start = time.monotonic()
+    budget = Budget(config.seconds, config.steps or config.grid.steps)
+    every = config.grid.held_out
     frames = usable_frames(frames)
-    held_out = frames[config.held_out - 1 :: config.held_out] if config.held_out else []
-    seen = [f for i, f in enumerate(frames) if not config.held_out or (i + 1) % config.held_out]
+    held_out = frames[every - 1 :: every] if every else []
+    seen = [f for i, f in enumerate(frames) if not every or (i + 1) % every]
     if len(seen) < MIN_FRAMES:
         raise FrameError(f"a grid needs at least {MIN_FRAMES} frames to fit besides held-out ones, got {len(seen)}")
-    box = box or scene_box(frames, config)
-    _check_parallax(frames, box)
+    box = box or scene_box(frames, config.grid)
+    check_parallax(frames, box)
     rays = frame_rays(seen, config.width)
     fitter = _Fitter(rays, box, config, None if leave_out is None else leave_out(seen, rays))
-    steps = 0
-    fraction = 0.0
-    while fraction < 1 and not stopped():
-        loss = fitter.step(steps, fraction)
-        steps += 1
-        fraction = budget_fraction(steps, time.monotonic() - start, steps=config.steps, seconds=config.seconds)
-        if on_progress is not None:
-            on_progress(GridFitProgress(steps, min(fraction, 1.0), loss))
+    steps = fit(fitter.learn, budget, on_progress, stopped)
+    complete = budget.used(steps) >= 1
     grid = fitter.finish()
     shown = [] if stopped() else held_out[:: -(-len(held_out) // PSNR_VIEWS) or 1]
     psnr, mean_psnr = held_out_psnr(grid, shown, config)
-    if psnr < mean_psnr + MIN_GAIN_DB and fraction >= 1:
+    if psnr < mean_psnr + MIN_GAIN_DB and complete:
         raise FrameError(
             f"held-out views are rendered with {psnr:.1f} dB, hardly better than by their mean colour "
             f"({mean_psnr:.1f} dB): poses do not fit the images, or {steps} steps are too few. Poses are "
@@ -173,31 +134,39 @@ def fit_grid(
             "must hold what is seen"
         )
     gains = np.exp(fitter.log_gain).astype(np.float32)
-    return GridFit(grid, steps, time.monotonic() - start, psnr, mean_psnr, tuple(seen), gains)
+    return GridFit(grid, steps, budget.elapsed_s, psnr, mean_psnr, tuple(seen), gains)
 
 
-def scene_box(frames: Sequence[PosedFrame], config: GridFitConfig) -> GridConfig:
-    """The box that ``config`` asks for, or what the frames' depth reaches, or what their images show.
+def grid_of_depth(rays: FrameRays, config: GridConfig, unseen: float = HAZE) -> SceneGrid:
+    """A grid whose density is that of the measured surface; colours are grey.
 
-    Raises:
-        ConfigError: a box without a volume, or too large for ``voxel_m``.
+    Density is Laplace-CDF(-distance) / beta with beta = half a voxel. What was not observed (``distance_to_surface``
+    says where that is) has the raw density ``unseen``: haze, for images to clear or fill.
     """
-    long_side = config.long_side or LONG_SIDE
-    if config.box_m is not None:
-        low, high = config.box_m[:3], config.box_m[3:]
-    elif any(f.depth_m is not None for f in frames):
-        low, high = depth_bounds(frames)
-    else:
-        low, high = image_bounds(frames, config.far_m)
-        sides = [b - a for a, b in zip(low, high, strict=True)]
-        long_side = config.long_side or max(LONG_SIDE, round(max(sides) * (VOXELS / math.prod(sides)) ** (1 / 3)))
-    box = grid_box(low, high, long_side, config.voxel_m)
-    wanted = max(b - a for a, b in zip(low, high, strict=True)) / (long_side - 1)
-    if config.voxel_m is None and box.voxel_m > wanted * (1 + 1e-9):
-        _log.warning(
-            "voxels_grown", wanted_m=round(wanted, 4), voxel_m=round(box.voxel_m, 4), reason="16 M voxels at most"
-        )
-    return box
+    distance, observed = distance_to_surface(rays, config)
+    grid = SceneGrid(config)
+    density = np.where(distance > 0, 0.5 * np.exp(-np.abs(distance) / BETA), 1 - 0.5 * np.exp(-np.abs(distance) / BETA))
+    per_voxel = density / BETA
+    raw = np.log(np.expm1(np.maximum(per_voxel, 1e-9))) - BIAS
+    values = np.where(observed, np.maximum(raw, NOTHING), unseen).astype(np.float32)
+    with torch.no_grad():
+        grid.values[..., 0] = torch.from_numpy(values)
+    grid.update_occupied()
+    return grid
+
+
+def distance_to_surface(rays: FrameRays, config: GridConfig) -> tuple[Float32, Bool]:
+    """Distance (X, Y, Z) in voxels, positive before the surface, at most ``TRUNCATION``; and where it was observed."""
+    distance, weight = np.zeros(config.shape, np.float32), np.zeros(config.shape, np.float32)
+    T_world_grid = np.diag((config.voxel_m, config.voxel_m, config.voxel_m, 1.0))
+    T_world_grid[:3, 3] = config.origin_m
+    for i, k in enumerate(rays.intrinsics):
+        depth = rays.depth_m[rays.pixels_of(i)].reshape(rays.image_size(i))
+        T_camera_grid = invert_pose(rays.T_world_camera[i].astype(np.float64)) @ T_world_grid
+        pinhole = (k.fx, k.fy, k.cx, k.cy)
+        arrays = (distance, weight, depth, np.ascontiguousarray(T_camera_grid[:3]))
+        fuse_grid_depth(len(distance), *arrays, *pinhole, TRUNCATION * config.voxel_m)
+    return distance * np.float32(TRUNCATION), weight > 0
 
 
 def render_frame(grid: SceneGrid, rays: FrameRays, frame: int, near_m: float) -> tuple[Float32, Float32]:
@@ -214,16 +183,16 @@ def render_frame(grid: SceneGrid, rays: FrameRays, frame: int, near_m: float) ->
     return colour.numpy().reshape(*size, 3), depth.numpy().reshape(size)
 
 
-def held_out_psnr(grid: SceneGrid, frames: Sequence[PosedFrame], config: GridFitConfig) -> tuple[float, float]:
+def held_out_psnr(grid: SceneGrid, frames: Sequence[PosedFrame], config: FinetuneConfig) -> tuple[float, float]:
     """PSNR in dB of frames that were not fitted to, and that of images of their mean colour; NaN without frames."""
     if not frames:
         return math.nan, math.nan
     rays = frame_rays(frames, config.width)
     errors, plain = [], []
     for i in range(len(frames)):
-        colour, _ = render_frame(grid, rays, i, config.near_m)
+        colour, _ = render_frame(grid, rays, i, config.grid.near_m)
         truth = rays.rgb[rays.pixels_of(i)].reshape(colour.shape) / np.float32(255)
-        if config.exposure:
+        if config.grid.exposure:
             colour = colour * ((colour * truth).sum((0, 1)) / np.maximum((colour * colour).sum((0, 1)), 1e-6))
         errors.append(np.square(colour - truth).mean())
         plain.append(np.square(truth.mean((0, 1)) - truth).mean())
@@ -238,22 +207,22 @@ def psnr_of(mean_square: float) -> float:
 class _Fitter:
     """The grid at its present resolution, and the state of Adam."""
 
-    def __init__(self, rays: FrameRays, box: GridConfig, config: GridFitConfig, left_out: Bool | None) -> None:
+    def __init__(self, rays: FrameRays, box: GridConfig, config: FinetuneConfig, left_out: Bool | None) -> None:
         self.pixels = np.arange(len(rays)) if left_out is None else np.flatnonzero(~left_out)
         if left_out is not None:
             rays = replace(rays, depth_m=np.where(left_out, np.float32(0), rays.depth_m))
-        self.rays, self.box, self.config = rays, box, config
+        self.rays, self.box, self.config = rays, box, config.grid
         self.rng = np.random.default_rng(config.seed)
         self.order = np.zeros(0, np.int64)
         self.log_gain = np.zeros((len(rays.intrinsics), 3))
-        measured = bool((rays.depth_m > 0).any()) and (config.depth > 0 or config.start_from_depth)
-        from_depth = config.start_from_depth and measured
-        self.opacity = (OPACITY if measured else 0.0) if config.opacity is None else config.opacity
+        measured = bool((rays.depth_m > 0).any())
+        opacity = self.config.opacity
+        self.loss = LossWeights(opacity=(OPACITY if measured else 0.0) if opacity is None else opacity)
         # A start from depth has nothing to gain from coarse grids.
-        self.stages = COARSE[-1:] if from_depth else COARSE
-        self.stage = 0
+        self.stages = COARSE[-1:] if measured else COARSE
+        self.stage, self.steps = 0, 0
         first = at_resolution(box, self._long_side(0))
-        self.grid = grid_of_depth(rays, first) if from_depth else SceneGrid(first)
+        self.grid = grid_of_depth(rays, first) if measured else SceneGrid(first)
         self.gain_adam, self.sky_adam = _Adam(self.log_gain.shape), _Adam(tuple(self.grid.sky.shape))
         self._allocate()
 
@@ -267,8 +236,9 @@ class _Fitter:
         self.samples = SampleLists.empty(self.config.rays, most_samples(self.values.shape), 4)
         self.rate, self.since = view_fraction(self.rays, self.grid.config, self.config.near_m), 0
 
-    def step(self, step: int, fraction: float) -> float:
+    def learn(self, fraction: float) -> float:
         """One step of Adam on a batch of rays at a fraction of the budget; returns their mean squared error."""
+        step, self.steps = self.steps, self.steps + 1
         if self.stage + 1 < len(self.stages) and fraction >= self.stages[self.stage + 1][0]:
             self.stage += 1
             del self.gradient, self.first, self.second, self.samples  # before larger ones are made
@@ -278,8 +248,8 @@ class _Fitter:
             self.grid.update_occupied()
         loss = self._rays_backward(self._draw())
         self.since += 1
-        config, rate = self.config, self.config.learning_rate * self.config.final_rate**fraction
-        variation = (config.density_variation / config.rays, config.colour_variation / config.rays)
+        rate, count = LEARNING_RATE * FINAL_FRACTION**fraction, self.config.rays
+        variation = (DENSITY_VARIATION / count, COLOUR_VARIATION / count)
         add_total_variation(len(self.values), self.values, self.gradient, *variation)
         buffers = (self.values, self.gradient, self.first, self.second, self.rate)
         corrections = (1 - BETA1**self.since, 1 - BETA2**self.since)
@@ -309,10 +279,9 @@ class _Fitter:
         inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         colour = self.rays.rgb[pixels].astype(np.float32) / np.float32(255)
         results = RayResults(*(np.empty((len(pixels), 3), np.float32) for _ in range(3)))
-        loss = LossWeights(self.config.point_colour, self.opacity, self.config.depth)
         rays = self.grid.rays(batch, jitter).arrays()
         targets = TargetArrays(colour, inverse, gain, behind)
-        photometric_rays(len(pixels), self.grid.arrays(), rays, targets, loss, self.samples, results)
+        photometric_rays(len(pixels), self.grid.arrays(), rays, targets, self.loss, self.samples, results)
         scatter_grid(len(self.gradient), self.samples, self.gradient)
         self._step_sky(batch.direction, results.sky_gradient)
         if self.config.exposure:
@@ -365,16 +334,120 @@ def view_fraction(rays: FrameRays, config: GridConfig, near_m: float) -> Float32
     return count / max(float(count.max()), 1.0)
 
 
-def _check_parallax(frames: Sequence[PosedFrame], box: GridConfig) -> None:
-    """Refuse cameras that stand in one place.
+def fit_geometry(
+    kind: str,
+    frames: Sequence[PosedFrame],
+    label_set: LabelSet,
+    start: LearnedField | None,
+    config: FinetuneConfig,
+    on_progress: OnProgress | None = None,
+    stopped: Callable[[], object] = bool,
+    shape: GridFieldConfig | None = None,
+    leave_out: Callable[[Sequence[PosedFrame], FrameRays], Bool] | None = None,
+) -> tuple[GridField, GridFit]:
+    """A field of ``kind`` (a ``GridField``) whose grid shows the frames, and how well it does.
+
+    Args:
+        start: Gives the kind's config, and its box if it is fitted, unless ``config.grid`` names one; its weights are
+            not looked at.
+        config: ``seconds`` bounds the time and ``steps``, if not 0, is the number of steps.
+        shape: Config of the kind in place of ``start``'s, but for the box.
+        leave_out: As of ``fit_grid``.
 
     Raises:
-        FrameError: they do.
+        FrameError, ConfigError: of ``fit_grid``.
     """
-    position = np.array([f.T_world_camera[:3, 3] for f in frames])
-    reach = float(np.linalg.norm(position - position.mean(0), axis=1).max())
-    if reach < MIN_PARALLAX * box.voxel_m * max(box.shape):
-        raise FrameError(
-            f"all cameras stand within {reach:.3g} m: poses that only turn tell no depth. Move the camera; poses are "
-            "T_world_camera, with translations in metres"
-        )
+    given = start.config if isinstance(start, GridField) else field_config(kind, {})
+    if not isinstance(given, GridFieldConfig):
+        raise ConfigError(f"a field of kind '{kind}' has no scene grid; kinds with one build on GridField")
+    fitted = isinstance(start, GridField) and start.fitted
+    box = given.grid if fitted and config.grid.box_m is None else None
+    found = fit_grid(frames, config, on_progress, stopped, box, leave_out)
+    torch.manual_seed(config.seed)  # of what the kind draws
+    field = build_field(kind, msgspec.structs.replace(shape or given, grid=found.grid.config), label_set)
+    assert isinstance(field, GridField)
+    field.grid = found.grid
+    field.fitted_steps += found.steps
+    return field, found
+
+
+def fit_scene(
+    frames: Sequence[PosedFrame],
+    label_set: LabelSet,
+    start: LearnedField | None,
+    config: FinetuneConfig,
+    on_progress: OnProgress | None = None,
+    stopped: Callable[[], object] = bool,
+    seen_stamps_ns: Iterable[int] = (),
+) -> Checkpoint:
+    """Fit a plain ``GridField``: geometry and colour, no classes. Arguments and errors as of ``fit_geometry``."""
+    began = time.monotonic()
+    until = GRID_UNTIL if isinstance(start, GridField) and start.trunk is not None else 1.0
+    part = msgspec.structs.replace(config, seconds=until * config.seconds)
+    progress = part_of(on_progress, 0, until)
+    field, found = fit_geometry(GridField.kind, frames, label_set, start, part, progress, stopped)
+    if field.trunk is not None:
+        part = msgspec.structs.replace(config, seconds=time_left(config.seconds, began))
+        fit_trunk(field, found, part, part_of(on_progress, until, 1.0), stopped)
+    return scene_checkpoint(field, found, config, time.monotonic() - began, seen_stamps_ns)
+
+
+def fit_trunk(
+    field: GridField,
+    geometry: GridFit,
+    config: FinetuneConfig,
+    on_progress: OnProgress | None = None,
+    stopped: Callable[[], object] = bool,
+) -> float:
+    """Fit features, trunk and colour head to the frames of a grid's fit; the geometry stays.
+
+    Returns the PSNR of the last steps' rays in dB.
+    """
+    trunk = field.trunk
+    assert trunk is not None
+    rng = np.random.default_rng(config.seed)
+    rays = frame_rays(geometry.frames, config.width)
+    networks = [p for name, p in trunk.named_parameters() if name != "features"]
+    groups = [{"params": [trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
+    optimiser = torch.optim.Adam(groups, fused=True)  # without temporaries as large as the features
+    errors: list[float] = []
+
+    def learn(fraction: float) -> float:
+        pixels = rng.integers(0, len(rays), TRUNK_RAYS)
+        batch = rays.rays(pixels, config.grid.near_m)
+        with torch.no_grad():
+            samples = field.march(batch, TRUNK_SAMPLES, torch.from_numpy(rng.random(len(pixels), np.float32)))
+            behind = field.grid.sky_colour(batch.direction) * samples.light[:, None]
+            weight = samples.weight * (samples.opacity / samples.weight.sum(1).clamp_min(1e-6))[:, None]
+        gain = torch.from_numpy(geometry.gains[rays.frame_of(pixels)])
+        seen = gain * ((weight[..., None] * field.colour(samples)).sum(1) + behind)
+        loss = nn.functional.mse_loss(seen, torch.from_numpy(rays.rgb[pixels] / np.float32(255)))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        errors.append(float(loss.detach()))
+        return errors[-1]
+
+    fit(learn, Budget(config.seconds, min(config.steps or TRUNK_STEPS, TRUNK_STEPS)), on_progress, stopped)
+    return psnr_of(float(np.mean(errors[-50:]))) if errors else math.nan
+
+
+def scene_checkpoint(
+    field: GridField,
+    geometry: GridFit,
+    config: FinetuneConfig,
+    seconds: float,
+    seen_stamps_ns: Iterable[int] = (),
+    labelled: Sequence[PosedFrame] = (),
+) -> Checkpoint:
+    """The weights with their recipe; ``labelled`` are frames whose labels were used."""
+    recipe = {
+        "kind": "scene fit",
+        "width": config.width,
+        "config": to_plain(config),
+        "steps": geometry.steps,
+        "seconds": round(seconds, 1),
+        "psnr": None if math.isnan(geometry.psnr) else round(geometry.psnr, 2),
+        "train_stamps_ns": sorted({int(f.stamp_ns) for f in labelled} | {int(s) for s in seen_stamps_ns}),
+    }
+    return Checkpoint(field.eval(), (), recipe)

@@ -19,27 +19,30 @@ import torch
 from torch.nn import functional
 
 from semantic_mapper.config import IRTConfig
-from semantic_mapper.errors import ConfigError, FrameError, WeightsError
+from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.grid.field import RaySamples
-from semantic_mapper.fields.irt import IRT, RayTexture, at_measured, no_texture, surface
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.scene.grid import RaySamples
+from semantic_mapper.fields.scene.irt import IRT, RayTexture, at_measured, no_texture, surface
 from semantic_mapper.geometry import camera_matrix, invert_pose
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.budget import BestWeights, BudgetClock
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, held_out_blocks
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.losses import IGNORE, RAREST, semantic_loss
-from semantic_mapper.training.scene_fit import (
-    FittedGeometry,
-    fit_geometry,
-    fit_trunk,
-    grid_settings,
+from semantic_mapper.training.config import FinetuneConfig
+from semantic_mapper.training.finetune import check_budget, held_out_blocks
+from semantic_mapper.training.fit import (
+    BestWeights,
+    Budget,
+    HeldOut,
+    OnProgress,
+    State,
+    cosine_rate,
+    fit,
     part_of,
-    scene_checkpoint,
+    time_left,
 )
-from semantic_mapper.training.schedule import cosine_rate
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
+from semantic_mapper.training.grid_fit import GridFit, fit_geometry, fit_trunk, scene_checkpoint
+from semantic_mapper.training.losses import IGNORE, RAREST, semantic_loss
 from semantic_mapper.training.views import jittered
 from semantic_mapper.types import PosedFrame
 
@@ -88,7 +91,7 @@ def fit_irt(
     label_set: LabelSet,
     start: LearnedField | None,
     config: FinetuneConfig,
-    on_progress: Callable[[FinetuneProgress], None] | None = None,
+    on_progress: OnProgress | None = None,
     stopped: Callable[[], object] = bool,
     seen_stamps_ns: Iterable[int] = (),
 ) -> Checkpoint:
@@ -100,7 +103,7 @@ def fit_irt(
         start: Gives config and box; its weights are not looked at.
         config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its parts.
         on_progress: Called after every step.
-        stopped: Asked before every step; once it says so (anything true), the best weights so far are the result.
+        stopped: Called before every step; once it returns anything true, the best weights so far are the result.
         seen_stamps_ns: Frames that ``start`` was fitted to.
 
     Raises:
@@ -108,8 +111,7 @@ def fit_irt(
         WeightsError: ``start`` has other classes.
         ConfigError: no budget.
     """
-    if config.seconds <= 0 and config.steps <= 0:
-        raise ConfigError("a fit needs a budget: set seconds, steps, or both")
+    check_budget(config)
     if start is not None and start.label_set != label_set:
         raise WeightsError(
             f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit without them"
@@ -117,20 +119,18 @@ def fit_irt(
     began = time.monotonic()
     labelled = [f for f in usable_frames(frames) if f.label is not None]
     rays = labelled_rays(labelled, label_set, config)
-    geometry = _fit_scene(frames, rays, label_set, start, config, on_progress, stopped)
-    field = geometry.field
-    assert isinstance(field, IRT)
-    fit = ClassFit(field, rays, config)
-    best = fit.run(began, part_of(on_progress, TRUNK_UNTIL, 1.0), stopped)
-    checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, labelled)
+    field, geometry = _fit_scene(frames, rays, label_set, start, config, on_progress, stopped)
+    classes = ClassFit(field, rays, config)
+    best, steps = classes.run(time_left(config.seconds, began), part_of(on_progress, TRUNK_UNTIL, 1.0), stopped)
+    checkpoint = scene_checkpoint(field, geometry, config, time.monotonic() - began, seen_stamps_ns, labelled)
     figures = {
-        "steps": fit.step,
+        "steps": steps,
         "best_step": best.step,
         "held_out_loss": best.loss,
         "held_out_accuracy": best.accuracy,
+        "grid_steps": geometry.steps,
     }
-    recipe = checkpoint.recipe | {"grid_steps": geometry.fit.steps} | figures
-    return Checkpoint(checkpoint.model, (), recipe)
+    return Checkpoint(checkpoint.model, (), checkpoint.recipe | figures)
 
 
 def labelled_rays(frames: Sequence[PosedFrame], label_set: LabelSet, config: FinetuneConfig) -> LabelledRays:
@@ -167,9 +167,9 @@ def _fit_scene(
     label_set: LabelSet,
     start: LearnedField | None,
     config: FinetuneConfig,
-    on_progress: Callable[[FinetuneProgress], None] | None,
+    on_progress: OnProgress | None,
     stopped: Callable[[], object],
-) -> FittedGeometry:
+) -> tuple[IRT, GridFit]:
     """Geometry, colours and features of all frames; they stay as they are from then on."""
     began = time.monotonic()
     count, size = len(labelled.rays.intrinsics), labelled.rays.image_size(0)
@@ -177,18 +177,14 @@ def _fit_scene(
     variant = config.irt.variant or shape.variant
     carried = count if config.irt.carry_labels else 0
     shape = msgspec.structs.replace(shape, variant=variant, carried=carried, carried_size=size)
-    known = start if isinstance(start, IRT) and start.fitted else None  # whose box is that of a scene
+    known = start if isinstance(start, IRT) else None
     part = msgspec.structs.replace(config, seconds=GRID_UNTIL * config.seconds)
     progress = part_of(on_progress, 0, GRID_UNTIL)
-    geometry = fit_geometry(IRT.kind, frames, label_set, known, part, progress, stopped, shape)
-    field, settings = geometry.field, grid_settings(part)
-    if config.steps:
-        settings = msgspec.structs.replace(settings, trunk_steps=min(settings.trunk_steps, config.steps))
-    assert field.trunk is not None
-    until = began + TRUNK_UNTIL * config.seconds if config.seconds else math.inf
-    progress = part_of(on_progress, GRID_UNTIL, TRUNK_UNTIL)
-    fit_trunk(field, field.trunk, geometry.fit, settings, lambda: stopped() or time.monotonic() > until, progress)
-    return geometry
+    field, geometry = fit_geometry(IRT.kind, frames, label_set, known, part, progress, stopped, shape)
+    assert isinstance(field, IRT)
+    part = msgspec.structs.replace(config, seconds=time_left(TRUNK_UNTIL * config.seconds, began))
+    fit_trunk(field, geometry, part, part_of(on_progress, GRID_UNTIL, TRUNK_UNTIL), stopped)
+    return field, geometry
 
 
 class ClassFit:
@@ -209,43 +205,32 @@ class ClassFit:
         if len(self.looked_at) > LOOK_RAYS:
             order = torch.randperm(len(self.looked_at), generator=self.generator)
             self.looked_at = self.looked_at[order[:LOOK_RAYS].sort().values]
-        self.step, self.fraction = 0, 0.0
 
     def run(
-        self, began: float, on_progress: Callable[[FinetuneProgress], None] | None, stopped: Callable[[], object]
-    ) -> BestWeights:
-        """Learn until the budget is spent; the field then has the weights that were best on what was held out."""
-        config = self.config
-        left = max(config.seconds - (time.monotonic() - began), 0.05 * config.seconds)
-        clock = BudgetClock(left, config.steps, config.evaluations)
-        latest = best = BestWeights(math.inf, math.nan, 0, self._state())
-        if stopped():
-            return best
-        carry_labels(self.field, self.data.rays, self.taught, config.grid.near_m)
-        while self.fraction < 1 and not stopped():
-            loss = self._learn()
-            self.step += 1
-            self.fraction = clock.used(self.step)
-            improved = False
-            if clock.look_due(self.fraction):
-                with clock.looking():
-                    latest = self._look()
-                improved = best.beaten_by(latest.loss)
-                best = latest if improved else best
-            if on_progress is not None:
-                done = min(self.fraction, 1.0)
-                on_progress(FinetuneProgress(self.step, done, loss, latest.loss, latest.accuracy, improved))
-        if stopped() and self.step > 0:
-            latest = self._look()
-            best = latest if best.beaten_by(latest.loss) else best
-        self.field.load_state_dict(best.state, strict=False)
-        carry_labels(self.field, self.data.rays, self.data.channel, self.config.grid.near_m)
-        return best
+        self, seconds: float, on_progress: OnProgress | None = None, stopped: Callable[[], object] = bool
+    ) -> tuple[BestWeights, int]:
+        """Learn until the budget is used; the field then has the weights that were best on what was held out.
 
-    def _learn(self) -> float:
-        """One step."""
+        Args:
+            seconds: 0 = only steps count.
+
+        Returns:
+            These weights, and the number of steps.
+        """
+        held_out = HeldOut(self._look, self._state, BestWeights(math.inf, math.nan, 0, self._state()))
+        steps = 0
+        if not stopped():
+            carry_labels(self.field, self.data.rays, self.taught, self.config.grid.near_m)
+            budget = Budget(seconds, self.config.steps, self.config.evaluations)
+            steps = fit(self._learn, budget, on_progress, stopped, held_out)
+            self.field.load_state_dict(held_out.best.state, strict=False)
+            carry_labels(self.field, self.data.rays, self.data.channel, self.config.grid.near_m)
+        return held_out.best, steps
+
+    def _learn(self, fraction: float) -> float:
+        """One step, at a fraction of the budget."""
         for group in self.optimiser.param_groups:
-            group["lr"] = cosine_rate(min(self.fraction, 1.0), LEARNING_RATE, FINAL_RATE)
+            group["lr"] = cosine_rate(fraction, LEARNING_RATE, FINAL_RATE)
         pixels, weight = self.pool.draw(RAYS, self.generator)
         channel = self.data.channel[pixels]
         with_depth = float(torch.rand(1, generator=self.generator)) < DEPTH_USED
@@ -265,7 +250,7 @@ class ClassFit:
         self.optimiser.step()
         return float(loss.detach())
 
-    def _look(self) -> BestWeights:
+    def _look(self) -> tuple[float, float]:
         """Loss and accuracy of what was held out, as a consumer with the frame's own image sees it."""
         losses: list[float] = []
         right = 0
@@ -281,11 +266,9 @@ class ClassFit:
                 right += int((logits.argmax(1) == channel).sum())
         self.field.train()
         count = len(self.looked_at)
-        if not count:
-            return BestWeights(math.inf, math.nan, self.step, self._state())
-        return BestWeights(sum(losses) / count, right / count, self.step, self._state())
+        return (sum(losses) / count, right / count) if count else (math.inf, math.nan)
 
-    def _state(self) -> dict[str, torch.Tensor]:
+    def _state(self) -> State:
         return {name: p.detach().clone() for name, p in self.learned.items()}
 
     def _samples(self, pixels: torch.Tensor, *, with_depth: bool, jitter: torch.Tensor | None = None) -> RaySamples:

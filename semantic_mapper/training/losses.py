@@ -1,31 +1,19 @@
-"""What a rendered ray is compared with."""
+"""What a rendered ray, and an image by itself, is compared with."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch.nn import functional
 
-from semantic_mapper.config import Config
 from semantic_mapper.training.views import RayTargets
 from semantic_mapper.types import FieldRender
 
 IGNORE = -1
 GUESS_WIDTH = 0.01  # least relative spread of a guessed depth
 RAREST = 1e-3  # fraction of the pixels below which a class is not weighted up further
-
-
-class LossConfig(Config, frozen=True):
-    """Weights of the parts of the loss."""
-
-    semantic: float = 0.25
-    colour: float = 0.75
-    depth: float = 0.1
-    source: float = 0.25  # per-pixel class loss on labelled source views: teaches the shared encoder densely
-    balance: float = 0.0  # of that loss, see ``image_loss``
-    source_depth: float = 0.0  # on the depth that the field predicts for source views without any, see ``guess_loss``
+SEMANTIC, COLOUR, DEPTH = 0.25, 0.75, 0.1  # weights of the parts of ``ray_loss``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +80,9 @@ def guess_loss(geometry: torch.Tensor, given_m: torch.Tensor, depth_m: torch.Ten
     return (each * guessed).sum() / guessed.sum().clamp_min(1)
 
 
-def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Loss:
+def ray_loss(
+    render: FieldRender, targets: RayTargets, weights: tuple[float, float, float] = (SEMANTIC, COLOUR, DEPTH)
+) -> Loss:
     """Weighted sum of the semantic, colour and depth losses over rays that some view sees.
 
     Depth is compared in inverse metres where it is measured, so that near and far errors count by what a camera sees.
@@ -105,13 +95,5 @@ def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Lo
     measured = known & (targets.depth_m > 0) & (render.opacity > 0.1)
     inverse = (1 / render.depth_m.clamp_min(0.1) - 1 / targets.depth_m.clamp_min(0.1)).abs()
     depth = (inverse * measured).sum() / measured.sum().clamp_min(1)
-    total = config.semantic * semantic + config.colour * colour + config.depth * depth
+    total = weights[0] * semantic + weights[1] * colour + weights[2] * depth
     return Loss(total, semantic, colour, depth)
-
-
-def mean_loss(losses: Sequence[Loss]) -> Loss:
-    """Mean of at least one loss, part by part."""
-    if len(losses) == 1:
-        return losses[0]
-    parts = {f.name: torch.stack([getattr(loss, f.name) for loss in losses]).mean() for f in fields(Loss)}
-    return Loss(**parts)

@@ -1,4 +1,4 @@
-"""One round of learning beside a mapper: finetune on the keyframes so far, and judge by those that were held out.
+"""One round of learning next to a mapper: finetune on the keyframes so far, and judge by those that were held out.
 
 The image encoder is frozen, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights
 can be put in the place of old ones at once.
@@ -13,55 +13,30 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, Fraction, NotNegative
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, SegmentationMetrics
 from semantic_mapper.fields.base import EncodedViews, stack_views
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.device import DeviceName
 from semantic_mapper.fields.learned import LearnedField, encode_alike
-from semantic_mapper.fields.sampling import sample_guided
+from semantic_mapper.fields.volume import sample_guided
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
+from semantic_mapper.training.config import OnlineConfig
+from semantic_mapper.training.finetune import finetune
+from semantic_mapper.training.fit import OnProgress
 from semantic_mapper.training.keyframe_pool import Key, KeyframeSplit, key_of
 from semantic_mapper.training.losses import IGNORE
-from semantic_mapper.training.overlap import view_overlap
-from semantic_mapper.training.step import StepConfig
-from semantic_mapper.training.views import LabelledView, draw_pixels, query_rays, stack_sources, view_from_frame
+from semantic_mapper.training.views import (
+    LabelledView,
+    draw_pixels,
+    query_rays,
+    stack_sources,
+    view_from_frame,
+    view_overlap,
+)
 from semantic_mapper.types import PosedFrame
 
-SOURCES = 7  # keyframes that a held-out ray is rendered from, beside its own image
-
-
-class RoundConfig(FinetuneConfig, frozen=True):
-    """As ``FinetuneConfig``, with other defaults: short rounds on a fraction of a core."""
-
-    seconds: AtLeastZero = 0.0  # steps count: how long they take is for the owner of the budget to say
-    steps: NotNegative = 60
-    frozen_encoder_fraction: Fraction = 1.0  # cannot be less
-    held_out_rays: AtLeastOne = 128
-    evaluations: AtLeastOne = 3
-    patience: NotNegative = 0
-    device: DeviceName = "cpu"  # "cuda" where a GPU has time to spare beside the mapper
-    step: StepConfig = StepConfig(rays=512)
-
-    def __post_init__(self) -> None:
-        if self.frozen_encoder_fraction < 1:
-            raise ValueError("frozen_encoder_fraction must be 1: the mapper's keyframes are not encoded again")
-
-
-class OnlineConfig(Config, frozen=True):
-    """When a learner learns, and when it finds new weights better."""
-
-    new_keyframes: AtLeastOne = 4  # this many must have come since the last round
-    held_out_every: AtLeastTwo = 4  # of this many keyframes, the last is never learned from: it judges
-    max_keyframes: AtLeastTwo = 32  # kept; past it the oldest goes
-    least_gain: Fraction = 0.01  # mIoU that new weights must gain on the held-out keyframes
-    least_score: Fraction = 0.2  # mIoU that they must reach there: labels without any sense are learned worse
-    # Accuracy that they may lose on those held-out keyframes with which the weights in use were found better.
-    tolerance: Fraction = 0.02
-    rays: AtLeastOne = 1024  # of each held-out keyframe
-    finetune: RoundConfig = RoundConfig()
+SOURCES = 7  # keyframes that a held-out ray is rendered from, next to its own image
+RAYS = 1024  # of each held-out keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +63,7 @@ def learn(
     keyframes: KeyframeSplit,
     current: Checkpoint,
     config: OnlineConfig,
-    on_progress: Callable[[FinetuneProgress], None] | None = None,
+    on_progress: OnProgress | None = None,
     on_judged: Callable[[], None] = lambda: None,
 ) -> OnlineResult:
     """Finetune ``current`` on the keyframes, and compare both on those held out.
@@ -129,7 +104,7 @@ def learn(
         held_out_keyframes=len(held_out),
         score=score,
         parent_score=parent_score,
-        teacher_proved=len(keyframes.validated),
+        validated=len(keyframes.validated),
     )
     refusal, worse = _refusal_by_score(score, parent_score, config), score < parent_score
     validated = [i for i, f in enumerate(held_out) if key_of(f) in keyframes.validated]
@@ -169,7 +144,7 @@ def judge(
             matrix = ConfusionMatrix(label_set)
             matrices.append(matrix)
             best = overlap[i, : len(sources)].argsort(descending=True, stable=True)[:SOURCES]
-            flat = draw_pixels(view.channel, config.rays, 0.5, generator, len(label_set))
+            flat = draw_pixels(view.channel, RAYS, 0.5, generator, len(label_set))
             if len(flat) == 0:
                 continue
             looked_on = stack_views([*(encoded[j] for j in best.tolist()), _encode(model, view, known=False)])

@@ -18,33 +18,34 @@ from torch.nn import functional
 from semantic_mapper.config import BoxConfig
 from semantic_mapper.errors import ConfigError, FrameError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.grid.field import RaySamples
-from semantic_mapper.fields.grid.kernels import adam_grid
-from semantic_mapper.fields.grid.scene_grid import NOTHING
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, heaviest, merged_classes, ray_share
-from semantic_mapper.fields.primitive_rays import MAX_INTERVALS
+from semantic_mapper.fields.scene.boxes import MAX_INTERVALS
+from semantic_mapper.fields.scene.grid import NOTHING, RaySamples, heaviest, ray_fraction
+from semantic_mapper.fields.scene.march import adam_grid
+from semantic_mapper.fields.scene.panoptic import BoxesOnRays, Panoptic, merged_classes
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.boxes_in_view import nothing_in_view
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, PanopticFitConfig
+from semantic_mapper.training.boxes import fill_boxes, nothing_in_view, shown_boxes
+from semantic_mapper.training.config import FinetuneConfig, PanopticFitConfig
+from semantic_mapper.training.finetune import check_budget
+from semantic_mapper.training.fit import Budget, OnProgress, fit, part_of, time_left
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.grid_fit import BETA1, BETA2, GridFit, GridFitProgress, fit_grid, view_fraction
-from semantic_mapper.training.moving_boxes import fill_boxes, shown_boxes
-from semantic_mapper.training.scene_fit import (
+from semantic_mapper.training.grid_fit import (
+    BETA1,
+    BETA2,
     FEATURE_RATE,
     TRUNK_RATE,
-    FittedGeometry,
-    grid_settings,
+    fit_geometry,
     scene_checkpoint,
+    view_fraction,
 )
-from semantic_mapper.training.schedule import budget_fraction
 from semantic_mapper.types import Bool, Int64, PosedFrame
 
 GRID_UNTIL = 0.35  # fraction of the time for geometry and colours alone
 SAMPLES = 8  # of a ray, those of greatest weight
 DENSITY_RATE = 0.05
+SEMANTICS, DEPTH = 0.05, 0.1  # weights of all that classes are learned from, and of rendered depth, against colours
 FINAL_RATE = 0.1  # what is left of all rates in the end
 LEAST = 1e-4  # of the probability that a pseudo label has: below, it has no gradient
 POINT_WEIGHT = 0.05  # from which on a sample says what is there
@@ -54,7 +55,7 @@ LOOKED_AT = 2000  # of these together: where many boxes overlap, each ray takes 
 FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is warned about
 FEW_MATCHED = 0.5  # fraction of the pseudo labels that are possible on their ray, below which the log is warned about
 LEARNED = 10  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
-FORGET = 50  # steps between two looks at which cells are empty
+EMPTY_EVERY = 50  # steps between two looks at which cells are empty
 _log = get_logger(__name__)
 
 
@@ -105,7 +106,7 @@ def fit_panoptic(
     label_set: LabelSet,
     start: LearnedField | None,
     config: FinetuneConfig,
-    on_progress: Callable[[FinetuneProgress], None] | None = None,
+    on_progress: OnProgress | None = None,
     stopped: Callable[[], object] = bool,
     seen_stamps_ns: Iterable[int] = (),
 ) -> Checkpoint:
@@ -118,7 +119,7 @@ def fit_panoptic(
             where ``config`` leaves out the losses that need some.
         config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
         on_progress: Called after every step.
-        stopped: Asked before every step; once it says so, the field so far is the result. With less than
+        stopped: Called before every step; once it returns anything true, the field so far is the result. With less than
             ``LEARNED`` steps of the second part its classes are those of the boxes alone (``fixed``).
         seen_stamps_ns: Frames whose true labels those who made the pseudo labels have learned from.
 
@@ -127,8 +128,7 @@ def fit_panoptic(
         FrameError: no pseudo label, or what ``fit_grid`` refuses.
         WeightsError: ``start`` has other classes.
     """
-    if config.seconds <= 0 and config.steps <= 0:
-        raise ConfigError("a fit needs a budget: set seconds, steps, or both")
+    check_budget(config)
     by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
     if not isinstance(start, Panoptic) or (by_boxes and not start.shape.boxes):
         raise ConfigError("a field of kind 'panoptic' needs boxes; give a file of them (--boxes)")
@@ -144,29 +144,34 @@ def fit_panoptic(
             "the stamps the log's, in nanoseconds?"
         )
     survey = replace(survey_boxes(start, everything, config), moving=len(start.moving) - lost, lost=lost)
-    fit = _fit_grid(usable, start, config, on_progress, stopped)
-    shape = msgspec.structs.replace(start.shape, grid=fit.grid.config, boxes=boxes)
-    torch.manual_seed(config.seed)
-    field = Panoptic(shape, label_set)
-    field.grid.load_state_dict(fit.grid.state_dict())
-    field.fitted_steps += fit.steps
-    data = pseudo_rays(fit.frames, label_set, config.width)
-    moving, _ = shown_boxes(start.moving, fit.frames, data.rays)
-    data = replace(data, gain=torch.from_numpy(fit.gains), still=np.flatnonzero(~moving))
-    joint = JointFit(field, data, config)
-    joint.run(began, on_progress, stopped)
-    if joint.step < LEARNED and stopped():
-        field.shape = field.config = msgspec.structs.replace(shape, classes="fixed")
-    fill_boxes(field, fit.frames, data.rays, fit.gains, config.grid.near_m)
+    shape = msgspec.structs.replace(start.shape, boxes=boxes)
+    part = msgspec.structs.replace(config, seconds=GRID_UNTIL * config.seconds)
+    progress = part_of(on_progress, 0, GRID_UNTIL)
+    movers = start.moving
+
+    def shows_movers(seen: Sequence[PosedFrame], rays: FrameRays) -> Bool:
+        return shown_boxes(movers, seen, rays)[0]
+
+    leave_out = shows_movers if len(movers) else None
+    field, grid = fit_geometry(start.kind, usable, label_set, start, part, progress, stopped, shape, leave_out)
+    assert isinstance(field, Panoptic)
+    data = pseudo_rays(grid.frames, label_set, config.width)
+    still = np.flatnonzero(~shows_movers(grid.frames, data.rays))
+    data = replace(data, gain=torch.from_numpy(grid.gains), still=still)
+    steps = JointFit(field, data, config).run(
+        time_left(config.seconds, began), part_of(on_progress, GRID_UNTIL, 1.0), stopped
+    )
+    if steps < LEARNED and stopped():
+        field.shape = field.config = msgspec.structs.replace(field.shape, classes="fixed")
+    fill_boxes(field, grid.frames, data.rays, grid.gains, config.grid.near_m)
     survey = replace(survey, ambiguous=ambiguous_fraction(field, everything, config))
     taught = [f for f in usable if f.label is not None and not f.label_is_pseudo]
-    geometry = FittedGeometry(field, fit)
-    checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, taught)
+    checkpoint = scene_checkpoint(field, grid, config, time.monotonic() - began, seen_stamps_ns, taught)
     figures: dict[str, Any] = {name: getattr(survey, name) for name in ("boxes", "seen", "moving", "lost")}
     figures |= {name: round(getattr(survey, name), 4) for name in ("covered", "matched", "crowded", "ambiguous")}
     figures["labelled_frames"] = sum(f.label is not None for f in usable)
     figures["frames"] = len(usable)
-    recipe = checkpoint.recipe | {"grid_steps": fit.steps, "steps": joint.step, "panoptic": figures}
+    recipe = checkpoint.recipe | {"grid_steps": grid.steps, "steps": steps, "panoptic": figures}
     return Checkpoint(checkpoint.model, (), recipe)
 
 
@@ -310,24 +315,15 @@ class JointFit:
         self.rate = view_fraction(data.rays, field.grid.config, config.grid.near_m)
         self.solid = field.solid() if field.shape.uncovered == "empty" else None
         self.step = 0
-        self._forget()
+        self._empty_cells()
 
-    def run(
-        self, began: float, on_progress: Callable[[FinetuneProgress], None] | None, stopped: Callable[[], object]
-    ) -> None:
-        """Learn until the budget is spent."""
-        first, fraction = time.monotonic(), 0.0
-        seconds = self.config.seconds
-        left = max(seconds - (first - began), 0.05 * seconds)
-        while fraction < 1 and not stopped():
-            loss = self.learn(fraction)
-            fraction = budget_fraction(self.step, time.monotonic() - first, steps=self.config.steps, seconds=left)
-            if on_progress is not None:
-                told = GRID_UNTIL + (1 - GRID_UNTIL) * min(fraction, 1.0)
-                on_progress(FinetuneProgress(self.step, told, loss, math.nan, math.nan, False))
-        self._forget()
+    def run(self, seconds: float, on_progress: OnProgress | None = None, stopped: Callable[[], object] = bool) -> int:
+        """Learn until the budget is used (``seconds`` 0 = only steps count); returns the number of steps."""
+        steps = fit(self.learn, Budget(seconds, self.config.steps), on_progress, stopped)
+        self._empty_cells()
         self.field.grid.values.requires_grad_(False)
         self.field.eval()
+        return steps
 
     def learn(self, fraction: float) -> float:
         """One step at a fraction of the budget; returns the loss."""
@@ -335,23 +331,23 @@ class JointFit:
         left = FINAL_RATE**fraction
         for group, rate in zip(self.optimiser.param_groups, self.rates, strict=True):
             group["lr"] = rate * left
-        pixels = self.data.still[self.rng.integers(0, len(self.data.still), config.panoptic.rays)]
+        pixels = self.data.still[self.rng.integers(0, len(self.data.still), config.step.rays)]
         batch = self.data.rays.rays(pixels, config.grid.near_m)
         samples = field.march(batch, SAMPLES, torch.from_numpy(self.rng.random(len(pixels), np.float32)))
         assert field.trunk is not None
         r = field.trunk(samples.points)
-        share = ray_share(samples)
+        share = ray_fraction(samples)
         behind = field.grid.sky_colour(batch.direction) * samples.light[:, None]
         colour = (share[..., None] * field.trunk.colour(r, batch.direction)).sum(1) + behind
         gain = self.data.gain[torch.from_numpy(self.data.rays.frame_of(pixels))]
         truth = torch.from_numpy(self.data.rays.rgb[pixels] / np.float32(255))
         loss = functional.mse_loss(gain * colour, truth)
-        loss = loss + config.panoptic.depth * self._depth_loss(samples, share, pixels)
+        loss = loss + DEPTH * self._depth_loss(samples, share, pixels)
         channel = self.data.channel[torch.from_numpy(pixels)]
         boxes = field.boxes_on(samples)
         learned = field.learned(samples, r)
         semantics = semantic_losses(field, samples, boxes, learned, channel, self.group, config.panoptic)
-        loss = loss + config.panoptic.semantics * semantics
+        loss = loss + SEMANTICS * semantics
         self.optimiser.zero_grad()
         field.grid.values.grad = None
         loss.backward()
@@ -386,36 +382,15 @@ class JointFit:
             1 - BETA1**self.step,
             1 - BETA2**self.step,
         )
-        if self.step % FORGET == 0:
-            self._forget()
+        if self.step % EMPTY_EVERY == 0:
+            self._empty_cells()
 
-    def _forget(self) -> None:
+    def _empty_cells(self) -> None:
         """Empty what lies outside of all boxes, where nothing may be there, and find the cells that rays may skip."""
         with torch.no_grad():
             if self.solid is not None:
                 self.field.grid.values[..., 0].masked_fill_(~self.solid, NOTHING)
             self.field.grid.update_occupied()
-
-
-def _fit_grid(
-    frames: Sequence[PosedFrame],
-    start: Panoptic,
-    config: FinetuneConfig,
-    on_progress: Callable[[FinetuneProgress], None] | None,
-    stopped: Callable[[], object],
-) -> GridFit:
-    """Geometry and colours of all frames."""
-    box = start.shape.grid if start.fitted and config.grid.box_m is None else None
-    settings = msgspec.structs.replace(grid_settings(config), seconds=GRID_UNTIL * config.seconds)
-
-    def tell(p: GridFitProgress) -> None:
-        if on_progress is not None:
-            on_progress(FinetuneProgress(p.step, GRID_UNTIL * p.fraction, p.loss, math.nan, math.nan, False))
-
-    def leave_out(seen: Sequence[PosedFrame], rays: FrameRays) -> Bool:
-        return shown_boxes(start.moving, seen, rays)[0]
-
-    return fit_grid(frames, settings, tell, stopped, box, leave_out if len(start.moving) else None)
 
 
 def _followed(start: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays) -> tuple[tuple[BoxConfig, ...], int]:

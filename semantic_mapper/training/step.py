@@ -1,104 +1,55 @@
-"""One gradient step's worth of loss: query views rendered from other views of the same scene.
+"""The losses of finetuning's steps: of rays of a query view rendered from other views, and of single images.
 
-Shared by training and finetuning. ``draw_batch`` makes all random draws, on the CPU; ``batch_loss`` computes.
+All draws are made on the CPU, so that they are the same whatever the device.
 """
 
 from __future__ import annotations
 
+# pyright: reportUnknownMemberType=false
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
-from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, Fraction, SamplingConfig
-from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
+from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.sampling import around_computed, sample_guided, sample_inverse_depth
-from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, guess_loss, image_loss, mean_loss, ray_loss
+from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
+from semantic_mapper.training.config import StepConfig
+from semantic_mapper.training.losses import IGNORE, guess_loss, image_loss, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
-    degrade_view,
-    draw_hard_examples,
     draw_pixels,
     jitter_colours,
-    join_sources,
     mirrored_view,
-    natural_weights,
     query_rays,
-    select_sources,
     stack_sources,
     withhold_depth,
-    withhold_labels,
 )
-from semantic_mapper.types import RayBatch, SourceViews
+from semantic_mapper.types import RayBatch
 
 LEAST_WORTH = 0.05  # of a view that sees nothing of the query: it may still be drawn, to learn what is no use
-
-
-class StepConfig(Config, frozen=True):
-    """How a training step draws its views, rays and samples."""
-
-    rays: AtLeastOne = 1024
-    views_min: AtLeastOne = 3  # source views of a step are drawn from views_min..views_max
-    views_max: AtLeastOne = 5
-    own_view_fraction: Fraction = (
-        0.3  # how often the query view is itself a source, as when the current frame is mapped
-    )
-    own_view_degraded: Fraction = (
-        0.0  # how often that source is spoiled: blur, noise, exposure, covered parts, no depth
-    )
-    wide_fraction: Fraction = 0.0  # training: how often the nearer half of the path round the query has no source view
-    balanced_fraction: Fraction = 0.5  # fraction of rays drawn with all classes equally likely
-    natural_prior: bool = False  # rays count by how much likelier balancing made them: classes as frequent as they are
-    hard_example_fraction: Fraction = (
-        0.0  # fraction of rays drawn where the field is in doubt, of views that know (finetuning)
-    )
-    depth_dropout: Fraction = 0.15  # fraction of source views, and of steps for the query's prior, without depth
-    no_depth: Fraction = 0.0  # fraction of steps without any depth: neither source views nor prior have it
-    known_labels: bool = True  # source views other than the query bring their labels, as keyframes of a finetuning do
-    label_dropout: Fraction = 0.3  # fraction of source views without known labels
-    prior_noise: AtLeastZero = 0.01  # sigma of the depth prior's error as a fraction of z
-    samples_without_depth: AtLeastTwo = 32  # samples a ray in steps without a depth prior
-    no_depth_thinning: AtLeastOne = (
-        1  # in steps without a depth prior, where a ray costs more, one ray in n is rendered
-    )
-    colour_jitter: Fraction = 0.2
-    mirrored: Fraction = 0.0  # fraction of steps in which the world is its mirror image
-    loss: LossConfig = LossConfig()
-    sampling: SamplingConfig = SamplingConfig()
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.views_min <= self.views_max <= MAX_SOURCE_VIEWS:
-            raise ValueError(
-                f"need 1 <= views_min <= views_max <= {MAX_SOURCE_VIEWS}, got {self.views_min} and {self.views_max}"
-            )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StepBatch:
-    """What one query view of one scene brings to a step, on the training device.
-
-    Args:
-        sources: The source views, with what is withheld taken away.
-        channel: (m, H, W) int64 labels of the source views, for the dense class loss; -1 = none.
-        rays: R query rays.
-        targets: What they should render to.
-        z: (R, N) sample depths, ascending, metres.
-        depth_m: (m, H, W) measured depth of the source views, also of those that the field is given none of.
-    """
-
-    sources: SourceViews
-    channel: torch.Tensor
-    rays: RayBatch
-    targets: RayTargets
-    z: torch.Tensor
-    depth_m: torch.Tensor
+VIEWS_MIN, VIEWS_MAX = 3, 5  # source views of a step
+OWN_VIEW_FRACTION = 0.3  # how often the query view is itself a source, as when the current frame is mapped
+BALANCED_FRACTION = 0.5  # of rays drawn with all classes equally likely
+DEPTH_DROPOUT = 0.15  # fraction of source views, and of steps for the query's prior, without depth
+LABEL_DROPOUT = 0.3  # fraction of source views without known labels
+PRIOR_NOISE = 0.01  # sigma of the depth prior's error as a fraction of z
+COLOUR_JITTER = 0.2
+SOURCE_LOSS = 0.25  # weight of the class loss on labelled source views: teaches the encoder densely
+IMAGES = 4  # of a step on single images
+MIRRORED = 0.5  # of them
+IMAGE_BALANCE, IMAGE_DEPTH = 0.25, 0.05  # of steps on images: see ``image_loss``; weight of ``guess_loss``
+PROBE_RATE = 0.03  # of Adam: rows of classes that are new to the weights start from nothing
+PROBE_BALANCE = 0.5  # see ``image_loss``
 
 
 def pick_views(
-    queries: Sequence[int], overlap: torch.Tensor, config: StepConfig, generator: torch.Generator
+    queries: Sequence[int],
+    overlap: torch.Tensor,
+    generator: torch.Generator,
+    own_view_fraction: float = OWN_VIEW_FRACTION,
 ) -> tuple[int, list[int]]:
     """Draw a query view of ``queries``, and its source views: the more one sees of the query, the likelier it is.
 
@@ -108,189 +59,151 @@ def pick_views(
     query = queries[int(torch.randint(len(queries), (1,), generator=generator))]
     worth = overlap[query] + LEAST_WORTH
     worth[query] = 0
-    size = int(torch.randint(config.views_min, config.views_max + 1, (1,), generator=generator))
+    size = int(torch.randint(VIEWS_MIN, VIEWS_MAX + 1, (1,), generator=generator))
     size = max(1, min(size, len(overlap) - 1))
     sources = torch.multinomial(worth, size, generator=generator).tolist() if len(overlap) > 1 else [query]
-    if float(torch.rand(1, generator=generator)) < config.own_view_fraction:
+    if float(torch.rand(1, generator=generator)) < own_view_fraction:
         sources = [*sources[: max(0, size - 1)], query]
     return query, sources
 
 
-def pick_views_on_path(
-    queries: Sequence[int], count: int, config: StepConfig, generator: torch.Generator
-) -> tuple[int, list[int]]:
-    """Draw a query view of ``queries`` and its source views from ``count`` >= 2 views in the order of a camera's path.
-
-    The source views are drawn from a stretch of the path round the query. Its length is drawn too, evenly on a
-    logarithmic scale: from the nearest views alone (a dense recording) to the whole path (views far apart).
-    """
-    query = queries[int(torch.randint(len(queries), (1,), generator=generator))]
-    others = sorted((i for i in range(count) if i != query), key=lambda i: abs(i - query))
-    size = int(torch.randint(config.views_min, config.views_max + 1, (1,), generator=generator))
-    size = max(1, min(size, len(others)))
-    if config.wide_fraction > 0 and float(torch.rand(1, generator=generator)) < config.wide_fraction:
-        others = others[min(len(others) // 2, len(others) - size) :]
-    stretch = round(size * (len(others) / size) ** float(torch.rand(1, generator=generator)))
-    order = torch.randperm(stretch, generator=generator)[:size].tolist()
-    sources = [others[i] for i in order]
-    if float(torch.rand(1, generator=generator)) < config.own_view_fraction:
-        sources = [*sources[: max(0, size - 1)], query]
-    return query, sources
-
-
-def training_loss(
+def step_on_rays(
     model: LearnedField,
     views: Sequence[LabelledView],
     query: int,
     sources: Sequence[int],
     config: StepConfig,
     generator: torch.Generator,
-) -> Loss | None:
+    encoded: EncodedViews | None = None,
+) -> torch.Tensor | None:
     """Loss of rays of ``views[query]`` rendered from ``views[sources]``; None where the query has no labelled pixel.
 
-    Gradients flow into the whole model.
-    """
-    device = next(model.parameters()).device
-    batch = draw_batch(views, query, sources, config, generator, len(model.label_set), device)
-    return None if batch is None else batch_loss(model, [batch], config.loss)
-
-
-def draw_batch(
-    views: Sequence[LabelledView],
-    query: int,
-    sources: Sequence[int],
-    config: StepConfig,
-    generator: torch.Generator,
-    classes: int,
-    device: torch.device,
-    resident: Sequence[LabelledView] | None = None,
-) -> StepBatch | None:
-    """Draw rays of ``views[query]`` and prepare ``views[sources]``; None where the query has no labelled pixel.
+    Gradients flow into the whole model; with ``encoded``, into all but what ``encode`` does.
 
     Args:
-        views: In host memory. The generator is of the CPU too, so that draws are the same whatever the device.
-        classes: L of the label set.
-        device: Of training.
-        resident: The same views on ``device`` already; without them the sources are copied there.
+        encoded: Of ``encode_once``: the image encoder is frozen. Colours are not jittered and no depth of source views
+            is withheld then: both would need features of their own.
     """
-    if config.mirrored > 0 and float(torch.rand(1, generator=generator)) < config.mirrored:
-        views = _mirrored(views, query, sources)
-        resident = None if resident is None else _mirrored(resident, query, sources)
-    blind = config.no_depth > 0 and float(torch.rand(1, generator=generator)) < config.no_depth
-    drawn = draw_rays(views[query], config, generator, classes, blind=blind)
+    drawn = draw_rays(views[query], config, generator, len(model.label_set))
     if drawn is None:
         return None
-    rays, targets, z = drawn
-    stacked = _sources(resident or views, query, sources, config, generator)
-    may_spoil = config.own_view_degraded > 0 and query in sources
-    if may_spoil and float(torch.rand(1, generator=generator)) < config.own_view_degraded:
-        stacked = degrade_view(stacked, list(sources).index(query), generator)
-    stacked = withhold_depth(stacked, 1.0 if blind else config.depth_dropout, generator)
-    stacked = jitter_colours(to_device(stacked, device), config.colour_jitter, generator)
-    channel = torch.stack([(resident or views)[i].channel for i in sources])
-    depth_m = torch.stack([(resident or views)[i].depth_m for i in sources])
-    drawn = to_device(rays, device), to_device(targets, device), z.to(device)
-    return StepBatch(stacked, channel.to(device), *drawn, depth_m.to(device))
+    device = next(model.parameters()).device
+    rays, targets, z = to_device(drawn[0], device), to_device(drawn[1], device), drawn[2].to(device)
+    if encoded is None:
+        stacked = stack_sources([views[i] for i in sources], with_labels=config.known_labels)
+        if stacked.channel is not None:
+            stacked = replace(stacked, channel=_withheld(stacked.channel, query, sources, generator))
+        stacked = withhold_depth(stacked, DEPTH_DROPOUT, generator)
+        chosen = model.encode(jitter_colours(to_device(stacked, device), COLOUR_JITTER, generator))
+    else:
+        chosen = encoded.select(torch.tensor(list(sources), device=device))
+        if config.known_labels:
+            chosen = replace(chosen, channel=_withheld(chosen.channel, query, sources, generator))
+    render, _ = model.render_samples(rays, z, chosen)
+    loss = ray_loss(render, targets).total
+    logits = model.source_logits(chosen)
+    if logits is None:
+        return loss
+    channel = torch.stack([views[i].channel for i in sources]).to(device)
+    return loss + SOURCE_LOSS * image_loss(logits, channel, 0.0)
+
+
+def _withheld(channel: torch.Tensor, query: int, sources: Sequence[int], generator: torch.Generator) -> torch.Tensor:
+    """Known labels (m, H, W) of the sources without those of a random fraction, and without the query's own: a robot's
+    current frame has none."""
+    keep = torch.rand(len(sources), generator=generator) >= LABEL_DROPOUT
+    keep &= torch.tensor([i != query for i in sources])
+    return torch.where(keep.to(channel.device)[:, None, None], channel, IGNORE)
 
 
 def draw_rays(
-    target: LabelledView, config: StepConfig, generator: torch.Generator, classes: int, *, blind: bool = False
+    target: LabelledView, config: StepConfig, generator: torch.Generator, classes: int
 ) -> tuple[RayBatch, RayTargets, torch.Tensor] | None:
     """Rays of a view, what they should render to, and their sample depths; None where it has no labelled pixel.
 
     Args:
         classes: L of the label set.
-        blind: Without depth priors.
     """
-    doubtful = 0 if target.uncertainty is None else int(config.rays * config.hard_example_fraction)
-    flat = draw_pixels(target.channel, config.rays - doubtful, config.balanced_fraction, generator, classes)
+    flat = draw_pixels(target.channel, config.rays, BALANCED_FRACTION, generator, classes)
     if len(flat) == 0:
         return None
-    if target.uncertainty is not None and doubtful > 0:
-        flat = torch.cat((flat, draw_hard_examples(target.uncertainty, doubtful, generator)))
-    rays, targets, z = _draw_samples(target, flat, config, blind, generator)
-    if config.natural_prior:
-        targets = replace(targets, weight=natural_weights(targets.channel, target.channel, config.balanced_fraction))
-    return rays, targets, z
-
-
-def batch_loss(
-    model: LearnedField, batches: Sequence[StepBatch], config: LossConfig, *, encode_together: bool = False
-) -> Loss:
-    """Mean loss of several batches; gradients flow into the whole model.
-
-    Args:
-        encode_together: One call of ``encode`` for the views of all batches. Right only for kinds of fields that
-            encode each view by itself; see ``encodes_views_separately``.
-    """
-    losses: list[Loss] = []
-    for batch, encoded in zip(batches, _encode(model, batches, encode_together), strict=True):
-        render, _ = model.render_samples(batch.rays, batch.z, encoded)
-        loss = ray_loss(render, batch.targets, config)
-        if config.source > 0:
-            logits = model.source_logits(encoded)
-            if logits is not None:
-                dense = image_loss(logits, batch.channel, config.balance)
-                loss = replace(loss, total=loss.total + config.source * dense)
-        if config.source_depth > 0 and encoded.geometry.any():  # a field without geometry holds zeros
-            guess = guess_loss(encoded.geometry, batch.sources.depth_m, batch.depth_m)
-            loss = replace(loss, total=loss.total + config.source_depth * guess)
-        losses.append(loss)
-    return mean_loss(losses)
-
-
-def encodes_views_separately(model: LearnedField, sources: SourceViews) -> bool:
-    """Whether encoding ``sources`` (at least 2 views) together gives what encoding them in two calls gives."""
-    first = torch.arange(len(sources.rgb)) < len(sources.rgb) // 2
-    with torch.no_grad():
-        together = model.encode(sources)
-        for part in (first, ~first):
-            index = part.nonzero()[:, 0].to(sources.rgb.device)
-            alone = model.encode(select_sources(sources, index))
-            for a, b in ((together.feature, alone.feature), (together.geometry, alone.geometry)):
-                if float((a[index] - b).abs().max()) > 1e-2 * float(b.abs().max()):
-                    return False
-    return True
-
-
-def _encode(model: LearnedField, batches: Sequence[StepBatch], together: bool) -> list[EncodedViews]:
-    if not together or len(batches) == 1:
-        return [model.encode(batch.sources) for batch in batches]
-    encoded = model.encode(join_sources([batch.sources for batch in batches]))
-    index = torch.arange(len(encoded), device=encoded.feature.device)
-    return [encoded.select(part) for part in index.split([len(batch.sources.rgb) for batch in batches])]
-
-
-def _mirrored(views: Sequence[LabelledView], query: int, sources: Sequence[int]) -> Sequence[LabelledView]:
-    """The views of a step as their mirror images; the others are left as they are, for nobody looks at them."""
-    wanted = {query, *sources}
-    return [mirrored_view(view) if i in wanted else view for i, view in enumerate(views)]
-
-
-def _sources(
-    views: Sequence[LabelledView], query: int, sources: Sequence[int], config: StepConfig, generator: torch.Generator
-) -> SourceViews:
-    """The source views, with their labels if asked but for the query's own: a robot's current frame has none."""
-    stacked = stack_sources([views[i] for i in sources], with_labels=config.known_labels)
-    if stacked.channel is None:
-        return stacked
-    own = torch.tensor([i == query for i in sources], device=stacked.channel.device)
-    stacked = replace(stacked, channel=torch.where(own[:, None, None], IGNORE, stacked.channel))
-    return withhold_labels(stacked, config.label_dropout, generator)
-
-
-def _draw_samples(
-    target: LabelledView, flat: torch.Tensor, config: StepConfig, blind: bool, generator: torch.Generator
-) -> tuple[RayBatch, RayTargets, torch.Tensor]:
-    noise = 1 + config.prior_noise * torch.randn(len(flat), generator=generator)
-    withheld = float(torch.rand(1, generator=generator)) < config.depth_dropout
+    noise = 1 + PRIOR_NOISE * torch.randn(len(flat), generator=generator)
+    withheld = float(torch.rand(1, generator=generator)) < DEPTH_DROPOUT
     near_m, far_m = config.sampling.near_m, config.sampling.far_m
     depth_m = target.depth_m if target.computed_m is None else target.computed_m
-    if blind or withheld or not bool((depth_m > 0).any()):
-        rays, targets = query_rays(target, flat[:: config.no_depth_thinning], near_m=near_m, far_m=far_m, prior=None)
+    if withheld or not bool((depth_m > 0).any()):
+        rays, targets = query_rays(target, flat, near_m=near_m, far_m=far_m, prior=None)
         return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, config.samples_without_depth, generator)
     # Computed depth has errors of its own.
     prior = depth_m.flatten()[flat] * noise if target.computed_m is None else depth_m.flatten()[flat]
     rays, targets = query_rays(target, flat, near_m=near_m, far_m=far_m, prior=prior)
     sampling = config.sampling if target.computed_m is None else around_computed(config.sampling)
     return rays, targets, sample_guided(rays, sampling)
+
+
+def classifies_images(model: LearnedField) -> bool:
+    """Whether a field of this kind says anything of single images."""
+    # The class decides: the field itself would need views to encode, and there are none yet where a run is checked.
+    return type(model).source_logits is not LearnedField.source_logits
+
+
+def step_on_images(model: LearnedField, views: Sequence[LabelledView], generator: torch.Generator) -> torch.Tensor:
+    """Loss of what a field that classifies images makes of some of the views, each by itself.
+
+    An image costs a fraction of what rays from several views cost; gradients flow into the encoder and the classifier.
+    """
+    views = [views[i] for i in torch.randperm(len(views), generator=generator).tolist()[:IMAGES]]
+    views = [mirrored_view(v) if float(torch.rand(1, generator=generator)) < MIRRORED else v for v in views]
+    # All without depth or none: norms take their statistics from images of one kind.
+    colours_only = float(torch.rand(1, generator=generator)) < DEPTH_DROPOUT
+    stacked = stack_sources(views, with_labels=True)
+    device = next(model.parameters()).device
+    sources = withhold_depth(replace(stacked, channel=None), float(colours_only), generator)
+    sources = jitter_colours(to_device(sources, device), COLOUR_JITTER, generator)
+    encoder = model.image_encoder
+    assert encoder is not None and stacked.channel is not None
+    with encoder.batch_statistics():
+        encoded = model.encode(sources)
+        logits = model.source_logits(encoded)
+    assert logits is not None
+    loss = image_loss(logits, stacked.channel.to(device), IMAGE_BALANCE)
+    if encoded.geometry.any():  # a field without geometry holds zeros
+        # Images without depth learn to guess it.
+        loss = loss + IMAGE_DEPTH * guess_loss(encoded.geometry, sources.depth_m, stacked.depth_m.to(device))
+    return loss
+
+
+def encode_once(model: LearnedField, views: Sequence[LabelledView], *, with_labels: bool) -> EncodedViews:
+    """All views, with their labels or without, but without gradients; on the model's device."""
+    device = next(model.parameters()).device
+    with torch.no_grad():
+        return model.encode(to_device(stack_sources(views, with_labels=with_labels), device))
+
+
+def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[LabelledView], steps: int) -> bool:
+    """Fit the class rows of ``model`` to the labelled pixels of ``views``; nothing else changes.
+
+    Convex, since the classifier is linear, and cheap, since nothing is rendered or encoded: what is left for the steps
+    on rays is what they alone can do. Kinds of fields that say nothing of images by themselves are left as they are.
+
+    Args:
+        encoded: The same views, encoded by ``model``.
+        views: Their labels count, at the size of the features.
+        steps: Over all views at once.
+
+    Returns:
+        Whether anything was fitted.
+    """
+    rows = [model.get_parameter(name) for name in model.class_rows]
+    channel = torch.stack([view.channel for view in views]).to(encoded.feature.device)
+    optimiser = torch.optim.Adam(rows, PROBE_RATE)
+    for _ in range(steps):
+        logits = model.source_logits(encoded)
+        if logits is None:
+            return False
+        gradients = torch.autograd.grad(image_loss(logits, channel, PROBE_BALANCE), rows)
+        for row, gradient in zip(rows, gradients, strict=True):
+            row.grad = gradient
+        optimiser.step()
+    optimiser.zero_grad()
+    return steps > 0

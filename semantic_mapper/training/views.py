@@ -1,4 +1,4 @@
-"""Labelled views as tensors, and the draws that training makes from them."""
+"""Labelled views as tensors, how much they see of each other, and the draws that fits make from them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch.nn import functional
 
-from semantic_mapper.fields.source_maps import UNSURE_SPREAD
-from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.fields.source_views import UNSURE_SPREAD
+from semantic_mapper.geometry import camera_matrix, transform, unproject
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.rays import pixel_rays
-from semantic_mapper.types import CameraIntrinsics, PosedFrame, RayBatch, SourceViews
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, RayBatch, SourceViews
+from semantic_mapper.view_selection import GUESSED_DEPTHS_M, visible_points
+
+PROBE = 24  # pixels a row of a view that overlap is found with
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,8 +29,6 @@ class LabelledView:
         channel: (H, W) int64 class channels, -1 = ignore.
         intrinsics: Of (H, W).
         T_world_camera: (4, 4) float32.
-        uncertainty: (H, W) float32 how likely a pixel is drawn among the hard examples
-            (``uncertainty.with_uncertainty``); None = never.
         computed_m: (H, W) float32 depth that was computed from pictures, 0 = none: what a field is given in the place
             of ``depth_m``, which remains what it is to render. None = a field is given ``depth_m``.
         computed_sigma_m: (H, W) float32 its one-sigma spread.
@@ -39,7 +39,6 @@ class LabelledView:
     channel: torch.Tensor
     intrinsics: CameraIntrinsics
     T_world_camera: torch.Tensor
-    uncertainty: torch.Tensor | None = None
     computed_m: torch.Tensor | None = None
     computed_sigma_m: torch.Tensor | None = None
 
@@ -96,90 +95,18 @@ def mirrored_view(view: LabelledView) -> LabelledView:
     )
 
 
-def cropped_view(view: LabelledView, fraction: float, down: float, across: float) -> LabelledView:
-    """A part of the view at the view's own size, as a longer lens sees it.
-
-    Args:
-        fraction: Of each side that is kept, above 0.
-        down, across: Place of the part, from 0 (top, left) to 1.
-    """
-    k = view.intrinsics
-    height, width = max(round(fraction * k.height), 1), max(round(fraction * k.width), 1)
-    top, left = round(down * (k.height - height)), round(across * (k.width - width))
-    part = slice(top, top + height), slice(left, left + width)
-    size = (k.height, k.width)
-    rgb = functional.interpolate(view.rgb[:, *part][None], size=size, mode="bilinear", align_corners=False)[0]
-
-    def enlarged(values: torch.Tensor) -> torch.Tensor:
-        return functional.interpolate(values[part][None, None].float(), size=size, mode="nearest-exact")[0, 0]
-
-    x, y = k.width / width, k.height / height
-    lens = CameraIntrinsics(
-        k.fx * x, k.fy * y, (k.cx - left + 0.5) * x - 0.5, (k.cy - top + 0.5) * y - 0.5, k.width, k.height
-    )
-    return LabelledView(
-        rgb,
-        enlarged(view.depth_m),
-        enlarged(view.channel).long(),
-        lens,
-        view.T_world_camera,
-        computed_m=None if view.computed_m is None else enlarged(view.computed_m),
-        computed_sigma_m=None if view.computed_sigma_m is None else enlarged(view.computed_sigma_m),
-    )
-
-
 def stack_sources(views: Sequence[LabelledView], *, with_labels: bool = False) -> SourceViews:
-    """Views of one resolution as the input of ``SemanticField.encode``, with what is known of their labels if asked."""
+    """Views of one resolution as the input of ``SemanticField.encode``, and what is known of their labels if wanted."""
+    spreads = [v.depth_m.new_zeros(()) if v.computed_sigma_m is None else v.computed_sigma_m for v in views]
+    computed = any(v.computed_sigma_m is not None for v in views)
     return SourceViews(
         torch.stack([v.rgb for v in views]),
         torch.stack([v.depth_m if v.computed_m is None else v.computed_m for v in views]),
         torch.stack([torch.from_numpy(camera_matrix(v.intrinsics)).float() for v in views]).to(views[0].rgb.device),
         torch.stack([v.T_world_camera for v in views]),
         torch.stack([v.channel for v in views]) if with_labels else None,
-        _stacked_spreads(views),
+        torch.stack([s.expand_as(v.depth_m) for s, v in zip(spreads, views, strict=True)]) if computed else None,
     )
-
-
-def _stacked_spreads(views: Sequence[LabelledView]) -> torch.Tensor | None:
-    if all(v.computed_sigma_m is None for v in views):
-        return None
-    return torch.stack(
-        [torch.zeros_like(v.depth_m) if v.computed_sigma_m is None else v.computed_sigma_m for v in views]
-    )
-
-
-def join_sources(parts: Sequence[SourceViews]) -> SourceViews:
-    """The views of several scenes one after the other; labels only where all parts have them."""
-    channels = [p.channel for p in parts if p.channel is not None]
-    return SourceViews(
-        torch.cat([p.rgb for p in parts]),
-        torch.cat([p.depth_m for p in parts]),
-        torch.cat([p.K for p in parts]),
-        torch.cat([p.T_world_camera for p in parts]),
-        torch.cat(channels) if len(channels) == len(parts) else None,
-        None if all(p.depth_sigma_m is None for p in parts) else torch.cat([_spread(p) for p in parts]),
-    )
-
-
-def _spread(sources: SourceViews) -> torch.Tensor:
-    return torch.zeros_like(sources.depth_m) if sources.depth_sigma_m is None else sources.depth_sigma_m
-
-
-def select_sources(sources: SourceViews, index: torch.Tensor) -> SourceViews:
-    """The views at ``index`` (k,) int64."""
-    channel = None if sources.channel is None else sources.channel[index]
-    spread = None if sources.depth_sigma_m is None else sources.depth_sigma_m[index]
-    return SourceViews(
-        sources.rgb[index], sources.depth_m[index], sources.K[index], sources.T_world_camera[index], channel, spread
-    )
-
-
-def withhold_labels(sources: SourceViews, fraction: float, generator: torch.Generator) -> SourceViews:
-    """Set the known labels of a random fraction of the views to "none": most source views of a robot have none."""
-    if sources.channel is None:
-        return sources
-    keep = (torch.rand(len(sources.rgb), generator=generator) >= fraction).to(sources.channel.device)
-    return replace(sources, channel=torch.where(keep[:, None, None], sources.channel, -1))
 
 
 def withhold_depth(sources: SourceViews, fraction: float, generator: torch.Generator) -> SourceViews:
@@ -201,63 +128,6 @@ def jittered(rgb: torch.Tensor, strength: float, generator: torch.Generator) -> 
     gamma = 1 + strength * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
     rgb = (rgb.clamp_min(1e-3) ** gamma.to(rgb.device)) * (gain * tint).to(rgb.device)
     return rgb.clamp(0, 1)
-
-
-def degrade_view(sources: SourceViews, index: int, generator: torch.Generator) -> SourceViews:
-    """Spoil one view as a moving camera in bad light does, so that the field learns when to believe the others.
-
-    Exposure and gamma, blur, noise, parts of the image covered; depth is lost in one of three cases.
-    """
-
-    def uniform(low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand(1, generator=generator))
-
-    rgb = sources.rgb[index].cpu()
-    height, width = rgb.shape[-2:]
-    rgb = rgb.clamp_min(1e-3) ** uniform(0.7, 1.4) * 2 ** uniform(-2.0, 0.5)
-    if (sigma := uniform(-1.0, 2.5) * width / 160) > 0.3:
-        rgb = blurred(rgb, sigma)
-    rgb = rgb + uniform(0.0, 0.1) * torch.randn(rgb.shape, generator=generator)
-    for _ in range(int(torch.randint(0, 4, (1,), generator=generator))):
-        h, w = int(uniform(0.1, 0.5) * height), int(uniform(0.1, 0.5) * width)
-        top, left = int(uniform(0, height - h)), int(uniform(0, width - w))
-        rgb[:, top : top + h, left : left + w] = torch.rand(3, 1, 1, generator=generator)
-    whole = sources.rgb.clone()
-    whole[index] = rgb.clamp(0, 1).to(whole.device)
-    depth_m = sources.depth_m
-    if uniform(0, 1) < 1 / 3:
-        depth_m = depth_m.clone()
-        depth_m[index] = 0
-    return replace(sources, rgb=whole, depth_m=depth_m)
-
-
-def blurred(rgb: torch.Tensor, sigma: float) -> torch.Tensor:
-    """(3, H, W) with a Gaussian of ``sigma`` pixels."""
-    radius = max(1, round(2.5 * sigma))
-    x = torch.arange(-radius, radius + 1, dtype=rgb.dtype, device=rgb.device)
-    kernel = torch.exp(-(x**2) / (2 * sigma**2))
-    kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
-    padded = functional.pad(rgb[None], (radius, radius, radius, radius), mode="replicate")
-    across = functional.conv2d(padded, kernel, groups=3)
-    return functional.conv2d(across, kernel.transpose(2, 3), groups=3)[0]
-
-
-def natural_weights(drawn: torch.Tensor, channel: torch.Tensor, balanced_fraction: float) -> torch.Tensor:
-    """(R,) weights that take back what ``draw_pixels`` did to the frequency of classes, in the mean over draws.
-
-    Half of the rays drawn with all classes equally likely teach rare classes, but leave a field that expects them
-    everywhere. A ray's weight is the probability of its pixel without balancing over that with it.
-
-    Args:
-        drawn: (R,) channels of the drawn pixels, -1 = ignore.
-        channel: (H, W) that they were drawn from.
-        balanced_fraction: Of ``draw_pixels``.
-    """
-    labelled = channel[channel >= 0]
-    histogram = torch.bincount(labelled, minlength=int(drawn.max()) + 1 if len(drawn) else 1).float()
-    classes = (histogram > 0).sum().clamp_min(1)
-    favoured = len(labelled) / (classes * histogram.clamp_min(1))  # how much likelier a balanced draw is, by class
-    return 1 / (1 - balanced_fraction + balanced_fraction * favoured[drawn.clamp_min(0)])
 
 
 def draw_pixels(
@@ -282,13 +152,6 @@ def draw_pixels(
     return torch.cat((uniform, balanced))
 
 
-def draw_hard_examples(doubt: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
-    """Flat indices (count,) of pixels of ``doubt`` (H, W), each as likely as its doubt is high."""
-    cumulative = torch.cumsum(doubt.flatten().double(), 0)
-    u = torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1]
-    return torch.searchsorted(cumulative, u, right=True).clamp_max(len(cumulative) - 1)
-
-
 def query_rays(
     view: LabelledView, flat_index: torch.Tensor, *, near_m: float, far_m: float, prior: torch.Tensor | None
 ) -> tuple[RayBatch, RayTargets]:
@@ -307,3 +170,31 @@ def query_rays(
         view.depth_m.flatten()[flat_index],
     )
     return rays, targets
+
+
+def view_overlap(views: Sequence[LabelledView]) -> torch.Tensor:
+    """Fraction of what each view sees that each other view sees, too: who shares nothing with a query teaches nothing.
+
+    Returns:
+        (n, n) float32 in [0, 1]; row = the view that is seen, column = the one that looks; 0 on the diagonal.
+    """
+    overlap = torch.zeros(len(views), len(views))
+    poses = [view.T_world_camera.cpu().numpy().astype(np.float64) for view in views]
+    depths = [view.depth_m.cpu().numpy() for view in views]
+    for i, view in enumerate(views):
+        points, measured = _points(poses[i], depths[i], view)
+        for j, other in enumerate(views):
+            if i != j:
+                seen = visible_points(points, poses[j], other.intrinsics, depths[j], measured=measured)
+                overlap[i, j] = float(seen.mean())
+    return overlap
+
+
+def _points(pose: Float64, depth_m: Float32, view: LabelledView) -> tuple[Float64, bool]:
+    """World points (P, 3) of a thinned-out view, and whether they are its measured surface or where it might be."""
+    step = max(1, view.intrinsics.width // PROBE)
+    unit = unproject(np.ones_like(depth_m), view.intrinsics)[step // 2 :: step, step // 2 :: step].reshape(-1, 3)
+    depth = depth_m[step // 2 :: step, step // 2 :: step].reshape(-1).astype(np.float64)
+    if not (depth > 0).any():
+        return transform(pose, np.concatenate([unit * z for z in GUESSED_DEPTHS_M])), False
+    return transform(pose, unit[depth > 0] * depth[depth > 0, None]), True

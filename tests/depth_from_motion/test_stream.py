@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from semantic_mapper.config import DepthFromMotionConfig
-from semantic_mapper.depth_from_motion import DepthEstimate, DepthFromMotion, estimate_depth, prepare_view
-from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS, MAX_VIEWS
+from semantic_mapper.depth_from_motion.estimate import estimate_depth
+from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS, MAX_VIEWS, DepthFromMotion
+from semantic_mapper.depth_from_motion.views import DepthEstimate, prepare_view
 from semantic_mapper.errors import FrameError, ShapeError
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.types import CameraIntrinsics, PosedFrame

@@ -1,6 +1,5 @@
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from semantic_mapper.fields.checkpoint import (
     Checkpoint,
     adapt_model,
     anchor_from_frame,
-    default_checkpoint_path,
     find_checkpoint,
     load_checkpoint,
     save_checkpoint,
@@ -39,35 +37,13 @@ def test_round_trip_keeps_weights_labels_recipe_and_anchors(tmp_path):
         assert np.array_equal(a.label, b.label) and a.label.shape == (48, 64)
 
 
-def test_half_precision_file_is_half_as_large_and_nearly_equal(tmp_path):
-    saved = Checkpoint(tiny_field())
-    save_checkpoint(saved, tmp_path / "full.safetensors")
-    save_checkpoint(saved, tmp_path / "half.safetensors", half=True)
-    full, half = (tmp_path / "full.safetensors").stat().st_size, (tmp_path / "half.safetensors").stat().st_size
-    assert half < 0.75 * full
-    loaded = load_checkpoint(tmp_path / "half.safetensors").model.state_dict()
-    for name, tensor in saved.model.state_dict().items():
-        torch.testing.assert_close(loaded[name], tensor, atol=1e-3, rtol=1e-3)
-
-
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(WeightsError, match="no such weights file"):
-        load_checkpoint(tmp_path / "none.safetensors")
-
-
-@pytest.mark.parametrize("keep", [0, 7, 100, 5000])
+@pytest.mark.parametrize("keep", [0, 100])
 def test_truncated_file_is_refused(tmp_path, keep):
     path = tmp_path / "w.safetensors"
     save_checkpoint(Checkpoint(tiny_field()), path)
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(WeightsError, match=r"w\.safetensors"):
         load_checkpoint(path)
-
-
-def test_foreign_safetensors_are_refused(tmp_path):
-    save_file({"x": torch.zeros(3)}, tmp_path / "other.safetensors")
-    with pytest.raises(WeightsError, match="not weights of this project"):
-        load_checkpoint(tmp_path / "other.safetensors")
 
 
 def test_weights_with_nan_are_refused(tmp_path):
@@ -78,12 +54,12 @@ def test_weights_with_nan_are_refused(tmp_path):
         load_checkpoint(tmp_path / "w.safetensors")
 
 
-def test_weights_that_do_not_fit_their_config_are_refused(tmp_path):
-    path = tmp_path / "w.safetensors"
-    save_checkpoint(Checkpoint(tiny_field()), path)
-    path.write_bytes(path.read_bytes().replace(b'feature_dim\\": 16', b'feature_dim\\": 12'))
-    with pytest.raises(WeightsError):
-        load_checkpoint(path)
+def test_files_of_others_are_refused(tmp_path):
+    save_file({"x": torch.zeros(3)}, tmp_path / "other.safetensors")
+    with pytest.raises(WeightsError, match="not weights of this project"):
+        load_checkpoint(tmp_path / "other.safetensors")
+    with pytest.raises(WeightsError, match="no such weights file"):
+        load_checkpoint(tmp_path / "none.safetensors")
 
 
 def change_metadata(path, **changes):
@@ -97,11 +73,11 @@ def change_metadata(path, **changes):
     "changes",
     [
         {"recipe": []},
-        {"recipe": {"width": "x"}},
         {"recipe": {"width": 0}},
         {"recipe": {"train_stamps_ns": ["soon"]}},
         {"model_config": {"heads": 0}},
         {"model_config": {"feature_dim": 10**9}},
+        {"model_config": {"encoder": {"blocks": [65, 1]}}},
         {"model_config": {"feature_din": 16}},
         {"label_set": {"name": "x"}},
         {"anchors": [{"seq": 1}]},
@@ -137,12 +113,6 @@ def test_an_anchor_without_a_usable_pose_is_refused(tmp_path):
         load_checkpoint(path)
 
 
-def test_others_may_read_weights_as_any_new_file(tmp_path):
-    (tmp_path / "any").touch()
-    save_checkpoint(Checkpoint(tiny_field()), tmp_path / "w.safetensors")
-    assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "any").stat().st_mode
-
-
 def test_adapted_model_carries_classifier_rows_over_by_name():
     model = tiny_field()
     other = make_label_set("other", ["spaceship", "chair", "wall"], ids=[4, 9, 2])
@@ -152,28 +122,6 @@ def test_adapted_model_carries_classifier_rows_over_by_name():
     assert torch.equal(weight[2], old[ROOMS.names.index("wall")])
     assert (weight[0] - old.mean(0)).abs().mean() < 0.5
     assert torch.equal(adapted.encoder.colour_net.head.weight, model.encoder.colour_net.head.weight)
-
-
-def test_the_shipped_checkpoint_is_small_and_says_where_it_comes_from():
-    path = default_checkpoint_path()
-    assert path.stat().st_size <= 16_000_000
-    checkpoint = load_checkpoint(path)
-    assert checkpoint.label_set.names == ROOMS.names[:-1] and not checkpoint.anchors
-    assert {"kind", "config", "steps", "rooms", "validation_miou", "history", "width"} <= set(checkpoint.recipe)
-
-
-@pytest.mark.parametrize(
-    "change", [{"feature_dim": 2048}, {"encoder": {"channels": [2048, 16]}}, {"encoder": {"blocks": [65, 1]}}]
-)
-def test_a_network_too_large_for_any_use_is_refused_before_it_is_made(tmp_path, change):
-    path = tmp_path / "w.safetensors"
-    save_checkpoint(Checkpoint(tiny_field()), path)
-    with safe_open(path, framework="pt") as stored:
-        metadata, tensors = stored.metadata(), {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-    metadata["model_config"] = json.dumps({**json.loads(metadata["model_config"]), **change})
-    save_file(tensors, path, metadata)
-    with pytest.raises(WeightsError, match=r"metadata is damaged: ConfigError: .*Expected"):
-        load_checkpoint(path)
 
 
 def test_weights_that_ship_are_found_by_name_and_files_come_first(tmp_path, monkeypatch):
@@ -186,10 +134,3 @@ def test_weights_that_ship_are_found_by_name_and_files_come_first(tmp_path, monk
     assert find_checkpoint(COMPUTED_DEPTH) == COMPUTED_DEPTH
     with pytest.raises(WeightsError, match="no such weights file"):
         load_checkpoint(tmp_path / "rooms-computed-depth.else")
-
-
-def test_a_folder_does_not_hide_shipped_weights_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "rooms").mkdir()
-    assert find_checkpoint(Path("rooms")) == default_checkpoint_path()
-    assert find_checkpoint(tmp_path / "rooms") == tmp_path / "rooms"

@@ -1,3 +1,8 @@
+"""The image encoder, its backbone, and the surface maps that it sees of measured depth."""
+
+from __future__ import annotations
+
+import math
 from dataclasses import replace
 
 import msgspec
@@ -6,9 +11,23 @@ import torch
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.encoder import ImageEncoder, calibrate, has_depth
-from semantic_mapper.types import SourceViews
+from semantic_mapper.fields.encoder import (
+    BACKBONE_WIDTHS,
+    EfficientNetLite0,
+    ImageEncoder,
+    calibrate,
+    surface_maps,
+    up_direction,
+)
+from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.types import CameraIntrinsics, SourceViews
+from tests.fields.scene import pose_at, wall_sources
 from tests.small import SMALL_ENCODER
+
+SMALL = EncoderConfig(backbone="efficientnet-lite0", channels=(8, 8, 12), blocks=(1, 0, 0), depth=True)
+CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)
+K = torch.from_numpy(camera_matrix(CAMERA)).float()[None]
+HEIGHT_M = 1.4
 
 
 def views(count: int, height: int = 24, width: int = 32, seed: int = 0) -> SourceViews:
@@ -22,13 +41,6 @@ def views(count: int, height: int = 24, width: int = 32, seed: int = 0) -> Sourc
 def encoder(config: EncoderConfig = SMALL_ENCODER) -> ImageEncoder:
     torch.manual_seed(0)
     return ImageEncoder(config, 16)
-
-
-@pytest.mark.parametrize("size", [(24, 32), (23, 31), (9, 13)])
-def test_features_have_half_the_size_rounded_up(size: tuple[int, int]):
-    config = EncoderConfig(channels=(8, 8, 8), blocks=(1, 1, 1))
-    feature = encoder(config)(views(2, *size))
-    assert feature.shape == (2, 16, -(-size[0] // 2), -(-size[1] // 2))
 
 
 def test_a_views_features_do_not_depend_on_the_views_beside_it_in_training_mode_either():
@@ -84,14 +96,6 @@ def test_calibration_makes_a_fresh_encoder_normalise_and_changes_no_weight():
     torch.testing.assert_close(seen[0].var((0, 2, 3)), torch.ones(8), atol=1e-2, rtol=0)
 
 
-def test_only_an_encoder_that_sees_depth_is_moved_by_it():
-    for depth in (True, False):
-        field = encoder(EncoderConfig(channels=(8,), blocks=(1,), depth=depth)).eval()
-        near, far = views(1), views(1)
-        far = SourceViews(far.rgb, far.depth_m * 2, far.K, far.T_world_camera)
-        assert torch.equal(field(near), field(far)) is not depth
-
-
 def without_depth(given: SourceViews, *index: int) -> SourceViews:
     depth = given.depth_m.clone()
     depth[list(index)] = 0
@@ -107,33 +111,6 @@ def test_each_view_goes_through_the_network_that_fits_it_and_comes_back_in_its_p
     torch.testing.assert_close(mixed[[0, 3]], with_depth[[0, 3]], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(mixed[[1, 2]], colours[[1, 2]], atol=1e-5, rtol=1e-4)
     assert not torch.allclose(with_depth[1], colours[1], atol=1e-2)
-
-
-def test_a_view_with_a_few_measured_pixels_counts_as_one_without_depth():
-    field = encoder().eval()
-    few = torch.zeros(2, 24, 32)
-    few[:, 0, :9] = 1.5  # 1.2 % of the pixels
-    assert not has_depth(few).any()
-    none = without_depth(views(2), 0, 1)
-    assert torch.equal(field(replace(none, depth_m=few)), field(none))
-
-
-def test_the_network_for_depth_begins_where_the_one_for_colours_is_and_then_goes_its_own_way():
-    field = encoder().eval()
-    calibrate(field, views(4))
-    field.grow_depth()
-    none = without_depth(views(4), 0, 1, 2, 3)
-    torch.testing.assert_close(field(views(4)), field(none), atol=1e-5, rtol=1e-4)
-    field(views(4)).square().sum().backward()
-    assert field.depth_net is not None
-    surface = field.depth_net.stem.weight.grad
-    assert surface is not None and surface[:, 3:].abs().max() > 0, "what ignores depth now has to be able to learn it"
-    assert field.colour_net.stem.weight.grad is None
-
-
-def test_an_encoder_of_colours_alone_has_no_network_to_grow():
-    with pytest.raises(ConfigError, match="depth = true"):
-        encoder(EncoderConfig(channels=(8,), blocks=(1,))).grow_depth()
 
 
 @pytest.mark.parametrize(
@@ -173,8 +150,88 @@ def test_computed_depth_that_is_not_sure_is_a_hole():
     assert torch.equal(shown(partly), shown(replace(given, depth_m=holes)))
 
 
-def test_a_measured_view_beside_computed_ones_is_shown_as_it_is():
-    given = views(2)
-    spread = torch.zeros_like(given.depth_m)
-    spread[1] = 0.02 * given.depth_m[1]
-    assert torch.equal(encoder()(replace(given, depth_sigma_m=spread)), encoder()(without_depth(given, 1)))
+@pytest.mark.parametrize("size", [(64, 96), (61, 95), (33, 47)])
+def test_stages_halve_the_image_rounded_up(size: tuple[int, int]):
+    maps = EfficientNetLite0().eval()(torch.rand(2, 3, *size))
+    for k, features in enumerate(maps, 1):
+        expected = tuple(-(-side // 2**k) for side in size)
+        assert features.shape == (2, BACKBONE_WIDTHS[k - 1], *expected)
+
+
+def test_strided_convolutions_look_where_tensorflow_s_do():
+    """Of an even size the middle of the first output's window is pixel 1, of an odd one pixel 0."""
+    for size, middle in ((8, 1), (9, 0)):
+        stem = EfficientNetLite0(1).stem
+        with torch.no_grad():
+            stem.weight.zero_()
+            stem.weight[:, :, 1, 1] = 1
+        image = torch.zeros(1, 3, size, size)
+        image[0, :, middle, middle] = 1
+        assert stem(image)[0, 0, 0, 0] == 3
+
+
+def test_blocks_at_the_coarsest_width_are_refused():
+    with pytest.raises(ConfigError, match="last one without blocks"):
+        ImageEncoder(EncoderConfig(backbone="efficientnet-lite0", channels=(8, 8), blocks=(1, 1)), 8)
+
+
+def test_a_frozen_backbone_keeps_weights_and_statistics_while_the_rest_learns():
+    encoder = ImageEncoder(SMALL, 8)
+    encoder.freeze_backbones()
+    encoder.freeze_colours(True)
+    encoder.freeze_colours(False)  # which must not wake it
+    before = {name: t.clone() for name, t in encoder.state_dict().items()}
+    optimiser = torch.optim.AdamW(encoder.parameters(), 0.1, weight_decay=0.1)
+    views = wall_sources([pose_at(0.0), pose_at(0.1)])
+    with encoder.batch_statistics():
+        encoder(views).square().sum().backward()
+    optimiser.step()
+    changed = {name for name, t in encoder.state_dict().items() if not torch.equal(t, before[name])}
+    assert not any("backbone" in name for name in changed)
+    assert "depth_net.stem.weight" in changed and "depth_net.stages.0.0.norm1.running_mean" in changed
+
+
+def looking_down(pitch: float) -> torch.Tensor:
+    """Up (3,) in the axes of a camera that is inclined downwards."""
+    return torch.tensor([0.0, -math.cos(pitch), -math.sin(pitch)])
+
+
+def floor_depth(pitch: float) -> torch.Tensor:
+    """Depth (1, H, W) of a level floor below the camera; 0 where the ray does not fall."""
+    v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    ray = torch.stack(((u - 79.5) / 110, (v - 59.5) / 110, torch.ones_like(u)))
+    falls = -torch.einsum("ihw,i->hw", ray, looking_down(pitch))
+    depth = torch.where(falls > 0.05, HEIGHT_M / falls.clamp_min(0.05), 0)
+    return depth[None]
+
+
+@pytest.mark.parametrize("pitch_deg", [0, 15, 40])
+def test_a_level_floor_is_level_at_height_nought_and_faces_up(pitch_deg: int):
+    depth = floor_depth(math.radians(pitch_deg))
+    inverse, measured, height, level, facing = surface_maps(depth, K)[0]
+    seen = depth[0] > 0
+    assert torch.equal(measured, seen.float())
+    torch.testing.assert_close(inverse[seen], 1 / depth[0][seen])
+    assert float(height[seen].abs().max()) < 0.02
+    inner = level != 0  # beside holes and at the border there is no normal
+    assert inner.float().mean() > 0.3
+    assert float(level[inner].min()) > 0.999
+    torch.testing.assert_close(
+        facing[inner], torch.full_like(facing[inner], -math.sin(math.radians(pitch_deg))), atol=2e-2, rtol=0
+    )
+
+
+def test_without_depth_there_is_nothing_and_holes_stay_holes():
+    assert not surface_maps(torch.zeros(2, 24, 32), K.expand(2, 3, 3)).any()
+    depth = floor_depth(0.5)
+    depth[0, 70:80, 60:90] = 0
+    maps = surface_maps(torch.cat((depth, torch.zeros_like(depth))), K.expand(2, 3, 3))
+    assert not maps[0, :, 70:80, 60:90].any()
+    assert not maps[1].any()
+    assert torch.isfinite(maps).all()
+
+
+def test_up_without_any_normal_is_the_cameras_own():
+    up = up_direction(torch.zeros(1, 3, 8, 8), torch.zeros(1, 8, 8, dtype=torch.bool))
+    torch.testing.assert_close(up[0].abs(), torch.tensor([0.0, 1.0, 0.0]))
+    assert float(up[0, 1]) < 0

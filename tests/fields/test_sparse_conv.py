@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from research.peers.unet3d import LEVELS, UNet3d
-from semantic_mapper.fields.sparse_conv import SubmanifoldConv, cell_levels
+from semantic_mapper.fields.sparse_conv import Down, SubmanifoldConv, Up, cell_levels
 
 SIZE = (8, 4, 12)
 
@@ -16,27 +15,15 @@ def _all_cells() -> np.ndarray:
     return np.stack(np.meshgrid(*(np.arange(s) for s in SIZE), indexing="ij"), -1).reshape(-1, 3) - 4
 
 
-def test_unet_over_all_cells_is_the_dense_one() -> None:
+def test_down_and_up_over_all_cells_are_the_dense_ones() -> None:
     torch.manual_seed(0)
-    net = UNet3d(5, 3, width=4)
-    x = torch.randn(len(_all_cells()), 5)
-    sparse = net(x, cell_levels(_all_cells(), LEVELS))
-    dense = net.dense(x.T.reshape(1, 5, *SIZE))[0].reshape(3, -1).T
-    assert sparse.abs().mean() > 0.01
-    torch.testing.assert_close(sparse, dense, atol=1e-5, rtol=1e-5)
-
-
-def test_gradients_are_those_of_the_dense_one() -> None:
-    torch.manual_seed(1)
-    net = UNet3d(2, 2, width=2)
-    x = torch.randn(len(_all_cells()), 2, requires_grad=True)
-    weight = torch.randn(len(_all_cells()), 2)
-    parameters = [x, *net.parameters()]
-    sparse = torch.autograd.grad((net(x, cell_levels(_all_cells(), LEVELS)) * weight).sum(), parameters)
-    dense_out = net.dense(x.T.reshape(1, 2, *SIZE))[0].reshape(2, -1).T
-    dense = torch.autograd.grad((dense_out * weight).sum(), parameters)
-    for mine, theirs in zip(sparse, dense, strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+    down, up = Down(3, 5), Up(5, 3)
+    level = cell_levels(_all_cells(), 1)[0]
+    x = torch.randn(len(_all_cells()), 3)
+    dense = down.dense(x.T.reshape(1, 3, *SIZE))
+    coarse = down(x, level)
+    torch.testing.assert_close(coarse, dense[0].reshape(5, -1).T, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(up(coarse, level), up.dense(dense)[0].reshape(3, -1).T, atol=1e-5, rtol=1e-5)
 
 
 def test_absent_cells_count_as_zeros() -> None:
@@ -69,17 +56,6 @@ def test_gradients_of_absent_cells_are_those_of_zeros() -> None:
     # Where the input wants no gradient, that of the weights is found in another way.
     alone = torch.autograd.grad((conv(x.detach(), cell_levels(every[kept], 1)[0]) * weight).sum(), conv.weight)[0]
     torch.testing.assert_close(alone, theirs[1], atol=1e-4, rtol=1e-4)
-
-
-def test_cells_far_apart_have_the_neighbours_of_cells_close_by() -> None:
-    rng = np.random.default_rng(0)
-    close = np.unique(rng.integers(0, 12, (300, 3)), axis=0)
-    near = cell_levels(close, 1)[0].neighbours
-    apart = np.concatenate((close, close[-1:] + 500_000))  # a box round them all would not fit into memory
-    far = cell_levels(apart, 1)[0].neighbours
-    assert (near < len(close)).sum() > 3 * len(close)
-    assert torch.equal(far[:-1], torch.where(near == len(close), len(apart), near))
-    assert far[-1].tolist() == [len(apart)] * 13 + [len(close)] + [len(apart)] * 13
 
 
 @pytest.mark.parametrize("shift", [0, 3])

@@ -1,3 +1,7 @@
+"""S-Ray's equations on a wall that many cameras see, in the paper's order and with one token a view at the surface."""
+
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -7,19 +11,18 @@ import torch
 from semantic_mapper.config import EncoderConfig, SamplingConfig, SRayConfig
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.base import EncodedViews, stack_views
-from semantic_mapper.fields.contextual import contextual_space
-from semantic_mapper.fields.geometry_net import hit_and_visibility
-from semantic_mapper.fields.projection import gather, reproject
-from semantic_mapper.fields.sampling import sample_guided
+from semantic_mapper.fields.source_views import gather, reproject
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.sray_layers import contextual_space, hit_and_visibility, surface_space
+from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.volume import compositing_weights, sample_inverse_depth
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.types import RayBatch, SourceViews
-from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
+from tests.fields.scene import WALL_M, pose_at, wall_colour, wall_rays, wall_sources
 from tests.fields.tiny_fields import assert_gradients_are_right, tiny
 from tests.small import SMALL_ENCODER
 
 LABELS = make_label_set("test", ["a", "b", "c"])
-ONE_STAGE = EncoderConfig(channels=(8,), blocks=(1,), depth=True)
 SMALL = SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER)
 POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
 
@@ -41,21 +44,12 @@ def test_reprojection_finds_the_same_wall_point_in_every_view():
     seen = where.valid[..., 0] & (where.uv[..., 0, 0] > 0) & (where.uv[..., 0, 0] < 23) & (where.uv[..., 0, 1] > 0)
     seen &= where.uv[..., 0, 1] < 15
     points = rays.origin + true_z[:, None] * rays.direction
-    from tests.fields.scene import wall_colour
-
     expected = wall_colour(points[:, 0], points[:, 1]).expand(len(POSES), -1, -1)
     error = (found.rgb[:, :, 0] - expected).abs().amax(-1)[seen]
     assert seen.float().mean() > 0.5
     assert error.max() < 0.05  # half-resolution colours of a smooth texture
     wrong = (found.rgb[:, :, 1] - expected).abs().amax(-1)[seen]
     assert wrong.mean() > 3 * error.mean()
-
-
-def test_samples_behind_a_camera_or_outside_its_image_are_invalid():
-    encoded = small_field().encode(wall_sources([pose_at(0.0), pose_at(0.0, 3.14159)]))
-    where = reproject(wall_rays(pose_at(0.0), step=50), torch.full((31, 1), 2.0), encoded)
-    assert where.valid[0].all()
-    assert not where.valid[1].any()
 
 
 def test_measured_depth_makes_the_wall_hit_and_what_is_behind_it_invisible():
@@ -91,13 +85,6 @@ def test_any_number_of_views_from_1_to_16_renders(views: int, mode: str):
     assert render.known.all()
 
 
-def test_more_than_16_views_are_refused():
-    field = small_field()
-    one = field.encode(wall_sources([pose_at(0.0)]))
-    with pytest.raises(ShapeError, match="1 to 16"):
-        stack_views([one] * 17)
-
-
 def test_a_ray_that_no_view_sees_is_unknown():
     field = small_field()
     encoded = field.encode(wall_sources(POSES))
@@ -122,8 +109,6 @@ def test_a_view_is_left_out_where_the_sample_is_hidden_from_it_and_not_from_othe
     on_wall, behind = inside[:, :2], inside[:, 2]
     assert seen[:3, :, :2][:, on_wall].all() and not seen[3, :, :2][on_wall].any()
     assert seen[:, :, 2][:, behind].all()  # hidden from all: any view is better than none
-    keep_all = small_field(occlusion=False)
-    assert torch.equal(keep_all.mask_occluded(space).valid, space.valid)
 
 
 def test_a_blind_view_changes_nothing():
@@ -159,13 +144,6 @@ def test_world_frame_does_not_matter():
     torch.testing.assert_close(a, b, atol=2e-3, rtol=2e-3)
 
 
-def test_views_without_depth_render_too():
-    field = small_field()
-    encoded = field.encode(wall_sources(POSES, with_depth=False))
-    render = field.render(wall_rays(pose_at(0.0), step=31, prior=0.0), encoded)
-    assert torch.isfinite(render.logits).all() and render.known.all()
-
-
 def test_each_view_is_encoded_by_itself():
     field = small_field()
     views = wall_sources(POSES)
@@ -173,40 +151,6 @@ def test_each_view_is_encoded_by_itself():
     one = field.encode(SourceViews(views.rgb[2:3], views.depth_m[2:3], views.K[2:3], views.T_world_camera[2:3]))
     torch.testing.assert_close(together.feature[2:3], one.feature, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(together.geometry[2:3], one.geometry, atol=1e-4, rtol=1e-4)
-
-
-def test_mismatched_sources_give_a_shape_error():
-    views = wall_sources(POSES)
-    with pytest.raises(ShapeError, match="source depth_m"):
-        small_field().encode(SourceViews(views.rgb, views.depth_m[:2], views.K, views.T_world_camera))
-
-
-def test_published_parity_runs_and_differs_from_the_paper():
-    published = small_field(parity="published", tokens="samples")
-    paper = small_field()
-    assert published.cross.head_dim == 4 and paper.cross.head_dim == 8
-    encoded = published.encode(wall_sources(POSES))
-    rays = wall_rays(pose_at(0.0), step=31)
-    z = torch.tensor([[1.9, 2.0, 2.1]]).expand(len(rays.origin), 3)
-    thin, _ = published.render_samples(rays, z, encoded)
-    assert torch.isfinite(thin.logits).all()
-    for name, theirs in published.state_dict().items():
-        if paper.state_dict()[name].shape == theirs.shape:
-            paper.state_dict()[name].copy_(theirs)
-    other, _ = paper.render_samples(rays, z, encoded)
-    assert not torch.allclose(thin.opacity, other.opacity, atol=0.01)  # alpha without the interval's length
-
-
-def test_published_parity_leaves_the_interval_length_out_of_alpha():
-    field = small_field(parity="published", tokens="samples")
-    encoded = field.encode(wall_sources(POSES))
-    rays = wall_rays(pose_at(0.0), step=31)
-    z = torch.tensor([[1.98, 2.0, 2.02]]).expand(len(rays.origin), 3)
-    with torch.no_grad():
-        space = contextual_space(rays, z, encoded)
-        sigma = field.find_density(space)
-        render, _ = field.render_samples(rays, z, encoded)
-    torch.testing.assert_close(render.opacity, 1 - torch.exp(-sigma.sum(1)))
 
 
 def test_reference_sampling_concentrates_fine_samples_on_the_wall():
@@ -217,32 +161,6 @@ def test_reference_sampling_concentrates_fine_samples_on_the_wall():
     z = field.sample(rays, encoded)
     assert z.shape[1] == 128
     assert ((z - WALL_M).abs() < 0.2).float().mean() > 0.4
-
-
-@pytest.mark.slow
-def test_the_whole_field_passes_gradcheck():
-    torch.manual_seed(1)
-    field = SRay(SRayConfig(feature_dim=8, heads=2, encoder=ONE_STAGE), LABELS).double().eval()
-    rays = wall_rays(pose_at(0.0), step=500)
-    rays = RayBatch(*(t.double() for t in (rays.origin, rays.direction, rays.near_m, rays.far_m, rays.prior_depth_m)))
-    z = sample_guided(rays, SamplingConfig(guided=3, free_space=0))
-    views = wall_sources(POSES[:2])
-    views = SourceViews(*(t.double() for t in (views.rgb, views.depth_m, views.K, views.T_world_camera)))
-    encoded = field.encode(views)
-    flat = encoded.feature.detach()[:, :, 4:12, 8:16].contiguous().requires_grad_()
-    geometry = encoded.geometry.detach()[:, :, 4:12, 8:16].contiguous()
-    K = encoded.K.clone()
-    K[:, 0, 2] -= 8
-    K[:, 1, 2] -= 4
-    channel = torch.randint(-1, 3, (2, 16, 16)).to(torch.int16)
-
-    def render(feature: torch.Tensor) -> torch.Tensor:
-        sources = EncodedViews(
-            feature, encoded.rgb[:, :, 4:12, 8:16].detach(), geometry, K, encoded.T_camera_world, channel
-        )
-        return field.render_samples(rays, z, sources)[0].logits
-
-    assert torch.autograd.gradcheck(render, (flat,), atol=1e-4)
 
 
 def test_the_whole_field_passes_gradcheck_with_labels_that_a_source_view_brings():
@@ -285,18 +203,20 @@ def test_a_view_carries_no_label_to_what_is_hidden_from_it():
     assert carried(WALL_M).min() > 0.6 and carried(WALL_M + 0.5).max() < 0.15 and carried(WALL_M - 0.5).max() < 0.15
 
 
-def test_unknown_labels_are_the_same_as_none_and_the_switch_turns_labels_off():
-    for field, label in ((small_field(), -1), (small_field(source_labels=False), 2)):
-        views, rays = wall_sources(POSES[:2]), wall_rays(pose_at(0.1), step=5)
-        with_labels = field.encode(replace(views, channel=torch.full((2, 32, 48), label)))
-        torch.testing.assert_close(
-            field.render(rays, with_labels).logits, field.render(rays, field.encode(views)).logits
-        )
+def test_unknown_labels_are_the_same_as_none():
+    field, views, rays = small_field(), wall_sources(POSES[:2]), wall_rays(pose_at(0.1), step=5)
+    with_labels = field.encode(replace(views, channel=torch.full((2, 32, 48), -1)))
+    torch.testing.assert_close(field.render(rays, with_labels).logits, field.render(rays, field.encode(views)).logits)
 
 
-def test_labels_of_another_size_than_their_images_are_refused():
+def test_views_that_do_not_fit_are_refused():
+    field, views = small_field(), wall_sources(POSES)
+    with pytest.raises(ShapeError, match="source depth_m"):
+        field.encode(SourceViews(views.rgb, views.depth_m[:2], views.K, views.T_world_camera))
     with pytest.raises(ShapeError, match="source channel"):
-        labelled_wall(small_field(), torch.zeros(1, 16, 24, dtype=torch.int64), pose_at(0.0))
+        field.encode(replace(views, channel=torch.zeros(4, 16, 24, dtype=torch.int64)))
+    with pytest.raises(ShapeError, match="1 to 16"):
+        stack_views([field.encode(wall_sources(POSES[:1]))] * 17)
 
 
 def test_the_farther_computed_depth_may_be_off_the_wider_is_where_a_view_ray_may_end():
@@ -308,3 +228,142 @@ def test_the_farther_computed_depth_may_be_off_the_wider_is_where_a_view_ray_may
     widths = [field.encode(views).geometry[:, 1] for views in (measured, sure, less)]
     assert torch.equal(widths[1], widths[0])  # no surer than a sensor
     torch.testing.assert_close(widths[2], 8 * widths[0])
+
+
+def constant_features(encoded: EncodedViews, values: list[float]) -> EncodedViews:
+    """Each view with one feature vector everywhere: a random one times its value."""
+    one = torch.randn(encoded.feature.shape[1], generator=torch.Generator().manual_seed(1))
+    feature = torch.tensor(values)[:, None, None, None] * one[None, :, None, None]
+    return replace(encoded, feature=feature.expand_as(encoded.feature).contiguous())
+
+
+def on_wall(rays: RayBatch) -> torch.Tensor:
+    return torch.tensor([0.97, 0.99, 1.01, 1.03])[None].expand(len(rays.origin), 4) * WALL_M
+
+
+def test_untrained_it_is_the_mean_of_what_its_views_say():
+    """Weighted by how much each view sees of the surface, which is alike here."""
+    field = small_field()
+    encoded = constant_features(field.encode(wall_sources(POSES[:3])), [1.0, -2.0, 0.5])
+    rays = wall_rays(pose_at(0.0), step=31)
+    z = on_wall(rays)
+    render, _ = field.render_samples(rays, z, encoded)
+    said = field.source_logits(encoded)
+    assert said is not None
+    space = contextual_space(rays, z, encoded)
+    seen = space.valid.all(2).all(0)
+    assert seen.sum() > 10
+    sigma = field.find_density(space)
+    token = surface_space(space, compositing_weights(sigma, space.delta), rays, encoded)
+    fraction = token.visibility[..., 0] / token.visibility[..., 0].sum(0)
+    assert (fraction[:, seen] - 1 / 3).abs().max() < 0.02
+    mean = torch.einsum("mr,ml->rl", fraction, said[:, :, 0, 0])
+    torch.testing.assert_close(render.logits[seen], mean[seen], atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_a_ray_that_meets_nothing_takes_what_the_views_say_of_its_direction(streaming: bool):
+    """The sky: no surface within reach, but every view that looks that way has an opinion of it."""
+    field = small_field()
+    views = wall_sources(POSES)
+    encoded = constant_features(field.encode(views), [1.0] * len(POSES))
+    away = torch.full_like(encoded.geometry[:, 0], 50.0)  # the views' own rays end far behind all samples
+    geometry = torch.stack((away, away * 0.01, away, away * 0.01, torch.ones_like(away)), dim=1)
+    encoded = replace(encoded, geometry=geometry)
+    rays = wall_rays(pose_at(0.0), step=31)
+    z = sample_inverse_depth(rays.near_m, rays.far_m, 16)
+    render = StreamingSRay(field).render_samples(rays, z, encoded) if streaming else None
+    with torch.no_grad():
+        render = render or field.render_samples(rays, z, encoded)[0]
+        said = field.source_logits(encoded)
+    assert said is not None
+    seen = render.known & (render.opacity < 0.1)
+    assert seen.float().mean() > 0.5
+    torch.testing.assert_close(render.logits[seen], said[0, :, 0, 0].expand(int(seen.sum()), 3), atol=1e-3, rtol=1e-3)
+
+
+def test_the_factor_of_the_own_view_leads_from_the_vote_to_the_own_image_alone():
+    field = small_field()
+    encoded = constant_features(field.encode(wall_sources(POSES[:3])), [1.0, -2.0, 0.5])
+    rays = wall_rays(POSES[1], step=31)
+    said = field.source_logits(encoded)
+    assert said is not None
+    others, own = said[[0, 2], :, 5, 5].mean(0), said[1, :, 5, 5]
+    space = contextual_space(rays, on_wall(rays), encoded)
+    seen = space.valid.all(2).all(0)
+    assert seen.sum() > 10
+    weights = compositing_weights(field.find_density(space), space.delta)
+    visibility = surface_space(space, weights, rays, encoded).visibility[:, seen, 0]
+    for factor in (1.0, 4.0, 1e6):
+        field.own_view_factor.fill_(factor)
+        logits = field.render_samples(rays, on_wall(rays), encoded)[0].logits[seen]
+        fraction = factor * visibility[1] / (visibility[0] + factor * visibility[1] + visibility[2])
+        wanted = fraction[:, None] * own + (1 - fraction[:, None]) * others
+        # The other two do not see the wall quite alike, and are said to here.
+        assert (logits - wanted).abs().max() < (1e-4 if factor > 1e5 else 0.05) * (others - own).abs().max()
+
+
+def test_everything_that_is_learned_gets_a_gradient_once_training_has_begun():
+    field = small_field(intra_view_attention=True).train()
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter += 0.05 * torch.randn_like(parameter)
+    encoded = field.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.05), step=31)
+    render, _ = field.render_samples(rays, on_wall(rays), encoded)
+    (render.logits.square().sum() + render.rgb.sum() + render.depth_m.sum()).backward()
+    idle = [n for n, p in field.named_parameters() if "colour_net" not in n and (p.grad is None or not p.grad.any())]
+    assert idle == ["label_logit"]  # these views have no known labels
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_where_no_view_knows_the_depth_the_query_s_own_view_decides(streaming: bool):
+    """The upper half of a street: no scanner reaches it, so what the views believe of its depth is a guess."""
+    field = small_field()
+    encoded = constant_features(field.encode(wall_sources(POSES)), [1.0, -2.0, 3.0, 0.5])
+    near = torch.full_like(encoded.geometry[:, 0], 0.2 * WALL_M)  # all samples are hidden from all views
+    geometry = torch.stack((near, near * 0.02, near, near * 0.02, torch.ones_like(near)), dim=1)
+    encoded = replace(encoded, geometry=geometry)
+    rays = wall_rays(POSES[2], step=31)
+    with torch.no_grad():
+        render = (
+            StreamingSRay(field).render_samples(rays, on_wall(rays), encoded)
+            if streaming
+            else field.render_samples(rays, on_wall(rays), encoded)[0]
+        )
+        said = field.source_logits(encoded)
+    assert said is not None
+    torch.testing.assert_close(render.logits, said[2, :, 0, 0].expand_as(render.logits), atol=1e-2, rtol=1e-2)
+
+
+def test_density_depends_on_how_much_the_colours_of_the_views_differ_at_the_surface():
+    """At a sample where features, depth and visibility say the same."""
+    for tokens in ("surface", "samples"):
+        field = small_field(tokens=tokens)
+        encoded = field.encode(wall_sources(POSES))
+        tint = torch.tensor([0.4, -0.4, 0.4, -0.4])[:, None, None, None]
+        rays = wall_rays(pose_at(0.0), step=31)
+        alike = contextual_space(rays, on_wall(rays), replace(encoded, rgb=torch.full_like(encoded.rgb, 0.5)))
+        differing = contextual_space(rays, on_wall(rays), replace(encoded, rgb=(0.5 + tint).expand_as(encoded.rgb)))
+        with torch.no_grad():
+            changed = (field.find_density(alike) - field.find_density(differing)).abs().amax()
+        assert (changed > 1e-3) == (tokens == "surface")
+
+
+@pytest.mark.parametrize("name", ["sray-paper", "sray-none", "sray-intra", "sray-cross"])
+def test_each_ablation_uses_the_attention_that_it_is_named_after(name: str):
+    field = tiny(name).train()
+    assert isinstance(field, SRay)
+    encoded = field.encode(wall_sources(POSES))
+    field.render(wall_rays(pose_at(0.0), step=31), encoded).logits.sum().backward()
+    used = tuple(
+        layer.qkv.weight.grad is not None and bool(layer.qkv.weight.grad.abs().max() > 0)
+        for layer in (field.radial, field.cross)
+    )
+    assert used == (field.config.intra_view_attention, field.config.cross_view_attention)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sray", "sray-paper", "sray-none", "sray-intra", "sray-cross"])
+def test_the_whole_field_passes_gradcheck(name: str):
+    assert_gradients_are_right(tiny(name))

@@ -1,8 +1,19 @@
+"""Samples along rays and volume rendering, against numbers computed by hand."""
+
 import math
 
 import torch
 
-from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights, interval_lengths
+from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.volume import (
+    composite,
+    compositing_weights,
+    interval_lengths,
+    sample_from_weights,
+    sample_guided,
+    sample_inverse_depth,
+)
+from semantic_mapper.types import RayBatch
 
 
 def test_weights_match_a_hand_computed_ray():
@@ -11,17 +22,6 @@ def test_weights_match_a_hand_computed_ray():
     weights = compositing_weights(sigma, delta)
     first, second = 1 - math.exp(-0.5), math.exp(-0.5) * (1 - math.exp(-0.5))
     torch.testing.assert_close(weights, torch.tensor([[0.0, first, second]]))
-
-
-def test_transparent_ray_has_no_opacity_and_no_depth():
-    weights = compositing_weights(torch.zeros(2, 4), torch.ones(2, 4))
-    assert weights.sum() == 0
-    assert composite_depth(weights, torch.ones(2, 4)).tolist() == [0, 0]
-
-
-def test_opaque_first_sample_hides_the_rest():
-    weights = compositing_weights(torch.tensor([[1e6, 5.0, 5.0]]), torch.full((1, 3), 0.1))
-    torch.testing.assert_close(weights, torch.tensor([[1.0, 0.0, 0.0]]))
 
 
 def test_opacity_is_one_minus_the_transmittance_of_the_whole_ray():
@@ -37,20 +37,62 @@ def test_interval_lengths_are_metric_along_an_oblique_ray():
     torch.testing.assert_close(delta, math.sqrt(2) * torch.tensor([[1.0, 2.0, 2.0]]))
 
 
-def test_rendering_is_independent_of_how_a_homogeneous_medium_is_cut():
-    coarse = compositing_weights(torch.full((1, 4), 0.7), torch.full((1, 4), 0.5)).sum()
-    fine = compositing_weights(torch.full((1, 16), 0.7), torch.full((1, 16), 0.125)).sum()
-    torch.testing.assert_close(coarse, fine)
-
-
-def test_composite_sums_values_by_weight():
-    weights = torch.tensor([[0.25, 0.5]])
-    values = torch.tensor([[[1.0, 2.0], [4.0, 8.0]]])
-    torch.testing.assert_close(composite(weights, values), torch.tensor([[2.25, 4.5]]))
-
-
 def test_volume_rendering_passes_gradcheck():
     sigma = (torch.rand(2, 5, dtype=torch.float64) + 0.1).requires_grad_()
     delta = (torch.rand(2, 5, dtype=torch.float64) + 0.1).requires_grad_()
     values = torch.rand(2, 5, 3, dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(lambda s, d, v: composite(compositing_weights(s, d), v), (sigma, delta, values))
+
+
+def rays_with_prior(prior: list[float], near: float = 0.3, far: float = 8.0) -> RayBatch:
+    count = len(prior)
+    return RayBatch(
+        torch.zeros(count, 3),
+        torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3),
+        torch.full((count,), near),
+        torch.full((count,), far),
+        torch.tensor(prior),
+    )
+
+
+def test_inverse_depth_midpoints_match_hand_computed_values():
+    z = sample_inverse_depth(torch.tensor([1.0]), torch.tensor([4.0]), 3)
+    # 1 / z from 1 to 0.25 in three intervals: midpoints 0.875, 0.625, 0.375
+    torch.testing.assert_close(z, torch.tensor([[1 / 0.875, 1 / 0.625, 1 / 0.375]]))
+
+
+def test_stratified_samples_stay_in_their_intervals_and_differ_by_seed():
+    near, far = torch.full((50,), 0.5), torch.full((50,), 5.0)
+    z = sample_inverse_depth(near, far, 8, torch.Generator().manual_seed(0))
+    again = sample_inverse_depth(near, far, 8, torch.Generator().manual_seed(0))
+    other = sample_inverse_depth(near, far, 8, torch.Generator().manual_seed(1))
+    position = (2 - 1 / z) / (2 - 0.2) * 8
+    assert (position.floor() == torch.arange(8)).all()
+    assert torch.equal(z, again) and not torch.equal(z, other)
+
+
+def test_guided_samples_surround_the_prior_and_leave_some_in_free_space():
+    config = SamplingConfig(guided=8, free_space=2, guided_sigma=0.02, guided_floor_m=0.04)
+    z = sample_guided(rays_with_prior([2.0]), config)[0]
+    assert (z[1:] > z[:-1]).all()
+    torch.testing.assert_close(z[2:], 2.0 + torch.linspace(-0.08, 0.08, 6))
+    assert (z[:2] < 1.92).all() and (z[:2] > 0.3).all()
+
+
+def test_rays_without_prior_search_the_whole_range():
+    config = SamplingConfig(guided=8)
+    z = sample_guided(rays_with_prior([0.0]), config)
+    torch.testing.assert_close(z, sample_inverse_depth(torch.tensor([0.3]), torch.tensor([8.0]), 8))
+
+
+def test_guided_samples_stay_ascending_and_positive_for_a_prior_nearer_than_near():
+    z = sample_guided(rays_with_prior([0.05, 0.2, 0.31]), SamplingConfig(guided=8, free_space=1))
+    assert (z > 0).all() and (z[:, 1:] >= z[:, :-1]).all()
+
+
+def test_fine_samples_follow_a_two_peaked_distribution_in_proportion():
+    z = torch.linspace(1, 5, 41)[None]
+    weights = torch.zeros(1, 41)
+    weights[0, 10], weights[0, 30] = 3.0, 1.0  # z = 2 and z = 4
+    fine = sample_from_weights(z, weights, 400)
+    assert abs((fine < 3).float().mean() - 0.75) < 0.02

@@ -20,7 +20,7 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
-from semantic_mapper.fields.sampling import sample_guided
+from semantic_mapper.fields.volume import sample_guided
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 from tests.fields.scene import pose_at, wall_rays, wall_sources
@@ -30,9 +30,6 @@ TINY_IRT = IRTConfig(
     grid=GridConfig(origin_m=(-2.0, -2.0, -1.0), voxel_m=0.25, shape=(17, 17, 17)),
     features=4,
     trunk_width=16,
-    width=16,
-    heads=2,
-    points=4,
     carried=2,
     carried_size=(6, 8),
 )
@@ -49,8 +46,9 @@ TINY: dict[str, Config] = {
     "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
     "grid": GridFieldConfig(grid=GridConfig(origin_m=(-2.0, -2.0, -1.0), voxel_m=0.25, shape=(17, 17, 17))),
     "irt": TINY_IRT,
-    "panoptic": PanopticConfig(grid=TINY_IRT.grid, features=4, trunk_width=16, head_width=16),
-    **{f"irt-{name}": TINY_IRT for name in ("b", "bc", "rt", "rtt", "rtc", "rttc", "colour")},
+    "panoptic": PanopticConfig(grid=TINY_IRT.grid, features=4, trunk_width=16),
+    "panoptic_uniform": PanopticConfig(grid=TINY_IRT.grid, features=4, trunk_width=16),
+    **{f"irt-{name}": TINY_IRT for name in ("b", "bc", "rt", "rtt", "rtc", "rttc")},
     "sray-paper": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-none": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),

@@ -17,7 +17,7 @@ from semantic_mapper.config import DepthConfig, DepthFromMotionConfig, PoseRefin
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.frame_depth import MOST_SPREAD, SURE_SPREAD, FrameDepth, computed_trust

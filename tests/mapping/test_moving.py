@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import CARLA, KITTI360, NYU40, ROOMS
 from semantic_mapper.mapping.moving import BEYOND_M, SETTLED_S, MotionDetector, MovingSpace
 from semantic_mapper.mapping.moving_filter import MUCH_LEFT_OUT, POSES_OFF, MovingFilter

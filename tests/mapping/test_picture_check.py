@@ -10,7 +10,7 @@ import pytest
 from research.experiments.picture_faults import BEGIN, FAULTS, named, room_walk, spoil, zoom
 from research.scenes import TRAIN_SEEDS
 from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.picture_check import REFUSED, SENTENCES, PictureCheck
 from semantic_mapper.mapping.pipeline import MappingPipeline

@@ -6,8 +6,8 @@ import pytest
 from semantic_mapper.config import GridFieldConfig
 from semantic_mapper.errors import FrameError, PoseError, WeightsError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
-from semantic_mapper.fields.grid.field import GridField
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.scene.grid import GridField
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline

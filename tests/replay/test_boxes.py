@@ -12,8 +12,8 @@ import pytest
 import structlog
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.primitive_rays import PrimitiveSet
-from semantic_mapper.fields.primitives import Primitive, resized
+from semantic_mapper.fields.scene.boxes import PrimitiveSet
+from semantic_mapper.fields.scene.primitives import Primitive, resized
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.nodes.map_answers import answer_instances

@@ -12,14 +12,13 @@ import torch
 
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
-from semantic_mapper.fields.irt import IRT
 from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.rays import pixel_grid
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, IRTFitConfig
-from semantic_mapper.training.fitters import fitter_of
-from semantic_mapper.training.grid_fit import GridFitConfig
+from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, IRTFitConfig
+from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.irt import ClassFit, fit_irt, labelled_rays
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
@@ -31,7 +30,7 @@ SMALL = FinetuneConfig(
     steps=150,
     width=64,
     device="cpu",
-    grid=GridFitConfig(steps=150, trunk_steps=100, long_side=40, rays=512, held_out=0, exposure=False),
+    grid=GridFitConfig(long_side=40, rays=512, held_out=0, exposure=False),
     irt=IRTFitConfig(variant="B", carry_labels=False),
 )
 
@@ -118,7 +117,7 @@ def small_field(labelled: int, **changes: object) -> tuple[IRT, ClassFit]:
 def test_geometry_colours_and_features_stay_as_they_are_while_classes_are_learned() -> None:
     field, fit = small_field(2)
     before = {n: t.clone() for n, t in field.state_dict().items()}
-    fit.run(0.0, None, bool)
+    fit.run(0.0)
     moved = {n for n, t in field.state_dict().items() if not torch.equal(t, before[n])}
     assert moved and not any(n.startswith(("grid.", "trunk.", "fitted")) for n in moved)
     assert {"classifier.weight", "image_head.weight", "vote.weight", "points.enter.weight"} <= moved
@@ -139,8 +138,8 @@ def test_held_out_blocks_choose_the_weights_and_nothing_learns_from_them() -> No
     _, fit = small_field(2)
     drawn = torch.cat([fit.pool.draw(2048, torch.Generator().manual_seed(i))[0] for i in range(5)])
     assert int(fit.data.held_out.sum()) > 0 and not bool(fit.data.held_out[drawn].any())
-    told: list[FinetuneProgress] = []
-    best = fit.run(0.0, told.append, bool)
+    told: list[FitProgress] = []
+    best, _ = fit.run(0.0, told.append)
     looks = [p for p in told if p.best]
     assert best.step == looks[-1].step and best.loss == min(p.held_out_loss for p in told)
     assert told[-1].fraction == 1.0
@@ -164,7 +163,7 @@ def test_a_fit_repeats_bit_for_bit_and_comes_back_from_its_file(tmp_path) -> Non
 
 
 def test_a_stopped_fit_gives_the_best_so_far() -> None:
-    told: list[FinetuneProgress] = []
+    told: list[FitProgress] = []
     config = msgspec.structs.replace(SMALL, steps=60)
     checkpoint = fit_irt(scene(), HEIGHTS, None, config, told.append, lambda: len(told) >= 130)
     assert [round(told[i].fraction, 2) for i in (59, 119)] == [0.35, 0.5]  # geometry, then features
@@ -190,7 +189,3 @@ def fit_config():
     from tests.fields.tiny_fields import TINY_IRT
 
     return TINY_IRT
-
-
-def test_the_kind_has_its_own_fitter() -> None:
-    assert fitter_of("irt") is fit_irt

@@ -14,14 +14,15 @@ from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.learned import encode_alike
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
+from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.keyframe_pool import KeyframePool, KeyframeSplit, key_of
-from semantic_mapper.training.online import OnlineConfig, learn
+from semantic_mapper.training.online import learn
 from semantic_mapper.types import PosedFrame
 from tests.small import settled_field, tiny_field, tiny_frames
 
 FRAMES = tiny_frames(8)
 CONFIG = convert_config(
-    {"rays": 400, "finetune": {"steps": 6, "width": 96, "held_out_rays": 64, "step": {"rays": 128}}},
+    {"finetune": {"steps": 6, "width": 96, "held_out_rays": 64, "step": {"rays": 128}}},
     OnlineConfig,
     "test",
 )
@@ -29,8 +30,8 @@ CONFIG = convert_config(
 
 def without_training() -> OnlineConfig:
     """Weights that are hardly other ones, of which much is expected."""
-    finetune = {"steps": 1, "linear_probe_steps": 0, "learning_rate": 1e-9, "width": 96, "step": {"rays": 32}}
-    return convert_config({"rays": 400, "least_gain": 0.5, "finetune": finetune}, OnlineConfig, "test")
+    finetune = {"steps": 1, "learning_rate": 1e-9, "width": 96, "step": {"rays": 32}}
+    return convert_config({"least_gain": 0.5, "finetune": finetune}, OnlineConfig, "test")
 
 
 def start_of(*stamps_ns: int) -> Checkpoint:
@@ -184,7 +185,7 @@ def test_labels_that_contradict_validated_ones_are_refused_although_they_agree_w
     for frame in FRAMES[4:]:
         pool.add(permuted(frame), ROOMS)
     config = convert_config(
-        {"rays": 400, "least_gain": 0.0, "finetune": {"steps": 6, "width": 96, "step": {"rays": 128}}},
+        {"least_gain": 0.0, "finetune": {"steps": 6, "width": 96, "step": {"rays": 128}}},
         OnlineConfig,
         "test",
     )

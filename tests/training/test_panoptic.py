@@ -9,29 +9,24 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-import structlog
 import torch
 
 from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
-from semantic_mapper.fields.primitive_rays import MAX_INTERVALS
-from semantic_mapper.fields.primitives import Primitive
-from semantic_mapper.fields.source_maps import encoded_views
+from semantic_mapper.fields.scene.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
+from semantic_mapper.fields.scene.primitives import Primitive
+from semantic_mapper.fields.source_views import encoded_views
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.training.boxes_in_view import boxes_in_view
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, PanopticFitConfig
+from semantic_mapper.training.boxes import boxes_in_view
+from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig, StepConfig
+from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.grid_fit import GridFitConfig
 from semantic_mapper.training.panoptic import (
-    FEW_MATCHED,
     fit_panoptic,
     held_out_unlabelled,
-    pseudo_rays,
     semantic_losses,
-    survey_boxes,
 )
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, RayBatch
@@ -45,7 +40,7 @@ SMALL = FinetuneConfig(
     width=64,
     device="cpu",
     grid=GridFitConfig(long_side=40, rays=256, held_out=0, exposure=False),
-    panoptic=PanopticFitConfig(rays=128),
+    step=StepConfig(rays=128),
 )
 
 
@@ -144,15 +139,6 @@ def test_weights_keep_boxes(tmp_path: Path) -> None:
     loaded, field = load_checkpoint(tmp_path / "w.safetensors").model, fitted().model
     assert isinstance(loaded, Panoptic) and loaded.shape.boxes == (DECK,) and isinstance(field, Panoptic)
     assert (answers(loaded, scene()[1])[0] == answers(field, scene()[1])[0]).float().mean() > 0.99
-
-
-def test_even_samples_spread_from_where_a_ray_enters_the_grid_to_where_it_leaves() -> None:
-    field = empty_field(DECK, samples="uniform")
-    field.fitted_steps.fill_(1)
-    origin, down = torch.tensor([(0.0, 0.0, 3.5), (0.0, 0.0, 0.5)]), torch.tensor([(0.0, 0.0, -1.0)] * 2)
-    rays = RayBatch(origin, down, torch.full((2,), 0.2), torch.full((2,), torch.inf), torch.zeros(2))
-    expected = torch.tensor([(1.5, 2.5, 3.5), (0.3333, 0.6, 0.8667)])  # the grid reaches from -0.5 to 2.5 m
-    torch.testing.assert_close(field.march(rays, 3, torch.tensor([0.5, 0.5])).z, expected, atol=1e-3, rtol=0)
 
 
 def test_labels_alone_teach_where_there_are_no_boxes() -> None:
@@ -290,21 +276,6 @@ def test_boxes_that_no_frame_can_see_are_left_out_wherever_they_move() -> None:
         boxes_in_view([primitive_of(beside)], scene())
 
 
-def test_boxes_behind_the_nearest_of_a_ray_are_counted() -> None:
-    stack = [box(n + 1, "table", (0.8, 0.0, 0.75), (1.7, 1.7, 0.5 + 0.001 * n)) for n in range(MAX_INTERVALS + 1)]
-    everything = pseudo_rays(scene(), SET, 64)
-    for boxes, crowded in ((stack, True), (stack[1:], False)):
-        survey = survey_boxes(empty_field(*boxes), everything, SMALL)
-        assert (survey.crowded > 0.05) == crowded and survey.crowded <= survey.covered
-
-
-def test_few_labels_that_fit_the_boxes_are_warned_about() -> None:
-    off = [replace(f, label=np.full((48, 64), SET.ids[TABLE], np.uint8)) for f in scene()]
-    with structlog.testing.capture_logs() as logs:
-        survey = survey_boxes(empty_field(DECK), pseudo_rays(off, SET, 64), SMALL)
-    assert survey.matched < FEW_MATCHED and [log["event"] for log in logs] == ["few_labels_match"]
-
-
 def test_frames_without_labels_are_those_that_are_held_out() -> None:
     one, none = scene()[0], scene(labelled=False)
     frames = held_out_unlabelled([*none[1:5], one, *none[5:], *scene()[1:3]], 3)
@@ -315,7 +286,7 @@ def test_frames_without_labels_are_those_that_are_held_out() -> None:
 
 @pytest.mark.parametrize("joint", [0, 2])
 def test_a_stop_before_classes_are_learned_leaves_what_the_boxes_say(joint: int, tmp_path: Path) -> None:
-    done: list[FinetuneProgress] = []
+    done: list[FitProgress] = []
     stopped = fit_panoptic(
         scene(), SET, empty_field(DECK), SMALL, done.append, lambda: len(done) >= SMALL.steps + joint
     )

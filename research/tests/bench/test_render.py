@@ -8,7 +8,7 @@ import research.bench.render as bench
 from research.bench.render import bench_render, log_scenes, room_scenes
 from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.views.view_renderer import ViewRenderer

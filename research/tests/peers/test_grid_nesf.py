@@ -8,7 +8,7 @@ import torch
 
 from research.peers.grid_nesf import GridNesf, GridNesfConfig, Placement, density_cells, smooth_opacity
 from semantic_mapper.config import GridConfig
-from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.labels import KLEVR
 
 BOX = GridConfig(origin_m=(-2.0, -2.0, 0.0), voxel_m=0.25, shape=(17, 17, 9))

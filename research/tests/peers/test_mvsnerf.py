@@ -9,8 +9,8 @@ from research.peers.cost_volume import Sweep, cost_volume, nearest_views, query_
 from research.peers.mvsnerf import MVSNeRF
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.nerf_math import encoded_size
 from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.scene.grid import encoded_size
 from tests.fields.scene import INTRINSICS, WALL_M, pose_at, wall_rays, wall_sources
 from tests.fields.tiny_fields import AWAY, LABELS, POSES, assert_gradients_are_right, assert_unknown, tiny
 

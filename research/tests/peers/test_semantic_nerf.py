@@ -5,9 +5,9 @@ from research.peers.config import SemanticNeRFConfig
 from research.peers.semantic_nerf import SemanticNeRF, config_for_scene
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.nerf_math import encode_frequencies, encoded_size
-from semantic_mapper.fields.sampling import sample_guided
-from semantic_mapper.training.losses import LossConfig, ray_loss
+from semantic_mapper.fields.scene.grid import encode_frequencies, encoded_size
+from semantic_mapper.fields.volume import sample_guided
+from semantic_mapper.training.losses import ray_loss
 from semantic_mapper.training.views import RayTargets
 from semantic_mapper.types import RayBatch
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
@@ -36,7 +36,7 @@ def fit(field: SemanticNeRF, steps: int, with_depth: bool = True) -> None:
     for _ in range(steps):
         render, _ = field.render_samples(rays, z, encoded)
         optimiser.zero_grad()
-        ray_loss(render, targets, LossConfig(depth=1.0)).total.backward()
+        ray_loss(render, targets, (0.25, 0.75, 1.0)).total.backward()
         optimiser.step()
     field.eval()
 

@@ -3,10 +3,11 @@ from dataclasses import replace
 import msgspec
 import torch
 
+from research.train.appearance import hue_rotation, mix_amplitudes, vary_appearance
+from research.train.images import ImageStepConfig
 from research.train.rooms import RoomPoolConfig, draw_images, render_room
-from semantic_mapper.training.appearance import hue_rotation, mix_amplitudes, vary_appearance
-from semantic_mapper.training.images import ImageStepConfig
-from semantic_mapper.training.views import cropped_view, query_rays
+from research.train.view_draws import cropped_view
+from semantic_mapper.training.views import query_rays
 from semantic_mapper.types import SourceViews
 from tests.fields.scene import pose_at, wall_sources
 

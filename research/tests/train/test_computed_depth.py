@@ -9,18 +9,19 @@ import torch
 from research.scenes import PoseNoiseConfig, room_frames
 from research.tests.train.small_run import POOL, small_run
 from research.train.cameras import draw_camera
+from research.train.computed_depth import BETWEEN_M, ComputedDepth, compute_depth, draw_computed_depth
 from research.train.rooms import PackedRoom, RoomPoolConfig, pack_room, unpack_room
 from research.train.start import take_over
+from research.train.step import StepConfig, draw_batch
 from research.train.train import train
+from research.train.view_draws import cropped_view, join_sources, select_sources
 from semantic_mapper.config import SamplingConfig, convert_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
-from semantic_mapper.fields.sampling import COMPUTED_GUIDED
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.volume import COMPUTED_GUIDED
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.computed_depth import BETWEEN_M, ComputedDepth, compute_depth, draw_computed_depth
-from semantic_mapper.training.step import StepConfig, draw_batch
-from semantic_mapper.training.views import cropped_view, join_sources, mirrored_view, select_sources, stack_sources
+from semantic_mapper.training.views import mirrored_view, stack_sources
 from tests.small import SMALL_ENCODER, SMALL_MODEL
 
 CPU = torch.device("cpu")

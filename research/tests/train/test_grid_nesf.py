@@ -16,7 +16,7 @@ from research.train.grid_nesf import (
     marched,
 )
 from semantic_mapper.config import GridConfig
-from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.labels import KLEVR
 from semantic_mapper.training.frame_rays import frame_rays
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from research.train.label_transfer import box_crf, nearest_labels
-from semantic_mapper.fields.primitive_rays import PrimitiveSet
-from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.fields.scene.boxes import PrimitiveSet
+from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.labels import KITTI360
 from semantic_mapper.types import CameraIntrinsics, PosedFrame, UInt8
 

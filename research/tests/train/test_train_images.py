@@ -10,6 +10,7 @@ from safetensors import safe_open
 from torch.nn import functional
 
 from research.tests.train.small_run import POOL, small_run
+from research.train.images import ImageStepConfig, images_loss
 from research.train.recipe import rooms_before
 from research.train.rooms import RoomPool, RoomPoolConfig, draw_images, render_room
 from research.train.start import take_over_encoder
@@ -20,9 +21,8 @@ from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.rays import invert_pose_torch
-from semantic_mapper.training.images import ImageStepConfig, images_loss
+from semantic_mapper.training.fit import cosine_rate
 from semantic_mapper.training.losses import image_loss
-from semantic_mapper.training.schedule import cosine_rate
 from semantic_mapper.training.views import mirrored_view, query_rays, stack_sources
 from tests.small import SMALL_ENCODER
 

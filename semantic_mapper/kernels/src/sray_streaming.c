@@ -43,13 +43,11 @@ typedef struct {
 typedef struct {
     int64_t heads;
     int64_t at_surface;        /* one token a view for the attention across views and for blending */
-    int64_t residual;          /* attention adds to the features instead of replacing them */
-    int64_t occlusion;         /* views count by their visibility */
     double log_ratio;          /* ln(1 / tau) of Eq. 12 */
     double sample_weight_threshold;       /* samples of a smaller fraction of their ray's weight take no part in the attention */
     double hidden_below;       /* visibility below which a view is left out where another one sees the sample */
     double least_visibility;   /* added to each visibility that is a weight */
-    double label_doubt;        /* hit probability at which a label that a view carries over counts by half */
+    double label_uncertainty;        /* hit probability at which a label that a view carries over counts by half */
     double own_density_offset; /* of the density that the network adds */
     double colour_scale;       /* of the colours whose moments the density depends on; 0 = on none */
     double min_depth;          /* metres before a source camera */
@@ -118,7 +116,7 @@ typedef struct {
 
     /* Samples. */
     float *z, *delta, *sigma;                 /* (N,) depth, interval length, density */
-    float *weight, *looked_at, *clearest;     /* (N,) of compositing; the same without the faint; best visibility */
+    float *weight, *looked_at, *clearest;     /* (N,) of compositing; the same without pruned samples; best visibility */
     float *density_input, *density_hidden;    /* (N, density_inputs), (N, the wider of two hidden layers) */
     float *density_token, *density_qkv;       /* (N, D), (N, 3 D) */
     float *density_mixed;                     /* (N, D) */
@@ -391,10 +389,8 @@ static void project_tokens(Scratch *s, const F32 *qkv, const Settings *set, int6
     product(normalised(s, set, count), s->stride, count, qkv, s->qkv);
 }
 
-/* What the heads found becomes, or is added to, the tokens' features. */
-static void merge_heads(Scratch *s, const F32 *out, int64_t count, bool residual) {
-    for (int64_t t = 0; t < count && !residual; t++)
-        memset(s->tokens + t * s->stride, 0, (size_t)s->channels * sizeof(float));
+/* What the heads found is added to the tokens' features. */
+static void merge_heads(Scratch *s, const F32 *out, int64_t count) {
     multiply_matrix(s->mixed, s->channels, count, out, NULL, s->tokens, s->stride);
 }
 
@@ -404,7 +400,7 @@ static void attend_along_ray(Scratch *s, const Attention *w, const Settings *set
     for (int64_t j = 0; j < s->views; j++)
         attend(s->qkv, s->every + s->view_start[j], s->view_start[j + 1] - s->view_start[j], set->heads, s->channels, s,
                s->mixed);
-    merge_heads(s, &w->out, count, set->residual);
+    merge_heads(s, &w->out, count);
 }
 
 /* Cross-view sparse attention (Eq. 10): each sample's tokens among themselves. */
@@ -412,7 +408,7 @@ static void attend_across_views(Scratch *s, const Attention *w, const Settings *
     project_tokens(s, &w->qkv, set, count);
     for (int64_t k = 0; k < s->samples; k++)
         attend(s->qkv, s->by_sample + k * s->views, s->sample_size[k], set->heads, s->channels, s, s->mixed);
-    merge_heads(s, &w->out, count, set->residual);
+    merge_heads(s, &w->out, count);
 }
 
 /* ---- Tokens: the contextual space (Eq. 3 to 5) ---- */
@@ -532,10 +528,10 @@ static void group_by_sample(Scratch *s, int64_t count) {
     }
 }
 
-/* Move the tokens that SRay.mask_occluded and without_faint keep to the front; returns how many they are. */
+/* Move the tokens that SRay.mask_occluded and pruned keep to the front; returns how many they are. */
 static int64_t drop_tokens(Scratch *s, const Settings *set) {
-    const float hidden_below = set->occlusion && !set->at_surface ? (float)set->hidden_below : 0.0f;
-    const bool drop_faint = set->sample_weight_threshold > 0;
+    const float hidden_below = set->at_surface ? 0.0f : (float)set->hidden_below;
+    const bool prune = set->sample_weight_threshold > 0;
     int64_t kept = 0, end = 0;
     for (int64_t k = 0; k < s->samples; k++) {
         s->clearest[k] = 0;
@@ -548,7 +544,7 @@ static int64_t drop_tokens(Scratch *s, const Settings *set) {
         for (; t < end; t++) {
             const int64_t k = s->sample_of[t];
             const bool hidden = s->visible[t] < hidden_below && hidden_below <= s->clearest[k];
-            if (hidden || (drop_faint && s->looked_at[k] == 0)) continue;
+            if (hidden || (prune && s->looked_at[k] == 0)) continue;
             if (kept < t) {
                 memcpy(s->tokens + kept * s->stride, s->tokens + t * s->stride, (size_t)s->stride * sizeof(float));
                 s->visible[kept] = s->visible[t], s->sample_of[kept] = k;
@@ -639,7 +635,7 @@ static void find_density(Scratch *s, const Weights *w, const Settings *set) {
     }
 }
 
-/* Compositing weights of the samples, and those of the samples that are looked at, 0 for the faint ones. */
+/* Compositing weights of the samples, and those of the samples that are looked at, 0 for pruned ones. */
 static void weigh_samples(Scratch *s, const Settings *set, float *opacity, float *depth) {
     float optical = 0, sum = 0, depth_sum = 0, kept = 0;
     for (int64_t k = 0; k < s->samples; k++) {
@@ -655,7 +651,7 @@ static void weigh_samples(Scratch *s, const Settings *set, float *opacity, float
     *opacity = sum, *depth = sum > 1e-3f ? depth_sum / max_f(sum, 1e-6f) : 0.0f;
 }
 
-/* ---- One token a view (contextual.surface_space) ---- */
+/* ---- One token a view (sray_layers.surface_space) ---- */
 
 /* Of view j's token `from`, `weight` times: its row to a surface token, and what the view sees of it, which is all where
  * the view is the query's own; returns its share in the token. */
@@ -664,7 +660,7 @@ INLINE float add_to_surface(Scratch *s, const Settings *set, int64_t j, int64_t 
     const float *row = s->tokens + from * s->stride;
     const int64_t C = s->channels;
     const float seen = s->own_view[j] > 0 ? 1.0f : s->visible[from];
-    const float share = set->occlusion ? weight * (seen + (float)set->least_visibility) : weight;
+    const float share = weight * (seen + (float)set->least_visibility);
     for (int64_t c = 0; c < C; c++) token[c] += share * row[c];
     for (int64_t c = C + 2; c < s->stride; c++) token[c] += share * row[c];
     token[C] += weight * row[C];
@@ -676,7 +672,7 @@ INLINE float add_to_surface(Scratch *s, const Settings *set, int64_t j, int64_t 
  * surface, where any does, become the tokens. Returns how many they are. */
 static int64_t composite_views(Scratch *s, const Settings *set) {
     const int64_t C = s->channels;
-    const float hidden_below = set->occlusion ? (float)set->hidden_below : 0.0f;
+    const float hidden_below = (float)set->hidden_below;
     float rest = 1.0f, clearest = 0;
     for (int64_t k = 0; k < s->samples; k++) rest -= s->looked_at[k];
     rest = max_f(rest, 0.0f);
@@ -693,7 +689,7 @@ static int64_t composite_views(Scratch *s, const Settings *set) {
         const float rate = 1.0f / max_f(sum, 1e-12f);
         for (int64_t c = 0; c < s->stride; c++) token[c] *= c == C ? 1.0f : rate;
         token[C + 1] = visible, token[C + OWN] = s->own_view[j];
-        s->surface_visible[count++] = set->occlusion ? visible : weight;
+        s->surface_visible[count++] = visible;
         clearest = max_f(clearest, visible);
     }
     int64_t kept = 0;
@@ -725,8 +721,7 @@ static void score_views(Scratch *s, const Weights *w, const Settings *set, int64
          * out. */
         const Lanes score = load(s->semantic_score + t);
         Lanes weight = exp_below((float)set->log_ratio * (logistic(2.0f * score) - 1.0f));
-        if (set->occlusion || set->at_surface) weight *= load(s->visible + t) + (float)set->least_visibility;
-        store(s->semantic_score + t, weight);
+        store(s->semantic_score + t, weight * (load(s->visible + t) + (float)set->least_visibility));
         Lanes colour = exp_below(load(s->colour_score + t));
         if (set->at_surface) colour *= load(s->visible + t) + (float)set->least_visibility;
         store(s->colour_score + t, colour);
@@ -790,7 +785,7 @@ static void composite_semantics(Scratch *s, const Weights *w, int64_t count, flo
 static void carry_labels(const Scratch *s, const Settings *set, float *out) {
     for (int64_t k = 0; k < s->samples; k++) {
         const int64_t *tokens = s->by_sample + k * s->views;
-        float sum = (float)set->label_doubt;
+        float sum = (float)set->label_uncertainty;
         for (int64_t i = 0; i < s->sample_size[k]; i++)
             if (s->label[tokens[i]] >= 0) sum += s->hit[tokens[i]];
         for (int64_t i = 0; i < s->sample_size[k]; i++) {
@@ -820,10 +815,8 @@ static void render_ray(const RenderArguments *a, Scratch *s, int64_t r) {
     weigh_samples(s, set, a->out.opacity.data + r, a->out.depth.data + r);
     memset(a->out.carried.data + r * s->classes, 0, (size_t)s->classes * sizeof(float));
     if (a->maps.labels.shape[1] > 0) carry_labels(s, set, a->out.carried.data + r * s->classes);
-    if (set->occlusion || set->sample_weight_threshold > 0) {
-        count = drop_tokens(s, set);
-        group_by_sample(s, count);
-    }
+    count = drop_tokens(s, set);
+    group_by_sample(s, count);
     if (w->radial.qkv.shape[0] > 0) attend_along_ray(s, &w->radial, set, count);
     if (set->at_surface) count = composite_views(s, set);
     if (w->cross.qkv.shape[0] > 0) attend_across_views(s, &w->cross, set, count);

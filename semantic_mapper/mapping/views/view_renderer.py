@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from semantic_mapper.config import RenderConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews, Sampled, SemanticField
-from semantic_mapper.fields.render import render_view
-from semantic_mapper.fields.sampling import around_computed
-from semantic_mapper.fields.sparse_render import render_sparse_view
+from semantic_mapper.fields.render import render_sparse_view, render_view
+from semantic_mapper.fields.volume import around_computed
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.rate_controller import RateController
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.errors import MapError, PoseError
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction.pose_correction import ALWAYS

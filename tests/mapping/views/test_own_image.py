@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.views.own_image import add_own_image

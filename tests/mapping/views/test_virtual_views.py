@@ -7,7 +7,7 @@ import pytest
 
 from semantic_mapper.config import VirtualViewConfig
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.fusion.vote_fusion import add_votes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import WeightsError
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import MappingPipeline

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.boxes import BoxFile, save_boxes
 from tests.nodes.support import error_line, run

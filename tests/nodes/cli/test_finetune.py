@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.fields.checkpoint import load_checkpoint
-from semantic_mapper.fields.grid.field import GridField
-from semantic_mapper.fields.irt import IRT
+from semantic_mapper.fields.scene.grid import GridField
+from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.nodes.console import FrameProgress
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.sequence import open_log

@@ -16,7 +16,7 @@ import pytest
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
-from semantic_mapper.fields.panoptic import Panoptic
+from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, make_label_set
 from semantic_mapper.mapper import Mapper
@@ -29,7 +29,7 @@ from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.jobs import AutolabelRequest, FinetuneRequest, FinetuneResult, autolabel_log, finetune_log
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.training.config import FinetuneConfig
 from tests.nodes.cli.test_autolabel import StopsAfter
 from tests.nodes.support import error_line, run, write_log
 from tests.replay.test_boxes import kitti_xml
@@ -66,7 +66,7 @@ def boxes(folder: Path) -> Path:
 @pytest.fixture(scope="module")
 def settings(folder: Path) -> Path:
     path = folder / "small.toml"
-    path.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\nheld_out = 0\n[panoptic]\nrays = 128\n")
+    path.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\nheld_out = 0\n[step]\nrays = 128\n")
     return path
 
 

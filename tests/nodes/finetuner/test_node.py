@@ -27,9 +27,9 @@ from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
 from semantic_mapper.nodes.process import StopRequest, run_when_idle
-from semantic_mapper.training.finetune import FinetuneProgress
+from semantic_mapper.training.config import OnlineConfig
+from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.keyframe_pool import KeyframeSplit
-from semantic_mapper.training.online import OnlineConfig
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe, Status, WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
@@ -41,7 +41,6 @@ from tests.training.test_online import permuted, start_of
 
 FRAMES = tiny_frames(8)
 LEARNING = """
-rays = 400
 [finetune]
 steps = 6
 width = 96
@@ -292,15 +291,15 @@ def test_a_round_rests_as_its_share_says_and_can_be_cancelled(monkeypatch: pytes
 
     def steps(*arguments: Any) -> Any:
         on_progress = arguments[3]
-        on_progress(FinetuneProgress(1, 0.1, 0.0, 0.0, 0.0, best=False))
+        on_progress(FitProgress(1, 0.1, 0.0, 0.0, 0.0, best=False))
         spent_s = time.process_time()
         while time.process_time() < spent_s + 0.05:
             pass
         began_s = time.monotonic()
-        on_progress(FinetuneProgress(2, 0.2, 0.0, 0.0, 0.0, best=False))
+        on_progress(FitProgress(2, 0.2, 0.0, 0.0, 0.0, best=False))
         rested_s.append(time.monotonic() - began_s)
         while True:
-            on_progress(FinetuneProgress(3, 0.3, 0.0, 0.0, 0.0, best=False))
+            on_progress(FitProgress(3, 0.3, 0.0, 0.0, 0.0, best=False))
 
     monkeypatch.setattr(finetune_round, "learn", steps)
     config = OnlineConfig()

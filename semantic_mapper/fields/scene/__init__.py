@@ -1,0 +1,1 @@
+"""Fields that are fitted to one scene, on a dense grid."""

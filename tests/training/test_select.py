@@ -1,0 +1,77 @@
+"""Which frames to label, and which next."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes, suggest_frames
+from tests.small import tiny_frames
+
+
+def candidate(*cells: int, stamp_ns: int = 0) -> Candidate:
+    """A frame whose pixels fall in these cells of a line."""
+    return Candidate(stamp_ns, np.array([[c, 0, 0] for c in cells], np.int64).reshape(-1, 3))
+
+
+def test_each_suggestion_counts_what_earlier_ones_show():
+    frames = [candidate(1, 2, 3, 4), candidate(1, 2, 3), candidate(8, 9), candidate(4, 5)]
+    found = suggest_frames(frames, 4)
+    assert [s.index for s in found] == [0, 2, 3], "the second frame shows nothing that the first does not"
+    # Of 11 pixels of the log, 8 fall in what the first one shows.
+    assert [s.gain for s in found] == pytest.approx([8 / 11, 2 / 11, 1 / 11])
+    assert [s.shown for s in found] == pytest.approx([8 / 11, 10 / 11, 1])
+
+
+def test_labelled_frames_are_not_suggested_and_what_they_show_counts_nothing():
+    frames = [candidate(1, 2, 3, 4), candidate(1, 2, 3), candidate(8, 9), candidate(4, 5)]
+    assert [s.index for s in suggest_frames(frames, 2, [0])] == [2, 3]
+    assert suggest_frames(frames, 2, [0])[0].shown == pytest.approx(10 / 11)
+    assert suggest_frames(frames, 2, [0, 2, 3]) == []
+
+
+def test_weights_of_pixels_decide_where_they_are_given():
+    frames = [candidate(1, 2, 3), candidate(8, 9)]
+    weights = [np.full(3, 0.1), np.ones(2)]
+    assert [s.index for s in suggest_frames(frames, 2, weights=weights)] == [1, 0]
+
+
+def test_suggestions_without_depth_are_spread_over_time():
+    frames = [candidate(stamp_ns=stamp) for stamp in (0, 10, 20, 30, 40, 50, 60, 70, 80)]
+    found = suggest_frames(frames, 3)
+    assert [s.index for s in found] == [4, 0, 8] and {(s.gain, s.shown) for s in found} == {(None, None)}
+    assert [s.index for s in suggest_frames(frames, 1, [0, 1])] == [8]
+    assert [s.index for s in suggest_frames(frames, 2, [8])] == [0, 4]
+    assert len(suggest_frames(frames, 99)) == 9
+
+
+def test_suggested_frames_of_a_room_show_more_than_others():
+    frames = tiny_frames(6)
+    candidates = [candidate_from_frame(f) for f in frames]
+    found = suggest_frames(candidates, 6)
+    shown, gains = [s.shown for s in found], [s.gain for s in found]
+    assert gains == sorted(gains, reverse=True) and shown == sorted(shown) and shown[-1] == pytest.approx(1)
+    again = suggest_frames([candidate_from_frame(dataclasses.replace(f, label=None)) for f in frames], 6)
+    assert again == found, "labels play no part"
+
+
+def test_chosen_keyframes_cover_different_places():
+    def cells(start: int) -> np.ndarray:
+        return np.stack([np.arange(start, start + 50), np.zeros(50, int), np.zeros(50, int)], axis=1)
+
+    candidates = [Candidate(i, cells(start)) for i, start in enumerate([0, 1, 2, 100, 101, 200])]
+    chosen = choose_keyframes(candidates, 3, seed=0)
+    assert len(set(chosen) & {0, 1, 2}) == 1 and len(set(chosen) & {3, 4}) == 1 and 5 in chosen
+
+
+def test_choice_is_decided_by_the_seed_and_gives_as_many_as_asked():
+    candidates = [candidate_from_frame(f) for f in tiny_frames(6)]
+    assert choose_keyframes(candidates, 4, 3) == choose_keyframes(candidates, 4, 3)
+    assert len(choose_keyframes(candidates, 4, 3)) == 4
+    assert choose_keyframes(candidates, 99, 0) == list(range(6))
+
+
+def test_frames_without_depth_are_spread_over_time():
+    blind = [Candidate(i, np.zeros((0, 3), np.int64)) for i in range(100)]
+    chosen = choose_keyframes(blind, 4, 0)
+    assert len(chosen) == 4 and min(np.diff(chosen)) >= 15
