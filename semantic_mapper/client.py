@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.map_types import CorrectedPoses, MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.queries.checks import as_numbers

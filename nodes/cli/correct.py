@@ -58,7 +58,7 @@ def correct(
     """
     output = Output.guarded()
     from semantic_mapper.client import MapClient
-    from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+    from semantic_mapper.mapping.correction import ALWAYS
     from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
     from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 

@@ -78,7 +78,7 @@ def export(
         given |= {"--up": up != "auto", "--min-weight": min_weight is not None, "--min-confidence": min_confidence > 0}
         map_options = [name for name, value in given.items() if value]
         return export_recording(output, source, out, format, camera, max_frames, map_options)
-    from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
+    from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
     from semantic_mapper.replay.exporters.map_files import ExportRequest, format_of, parse_up
 
     if camera or max_frames:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import structlog
 
-from semantic_mapper.config import MapperConfig, VoxelMapConfig
+from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -102,10 +102,13 @@ def stored_settings(config: MapperConfig, given: Collection[str], path: Path) ->
     Raises:
         MapError: it cannot be read.
     """
+    if "voxel_size_m" in given:
+        return config
     with open_map(path) as reader:
-        saved = reader.manifest.config
-    kept = {name: getattr(saved, name) for name in VoxelMapConfig.stored if name not in given}
-    return msgspec.structs.replace(config, voxel_map=msgspec.structs.replace(config.voxel_map, **kept))
+        voxel_size_m = reader.manifest.config.voxel_size_m
+    return msgspec.structs.replace(
+        config, voxel_map=msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
+    )
 
 
 def note_worlds(context: NodeContext, known: Mapping[int, Float64]) -> None:

@@ -17,8 +17,8 @@ from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import EndOfStream
-from tests.mapping.correction.test_corrected_map import drifted, true_poses
 from tests.mapping.rendered_views import small_map
+from tests.mapping.test_correction import drifted, true_poses
 from tests.nodes.mapper.test_live_correction import running_robot
 from tests.nodes.support import eventually
 from tests.queries.scene import LABELS, integrate, poses
