@@ -15,8 +15,7 @@ from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction.history import SEGMENTS
-from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+from semantic_mapper.mapping.correction import ALWAYS
 from semantic_mapper.replay.importers.tum import match_nearest, read_trajectory
 from semantic_mapper.types import Float64
 
@@ -60,8 +59,7 @@ def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
     """The config with a history that holds a log of this many frames, where it says nothing else."""
     if config.history.max_frames:
         return config
-    # One segment for all: none will leave, and so nothing has to be kept of what the map was before.
-    history = msgspec.structs.replace(config.history, max_frames=SEGMENTS * (frames + 1))
+    history = msgspec.structs.replace(config.history, max_frames=frames + 1)  # none will leave
     return msgspec.structs.replace(config, history=history)
 
 

@@ -12,8 +12,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError
-from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.map_types import CorrectedPoses, MapPoints
 from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph

@@ -181,8 +181,7 @@ class SamplingConfig(Config, frozen=True):
 class KeyframeConfig(Config, frozen=True):
     """When a frame becomes a source view, and which views a query uses."""
 
-    translation_m: Positive = 0.15  # new keyframe when moved this far from the nearest one, or ...
-    rotation_deg: Positive = 12.0  # ... turned this far
+    translation_m: Positive = 0.15  # new keyframe when moved this far from the nearest one, or turned by 12 degrees
     capacity: Annotated[int, msgspec.Meta(ge=1, le=4096)] = (
         64  # keyframes kept; the one whose loss costs least coverage goes first
     )
@@ -200,24 +199,21 @@ class VoxelMapConfig(Config, frozen=True):
     """The fused map."""
 
     voxel_size_m: Annotated[float, msgspec.Meta(ge=1e-4, le=10)] = 0.02  # edge of a voxel
-    truncation_voxels: Annotated[float, msgspec.Meta(gt=0, le=64)] = 4.0
     depth_max_m: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 5.0
-    max_weight: Positive = 255.0  # cap of the TSDF weight, so that the map stays able to change
-    initial_blocks: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = (
-        2000  # capacity at start; grows by half when full
-    )
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
-    vote_discount: Fraction = 0.75  # rho: how much a repeated view of a voxel repeats what earlier views said
-    vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
     unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
     clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``fusion/clearing.py``)
     # Where the sensor gives no depth there is nothing up to here, in metres: for sensors that are to be trusted so.
     # 0 = no depth says nothing.
     no_return_range_m: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0
-    evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
-    stored: ClassVar = ("voxel_size_m", "truncation_voxels", "evidence")  # what the data of a saved map means
+    # The same for all maps:
+    truncation_voxels: ClassVar[float] = 4.0
+    max_weight: ClassVar[float] = 255.0  # cap of the TSDF weight and of votes, so that the map stays able to change
+    initial_blocks: ClassVar[int] = 2000  # capacity at start; grows by half when full
+    vote_discount: ClassVar[float] = 0.75  # rho: how much a view of a voxel repeats what earlier views said
+    vote_band_voxels: ClassVar[float] = 2.0  # only voxels this near the surface take class votes
 
 
 class PoseRefinerConfig(Config, frozen=True):
@@ -235,23 +231,18 @@ class PoseRefinerConfig(Config, frozen=True):
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
-    # Corrections reach the last this many frames, and at times up to an eighth more; older ones stay in the map where
-    # they are. 0 = keep none.
+    # Corrections reach the last this many frames; older ones stay in the map where they are, and are kept in a second
+    # map for that. 0 = keep none.
     max_frames: NotNegative = 0
-    # In the folder for temporary files, for frames and for what the map was before each eighth of them (the blocks that
-    # changed, ``mapping/map_journal``, some three times as large): the oldest eighth leaves earlier for it.
+    # In the folder for temporary files; the oldest frames leave earlier for it.
     max_disk_mb: AtLeastOne = 4000
 
 
 class VirtualViewConfig(Config, frozen=True):
-    """Views from where no camera stood, rendered from keyframes, that add class votes where the map is in doubt."""
+    """Views from where no camera stood, rendered from keyframes, that add class votes where the map is unsure."""
 
-    # After every n frames, in time that ``render.target_hz`` knows nothing of; 0 = only where asked for.
+    # One after every n frames, in time that ``render.target_hz`` knows nothing of; 0 = only where requested.
     every_n_frames: NotNegative = 0
-    views: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1  # at a time
-    weight: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.3  # of their votes, against those of a frame
-    max_votes: Positive = 0.3  # only voxels with fewer take theirs; a frame's vote from up to 2 m, head on, is 1
-    keyframes: AtLeastTwo = 2  # that must see a surface for a virtual view to look at it
 
 
 class RenderConfig(Config, frozen=True):
@@ -261,13 +252,11 @@ class RenderConfig(Config, frozen=True):
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
     # 1 = rays for all its pixels; below, for every fourth a side and, up to this fraction, where these are uncertain.
     ray_fraction: Fraction = 0.2
-    samples_without_depth: SamplesOfTwo = 32  # a ray, of views of which neither sensor nor map knows any depth
     target_hz: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
         0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
     )
     # Of the source images when they are encoded; 0 = what the weights were trained at.
     encode_width: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 0
-    rays_per_chunk: Annotated[int, msgspec.Meta(ge=0, le=1 << 20)] = 0  # 0 = 2,048 on a CPU, 32,768 on a GPU
     device: Literal["cpu", "cuda"] = "cpu"  # where views are encoded and rendered; the map is always the CPU's
     bfloat16: bool = False  # on a GPU: networks compute in bfloat16; geometry and logits never do
 

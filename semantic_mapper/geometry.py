@@ -103,6 +103,11 @@ def rotation_vector(T_a_b: Float64) -> Float64:
     return np.asarray(cv2.Rodrigues(T_a_b[:3, :3])[0], np.float64)[:, 0]
 
 
+def move(motion: Float64, T_world_camera: Float64) -> Float64:
+    """``motion @ T_world_camera``; no motion leaves the pose as it is, to the bit."""
+    return T_world_camera if np.array_equal(motion, np.eye(4)) else motion @ T_world_camera
+
+
 def interpolate_pose(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
     """The pose (4, 4) at a fraction of the way from a to b: slerp of the rotation, a line for the position.
 

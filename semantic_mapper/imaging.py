@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -51,10 +53,14 @@ def resize_spread(frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32 | 
 class FrameViews:
     """A frame with its colour and depth at the sizes that a step needs, each resized once. Do not write to them."""
 
-    def __init__(self, frame: PosedFrame) -> None:
+    def __init__(self, frame: PosedFrame, rgb: dict[tuple[int, int], UInt8] | None = None) -> None:
         self.frame = frame
-        self._rgb: dict[tuple[int, int], UInt8] = {}
+        self._rgb: dict[tuple[int, int], UInt8] = {} if rgb is None else rgb
         self._depth: dict[tuple[int, int], Float32] = {}
+
+    def with_depth(self, depth_m: Float32) -> FrameViews:
+        """The same frame with other depth (H, W); its colours are not resized again."""
+        return FrameViews(replace(self.frame, depth_m=depth_m), self._rgb)
 
     def rgb(self, intrinsics: CameraIntrinsics) -> UInt8:
         """See ``resize_rgb``."""
@@ -69,6 +75,11 @@ class FrameViews:
         if size not in self._depth:
             self._depth[size] = resize_depth(self.frame, intrinsics)
         return self._depth[size]
+
+
+def is_measured(frame: PosedFrame) -> bool:
+    """Whether a sensor measured the depth of a frame."""
+    return frame.depth_m is not None and frame.depth_sigma_m is None
 
 
 def resize_label(label: UInt8, intrinsics: CameraIntrinsics) -> UInt8:

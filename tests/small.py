@@ -44,5 +44,5 @@ def tiny_frames(count: int = 6, seed: int = 7) -> tuple[PosedFrame, ...]:
 
 def tiny_config(**changes: object) -> MapperConfig:
     """A config for 96x72 frames; ``changes`` are whole sections as dicts."""
-    base = {"render": {"encode_width": 96, "scale": 0.5}, "voxel_map": {"voxel_size_m": 0.05, "initial_blocks": 200}}
+    base = {"render": {"encode_width": 96, "scale": 0.5}, "voxel_map": {"voxel_size_m": 0.05}}
     return convert_config({**base, **changes}, MapperConfig, "test config")

@@ -13,7 +13,7 @@ import typer
 from semantic_mapper.client import Correction, MapClient
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import write_json
-from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+from semantic_mapper.mapping.map_types import ALWAYS
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file, verb

@@ -12,7 +12,7 @@ import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError, MapError
-from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
+from semantic_mapper.mapping.map_types import CorrectedPoses
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.worlds import MapWorlds
 from semantic_mapper.nodes.status import PartStatus

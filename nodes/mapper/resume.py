@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import structlog
 
-from semantic_mapper.config import MapperConfig, VoxelMapConfig, read_toml
+from semantic_mapper.config import MapperConfig, read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -104,10 +104,11 @@ def stored_settings(config: MapperConfig, path: Path | None, voxel_size_m: float
         MapError: it cannot be read.
     """
     given = {*(read_toml(path).get("voxel_map", {}) if path else ()), *(("voxel_size_m",) if voxel_size_m else ())}
+    if "voxel_size_m" in given:
+        return config
     with open_map(saved) as reader:
-        stored = reader.manifest.config
-    kept = {name: getattr(stored, name) for name in VoxelMapConfig.stored if name not in given}
-    return msgspec.structs.replace(config, voxel_map=msgspec.structs.replace(config.voxel_map, **kept))
+        voxel_size = reader.manifest.config.voxel_size_m
+    return msgspec.structs.replace(config, voxel_map=msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size))
 
 
 def note_worlds(context: NodeContext, known: Mapping[int, Float64]) -> None:

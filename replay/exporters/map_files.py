@@ -26,7 +26,7 @@ from semantic_mapper.mapping.files.formats import (
     write_ply,
 )
 from semantic_mapper.mapping.files.up_axis import find_up
-from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid

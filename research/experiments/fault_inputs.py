@@ -204,7 +204,7 @@ def wrong_keys(rounds: int) -> Iterator[Outcome]:
         allow(robot.folder, "desk", desk.public.decode())
         for keys in (desk, stranger):
             allow(keys.folder, "robot", robot.public.decode())
-        voxel_map = VoxelMap(VoxelMapConfig(initial_blocks=100), ROOMS)
+        voxel_map = VoxelMap(VoxelMapConfig(), ROOMS)
         service = stack.enter_context(QueryService("tcp://127.0.0.1:*", voxel_map, keys=robot))
         with MapClient(service.endpoint, identity=ServerIdentity(desk, "robot"), timeout_s=ANSWER_S) as client:
             map_id = client.info().map_id  # compiled

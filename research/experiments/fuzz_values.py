@@ -58,7 +58,7 @@ MAX_BLOCKS = 4000  # their memory is taken at the start: growth comes from elsew
 CONFIG: dict[str, Any] = {
     "render": {"scale": 0.5, "encode_width": 32},
     "keyframes": {"capacity": 12},
-    "voxel_map": {"voxel_size_m": 0.2, "initial_blocks": MAX_BLOCKS, "max_blocks": MAX_BLOCKS},
+    "voxel_map": {"voxel_size_m": 0.2, "max_blocks": MAX_BLOCKS},
     "history": {"max_frames": 32, "max_disk_mb": 50},
     "virtual": {"every_n_frames": 25},
 }

@@ -24,6 +24,11 @@ MEASURED_SPREAD = 0.01  # and where it was measured
 RECENT_FRAMES = 500
 REFINED_WIDTH = 320  # pixels; corners of smaller images are too inexact to check or correct poses by
 
+MOST_TRUST = 1.0  # of a rendered depth
+GUESS_TRUST = 0.1  # where the map has no surface yet
+LEAST_TRUST = 0.05  # below, nothing is fused
+ROUGHNESS = 0.003  # fraction of z by which a pixel may leave the line between its neighbours: trust falls to 1 / e
+
 
 @dataclass(slots=True)
 class PoseDisagreement:
@@ -153,3 +158,36 @@ def computed_trust(depth_m: Float32, sigma_m: Float32) -> Float32:
     spread = sigma_m / np.maximum(depth_m, np.float32(1e-3))
     trust = np.minimum(1.0, (SURE_SPREAD / np.maximum(spread, np.float32(1e-6))) ** 2)
     return np.where((depth_m > 0) & (spread < MOST_SPREAD), trust, 0).astype(np.float32)
+
+
+def rendered_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) -> Float32:
+    """Fraction of its full weight that depth has which a field rendered.
+
+    It is a mean along each ray: where its samples disagree, at edges and where it guesses, it leaves the smooth surface
+    of its neighbours; and where the map has a surface, it has to lie near that. So trust falls with both differences.
+    Beyond the map a field mostly guesses: there many looks have to agree.
+
+    Args:
+        depth_m: (h, w) float32 rendered z, 0 = none.
+        map_depth_m: (h, w) float32 z of the map's surface in the same view, 0 = none.
+        truncation_m: Of the map; half of it away from its surface trust falls to 1 / e.
+
+    Returns:
+        (h, w) float32 in 0..1, 0 where nothing is to be fused.
+    """
+    roughness = np.maximum(_bend(depth_m, 0), _bend(depth_m, 1)) / np.maximum(depth_m, np.float32(1e-3))
+    cost = (roughness / ROUGHNESS) ** 2
+    off = 2 * (depth_m - map_depth_m) / truncation_m
+    cost += np.where(map_depth_m > 0, off * off, 0)
+    trust = np.where(map_depth_m > 0, MOST_TRUST, GUESS_TRUST) * np.exp(-cost)
+    return np.where((depth_m > 0) & (trust >= LEAST_TRUST), trust, 0).astype(np.float32)
+
+
+def _bend(depth_m: Float32, axis: int) -> Float32:
+    """How far each pixel lies from the line between its two neighbours along an axis; inf next to unknown ones."""
+    known = np.where(depth_m > 0, depth_m, np.inf)
+    padded = np.pad(known, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="reflect")
+    before, after = (padded[:-2], padded[2:]) if axis == 0 else (padded[:, :-2], padded[:, 2:])
+    with np.errstate(invalid="ignore"):
+        bend = np.abs(0.5 * (before + after) - known)
+    return np.where(np.isfinite(bend), bend, np.inf).astype(np.float32)

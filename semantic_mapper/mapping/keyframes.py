@@ -15,6 +15,7 @@ from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from semantic_mapper.view_selection import GUESSED_DEPTHS_M, LABELLED_VALUE, select_views, visible_points
 
+ROTATION_DEG = 12.0  # that a frame has turned from every keyframe near it, to become one
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
 NEARNESS_VALUE = 0.05  # breaks ties towards near views
 EncodedSize = tuple[tuple[int, ...], tuple[int, ...]]  # see ``EncodedViews.size``
@@ -69,7 +70,7 @@ class KeyframeStore:
         """
         own = np.array([size in (None, k.encoded.size) for k in self._keyframes], bool)
         moved, turned = pose_distances(self._poses()[own], T_world_camera)
-        near = (moved < self._config.translation_m) & (turned < self._config.rotation_deg)
+        near = (moved < self._config.translation_m) & (turned < ROTATION_DEG)
         return not near.any()
 
     def add(self, keyframe: Keyframe) -> None:
@@ -139,7 +140,7 @@ class KeyframeStore:
 
     def _drop_most_redundant(self) -> bool:
         """Drop the one nearest to another; what the camera has left behind counts as nearer than it is. False where
-        there is none to drop.
+        all have to stay.
 
         Without that, a long walk would thin out its few keyframes evenly, and leave no source views where it is.
         """

@@ -83,7 +83,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
         way_out: What errors advise where it cannot be found.
 
     Raises:
-        MapError: the maps do not fit each other, nothing can be told, or not for sure; says why.
+        MapError: the maps do not fit each other, nothing is found, or not for sure; says why.
     """
     check_fit(voxel_map.config, voxel_map.label_set, other.config, other.label_set)
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
@@ -102,10 +102,10 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
             seen.append(sighting(found.T_map_camera, place.T_world_camera, found.inliers))
     consensus = find_consensus(seen)
     if consensus.refusal:
-        told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        refused = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         raise MapError(
             f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
-            f"first ({told or 'none was refused'}), and {consensus.refusal}. {way_out}"
+            f"first ({refused or 'none was refused'}), and {consensus.refusal}. {way_out}"
         )
     T = agreed(consensus.agreeing)
     refined = _refine(voxel_map, other, T)

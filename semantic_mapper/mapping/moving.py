@@ -7,7 +7,7 @@ has come there. So a thing that stays becomes part of the map after this time, w
 A cell of ``CELLS`` across the image has the nearest depth of its pixels. It contradicts a view where all that the view
 measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things and depth edges
 say nothing. Poses that are off by a few centimetres would look like motion: a frame is first aligned with views of
-these seconds (``view_alignment.py``). Where that does not fit, or what it changes leaps from frame to frame, the poses
+these seconds. Where that does not fit, or what it changes leaps from frame to frame, the poses
 are wrong and nothing is found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows,
 cell by cell, along its own surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside,
 which it hid itself.
@@ -15,6 +15,11 @@ which it hid itself.
 Not found: what moves away along the line of sight (it hid the space where it is now), what had moved before it was seen
 for the first time, and what is slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through
 it (``fusion/clearing.py``).
+
+Alignment is Gauss-Newton from point to plane on small depth images, with a prior that the given pose is right to within
+``SIGMA_M`` and ``SIGMA_RAD``: a pose that jitters or drifts is corrected, one that jumps is not, and ``misfit`` tells.
+Most of what moves is no part of it: it is farther from what was there than residuals that count. Wider ``CUTS`` correct
+more, and people who walk pull at the pose.
 """
 
 from __future__ import annotations
@@ -27,9 +32,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.config import MapperConfig
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import invert_pose, transform
-from semantic_mapper.mapping.view_alignment import Alignment, SlopedViews, align_pose, depth_slopes
-from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame
+from semantic_mapper.imaging import FrameViews, is_measured
+from semantic_mapper.labels import MOVING_NAMES, LabelSet
+from semantic_mapper.log_events import get_logger, is_power_of_two
+from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame, UInt8
 
 BEYOND_M = np.float32(1e4)  # depth of what is left out, where no depth would mean free space
 CELLS = 80  # across the longer side of the image
@@ -50,6 +59,26 @@ STRIDE = 3  # pixels: 2 cm at 3 m, as voxels are
 _FULL = 0.5  # fraction of the pixels of a cell that are measured, for it to say that space is free
 _SECOND = 1_000_000_000
 _EVERY_NS = round(EVERY_S * _SECOND)
+CUTS = (1.0, 1.0, 0.5)  # margins within which residuals count, by iteration
+SIGMA_M, SIGMA_RAD = 0.05, 0.026
+_SIGMA_DEPTH_M, _INDEPENDENT = 0.03, 60.0  # of depth, and how many residuals are as good as independent
+_EDGE = 0.1  # change of depth from cell to cell, as a fraction of it, from which on it is no surface
+LEAST_POINTS, LEAST_FRACTION = 30, 0.2  # on surfaces that views saw: to judge at all; of those compared, to fit
+_NEAREST_M = 0.1
+EDGE_PX = 2  # around what moves, where depth may be between it and what is behind
+
+RECENT = 30  # frames that a warning is about
+MUCH = 0.3  # fraction of the pixels; where half of the frames leave out more, people are warned
+POSES_OFF = (
+    "moving: poses do not fit the depth of the seconds before, so nothing is left out as moving: check their stamps, "
+    "T_world_camera or T_base_camera and the calibration; moving.motion = false ends the search"
+)
+MUCH_LEFT_OUT = (
+    f"moving: more than {MUCH:.0%} of the pixels are left out as moving and not mapped: either something fills the "
+    "picture, or poses drift: check them against the map; moving.motion = false maps what does not move by its class"
+)
+
+_log = get_logger(__name__)
 
 
 class MovingSpace:
@@ -88,6 +117,93 @@ class MovingSpace:
     def points(self) -> Float32:
         """(N, 3) in the world, metres."""
         return np.concatenate([np.empty((0, 3), np.float32), *(points for _, points in self._parts)])
+
+
+class MovingFilter:
+    """Of one map.
+
+    Args:
+        config: Of the mapper.
+        label_set: Of the map.
+
+    Attributes:
+        pixels: Left out so far.
+        space: Where what moves was within the last second.
+        uses_classes: Whether classes of ``label_set`` move.
+        warning: What is wrong with the last ``RECENT`` frames and how to fix it, for people; empty where all is well.
+
+    Raises:
+        ConfigError: ``moving.classes``, and none of the classes does.
+    """
+
+    def __init__(self, config: MapperConfig, label_set: LabelSet) -> None:
+        self._config = config
+        self._motion = MotionDetector(config.voxel_map.depth_max_m)
+        self._ids = label_set.moving_ids() if config.moving.classes else ()
+        if config.moving.classes and not self._ids:
+            names = ", ".join(sorted(MOVING_NAMES))
+            raise ConfigError(
+                f"moving.classes: none of the classes of '{label_set.name}' moves by itself ({names} would); use "
+                "weights that know one (`rooms-people` ship), or moving.motion"
+            )
+        self.pixels = 0
+        self.warning = ""
+        self._recent: deque[tuple[bool, float]] = deque(maxlen=RECENT)  # whether poses fit; fraction that moves
+        self._warned = 0
+        self.space = MovingSpace()
+
+    @property
+    def uses_classes(self) -> bool:
+        """Whether classes of the map move by themselves."""
+        return bool(self._ids)
+
+    def looks_at(self, frame: PosedFrame) -> bool:
+        """Whether anything is looked for in a frame: a sensor has to have measured its depth."""
+        return (self._config.moving.motion or self._config.moving.classes) and is_measured(frame)
+
+    def find(self, frame: PosedFrame) -> Bool:
+        """Pixels (H, W) of what moves by depth, of a frame whose depth was measured."""
+        return self._motion.find(frame) if self._config.moving.motion else np.zeros(frame.rgb.shape[:2], np.bool_)
+
+    def of_classes(self, label: UInt8) -> Bool:
+        """Pixels (H, W) whose class moves by itself."""
+        return np.isin(label, self._ids)
+
+    def note(self, frame: PosedFrame, moving: Bool) -> None:
+        """Count what was left out of a frame (its depth as it came), and keep for a second where that was."""
+        self.pixels += int(moving.sum())
+        self.space.add(frame, moving)
+        self._recent.append((self._motion.poses_fit, float(moving.mean())))
+        before, self.warning = self.warning, self._find_warning()
+        if self.warning and self.warning != before:
+            self._warned += 1
+            if is_power_of_two(self._warned):
+                _log.warning("motion_is_uncertain", seq=frame.seq, camera=frame.camera_id, reason=self.warning)
+
+    def _find_warning(self) -> str:
+        fit, fraction = np.array(self._recent).T
+        if len(fit) < RECENT:
+            return ""
+        if fit.mean() < 0.5:
+            return POSES_OFF
+        return MUCH_LEFT_OUT if np.median(fraction) > MUCH else ""
+
+    def leave_out(self, views: FrameViews, moving: Bool) -> FrameViews:
+        """The frame without depth where it shows what moves, and at its edges: neither surface nor seen through."""
+        if not moving.any():
+            return views
+        depth_m = views.frame.depth_m
+        assert depth_m is not None
+        nothing = BEYOND_M if self._config.voxel_map.no_return_range_m > 0 else np.float32(0)
+        wider = cv2.dilate(moving.astype(np.uint8), np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)) > 0
+        return views.with_depth(np.where(wider, nothing, depth_m))
+
+    def clear(self) -> None:
+        """Forget the last seconds: poses of frames to come are in another world."""
+        self._motion.clear()
+        self.space.clear()
+        self._recent.clear()
+        self.warning = ""
 
 
 class _Cells(NamedTuple):
@@ -297,7 +413,7 @@ _NEIGHBOURS = (
 
 
 def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> NDArray[np.bool_]:
-    """Pixels (H, W) of moving cells and those beside them that are as near as what moves there."""
+    """Pixels (H, W) of moving cells and those next to them that are as near as what moves there."""
     if not moving.any():
         return np.zeros(depth.shape, np.bool_)
     farthest = np.where(moving, cells.inside * (1 + STEP_PER_M) + STEP_M, 0).astype(np.float32)
@@ -310,3 +426,106 @@ def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> NDArray[np.bool_]:
     inside = (tiles < farthest[:, None, :, None]) & (tiles > nearest[:, None, :, None]) & (tiles > 0)
     found[:h, :w] = inside.reshape(h, w)
     return found
+
+
+class Alignment(NamedTuple):
+    """Where a pose is by what views saw.
+
+    Args:
+        T_world_camera: (4, 4) corrected; as given where it does not fit or cannot be compared.
+        moved: (6,) by how much: translation, metres, and rotation, radians, in the camera.
+        misfit: Median distance of points from the surface that views saw, in margins; points in front of it by more
+            than a margin do not count. inf where most is elsewhere, 0 where there is too little to compare with.
+    """
+
+    T_world_camera: Float64
+    moved: Float64
+    misfit: float
+
+
+class SlopedViews(NamedTuple):
+    """V views of one size.
+
+    Args:
+        T_camera_world: (V, 4, 4).
+        focal, centre: (V, 2) in cells, whose centres have whole numbers.
+        slopes: (V, 3, h, w) of ``depth_slopes``.
+    """
+
+    T_camera_world: Float64
+    focal: Float32
+    centre: Float32
+    slopes: Float32
+
+
+def depth_slopes(depth_m: Float32) -> Float32:
+    """(3, h, w) depth, metres, and its change from cell to cell along rows and columns; NaN at edges and holes.
+
+    Args:
+        depth_m: (h, w) 0 = none.
+    """
+    z = np.where(depth_m > 0, depth_m, np.float32(np.nan))
+    slopes = np.full((3, *z.shape), np.nan, np.float32)
+    slopes[0, 1:-1, 1:-1] = z[1:-1, 1:-1]
+    slopes[1, :, 1:-1] = (z[:, 2:] - z[:, :-2]) / 2
+    slopes[2, 1:-1] = (z[2:] - z[:-2]) / 2
+    slopes[0, ~(np.abs(slopes[1]) + np.abs(slopes[2]) < _EDGE * z)] = np.nan  # and where it is NaN
+    return slopes
+
+
+def align_pose(points: Float32, T_world_camera: Float64, views: SlopedViews, margin: tuple[float, float]) -> Alignment:
+    """Correct a pose by what views saw.
+
+    Args:
+        points: (N, 3) that the frame measured, in its camera, metres.
+        T_world_camera: (4, 4) as given.
+        views: To align with.
+        margin: Metres, and metres a metre of depth: residuals beyond ``CUTS`` of it are something else.
+    """
+    T, moved, misfit = T_world_camera, np.zeros(6), np.inf
+    prior = np.repeat((SIGMA_M**-2, SIGMA_RAD**-2), 3)
+    for cut in CUTS:
+        jacobian, residual, weight, misfit = _residuals(points, T, views, margin, cut)
+        if not len(residual):
+            return Alignment(T_world_camera, np.zeros(6), misfit)
+        scale = _INDEPENDENT / (weight.sum() * _SIGMA_DEPTH_M**2)
+        weighted = (scale * weight)[:, None] * jacobian
+        change = np.linalg.solve(weighted.T @ jacobian + np.diag(prior), -weighted.T @ residual - prior * moved)
+        moved += change
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = cv2.Rodrigues(change[3:])[0], change[:3]
+        T = T @ step
+    return Alignment(T, moved, misfit)
+
+
+def _residuals(
+    points: Float32, T_world_camera: Float64, views: SlopedViews, margin: tuple[float, float], cut: float
+) -> tuple[Float64, Float64, Float64, float]:
+    """Of points that count: d residual / d (translation, rotation) (M, 6) in the camera, residual (M,), weight (M,);
+    and the misfit of all."""
+    T_view_camera = views.T_camera_world @ T_world_camera
+    R = T_view_camera[:, :3, :3].astype(np.float32)
+    p = R @ points.T + T_view_camera[:, :3, 3:].astype(np.float32)  # V 3 N
+    xy = p[:, :2] / np.maximum(p[:, 2:], _NEAREST_M) * views.focal[..., None] + views.centre[..., None]
+    cell = np.rint(xy).astype(np.int32)
+    h, w = views.slopes.shape[2:]
+    x, y = cell[:, 0], cell[:, 1]
+    view, number = np.nonzero((p[:, 2] > _NEAREST_M) & (x >= 0) & (y >= 0) & (x < w) & (y < h))
+    depth, along_x, along_y = views.slopes.transpose(1, 0, 2, 3)[:, view, y[view, number], x[view, number]]
+    off = xy[view, :, number] - cell[view, :, number]
+    q = p[view, :, number]  # M 3
+    residual = depth + along_x * off[:, 0] + along_y * off[:, 1] - q[:, 2]  # NaN at edges
+    relative = residual / (margin[0] + margin[1] * q[:, 2])
+    fits, compared = int((np.abs(relative) < 1).sum()), int(np.isfinite(relative).sum())
+    if fits < max(LEAST_POINTS, LEAST_FRACTION * compared):
+        return np.empty((0, 6)), np.empty(0), np.empty(0), np.inf if compared >= LEAST_POINTS else 0.0
+    misfit = float(np.median(np.abs(relative[relative < 1])))
+    use = np.abs(relative) < cut
+    q, view, number, residual = q[use], view[use], number[use], residual[use]
+    slope = np.stack((along_x[use], along_y[use]), axis=1) * views.focal[view] / q[:, 2:]
+    normal = np.concatenate((slope, -1 - (slope * q[:, :2]).sum(axis=1, keepdims=True) / q[:, 2:]), axis=1)
+    # A slanted surface, and a distant one, is less sure; what nears the cut counts less.
+    weight = (1 - (relative[use] / cut) ** 2) ** 2 / ((normal**2).sum(axis=1) * q[:, 2] ** 2)
+    normal = np.einsum("mi,mij->mj", normal, R[view])  # in the camera of the frame
+    jacobian = np.concatenate((normal, np.cross(points[number], normal)), axis=1)
+    return jacobian.astype(np.float64), residual.astype(np.float64), weight.astype(np.float64), misfit

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,25 +21,28 @@ from semantic_mapper.fields.base import EncodedViews, SemanticField, check_class
 from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
-from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, resize_spread, working_intrinsics
+from semantic_mapper.imaging import (
+    FrameViews,
+    fill_holes,
+    is_measured,
+    resize_label,
+    resize_spread,
+    working_intrinsics,
+)
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import MAX_FEATURES, make_place
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction.corrected_map import CorrectedPoses, CorrectionStatus, MapCorrector
-from semantic_mapper.mapping.correction.history import FusedFrame
-from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust
-from semantic_mapper.mapping.fusion.depth_trust import depth_trust
-from semantic_mapper.mapping.fusion.vote_fusion import add_votes
+from semantic_mapper.mapping.correction import CorrectionStatus, FusedFrame, MapCorrector
+from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust, rendered_trust
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
-from semantic_mapper.mapping.moving import BEYOND_M
-from semantic_mapper.mapping.moving_filter import MovingAgain, MovingFilter
+from semantic_mapper.mapping.map_types import CorrectedPoses
+from semantic_mapper.mapping.moving import BEYOND_M, MovingFilter
 from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.mapping.pose_check import PoseCheck
-from semantic_mapper.mapping.views.own_image import add_own_image
 from semantic_mapper.mapping.views.upsample import upsample
-from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
-from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
+from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer, add_own_image
+from semantic_mapper.mapping.views.virtual_views import RenderedVirtualView, ViewpointChooser, add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.mapping.worlds import Whereabouts
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
@@ -52,6 +56,24 @@ SURE = 0.8  # confidence from which on the map is believed where another field i
 COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
 
 
+class _FullSize(NamedTuple):
+    """A rendered view at the size of its frame.
+
+    Args:
+        views: The frame, without what moves.
+        depth_m: (H, W) to fuse.
+        rows: (H, W) which coarse pixel each pixel takes its probabilities from, -1 = unknown.
+        trust: (H, W) in depth; None = full.
+        moving: (H, W) what was left out because it moves; None = nothing was looked for.
+    """
+
+    views: FrameViews
+    depth_m: Float32
+    rows: NDArray[np.int32]
+    trust: Float32 | None
+    moving: Bool | None = None
+
+
 class MappingPipeline:
     """Keyframes, view choice, rendering and fusion behind one ``step``.
 
@@ -62,6 +84,11 @@ class MappingPipeline:
         field: Renders semantics; its classes must be those of ``label_set``.
         label_set: Classes of the map.
         anchors: Labelled keyframes that the field was finetuned on; they are source views from the first frame on.
+
+    Attributes:
+        whereabouts: Of the last frame of a session.
+        picture_check: What was wrong with pictures that depth was to be computed from, and between them and their
+            poses.
 
     Raises:
         WeightsError: the field renders other classes than the map holds.
@@ -82,18 +109,22 @@ class MappingPipeline:
         self.voxel_map = VoxelMap(config.voxel_map, label_set)
         self.keyframes = KeyframeStore(config.keyframes)
         self._frame_depth = FrameDepth(config.depth, self._cast_for_hint)
+        self.picture_check: PictureCheck = self._frame_depth.pictures
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
         self.moving = MovingFilter(config, label_set)
-        self.whereabouts = Whereabouts()  # of the last frame of a session
-        self._viewpoints = ViewpointChooser(config.virtual, config.seed)
-        self._steps = 0
+        self.whereabouts = Whereabouts()
+        self._viewpoints = ViewpointChooser(config.seed)
+        self._uses_own_view = config.keyframes.use_current_view
+        self._own_image_weight = config.keyframes.own_image_weight if self._uses_own_view else 0.0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
-        self._own_image_weight = config.keyframes.own_image_weight if config.keyframes.use_current_view else 0.0
-        self.corrector = MapCorrector(config.history, self.voxel_map, self.keyframes, self._fuse_again, self.moving)
+        self.corrector = MapCorrector(
+            config.history, self.voxel_map, self.keyframes, self._fuse_again, self.moving.clear
+        )
+        self._steps = 0
         self._intrinsics: dict[str, CameraIntrinsics] = {}
         self._odd_sizes: dict[str, tuple[tuple[int, int], int]] = {}
         self._stage_ms: dict[str, float] = {}
-        self._told_sizes = False
+        self._warned_of_sizes = False
         for anchor in anchors:
             self.keyframes.add(self.encode_anchor(anchor))
 
@@ -107,9 +138,32 @@ class MappingPipeline:
             ConfigError: ``depth.from_motion.delay_frames`` is not 0, and the frame does not come from ``prepare``.
         """
         (frame,) = self.prepare(frame) if self._delay_frames == 0 else (self._prepared(frame),)
-        self.corrector.make_room()
-        with self.corrector.turn:
-            return self._map_frame(self.corrector.place(frame))
+        with self.corrector.lock:
+            self.corrector.make_room()
+            frame = self.corrector.place(frame)
+            self._check(frame)
+            self._stage_ms = {}
+            views = FrameViews(frame)
+            with self._stage("encode"):
+                current = self._encode(views)
+            with self._stage("choose"):
+                sources = self._choose_sources(views, current.size)
+            with self._stage("render"):
+                view = self._render(views, self._with_own(sources, current), self.config.render.scale)
+                votes = add_own_image(view, self.field, current, self._own_image_weight)
+            moving = self._find_moving(frame)
+            with self._stage("upsample"):
+                full = self._upsample_still(views, votes, moving)
+            with self._stage("fuse"):
+                touched = self._fuse(self.voxel_map, full, votes)
+            if self.corrector.records:
+                with self._stage("history"):
+                    rendered = votes.probabilities, votes.known, votes.depth_m
+                    self.corrector.record(FusedFrame(full.views.frame, *rendered))
+            with self._stage("keyframe"):
+                is_keyframe = self._keep_view(full.views, current, sources)
+            self._note_step(frame)
+            return self._update(frame, view, full, sources, is_keyframe, touched)
 
     def prepare(self, frame: PosedFrame) -> list[PosedFrame]:
         """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first.
@@ -132,11 +186,6 @@ class MappingPipeline:
         """Median distance in pixels of corners from where given poses have them, and where refined poses do, of the
         last frames whose depth was computed; None where there were none."""
         return self._frame_depth.disagreement.medians
-
-    @property
-    def picture_check(self) -> PictureCheck:
-        """What was wrong with pictures that depth was to be computed from, and between them and their poses."""
-        return self._frame_depth.pictures
 
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None) -> CorrectionStatus:
         """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
@@ -166,27 +215,27 @@ class MappingPipeline:
         """Carry a correction on by this many frames of the history; see ``MapCorrector.advance``."""
         return self.corrector.advance(max_frames)
 
-    def look_around(self, views: int = 1) -> tuple[VirtualLook, ...]:
-        """Look at the map from where no camera stood: render the views of most gain and fuse what they say of classes.
+    def render_virtual_views(self, views: int = 1) -> tuple[RenderedVirtualView, ...]:
+        """Render the map from where no camera stood, the views of most gain, and fuse what they say of classes.
 
         For when there is time to spare; every view takes about that of a frame. Nothing is measured: TSDF, colours and
-        ``frames`` stay as they are. Deterministic, as part of the sequence of steps and looks.
+        ``frames`` stay as they are. Deterministic, as part of the sequence of steps and virtual views.
 
-        The history keeps frames alone, so a correction of poses rebuilds the map without the votes of these views,
-        save those that were in the map when its oldest frames were frozen; afterwards all may be looked at again.
+        The history keeps frames alone, so a correction of poses rebuilds the map without the votes of these views;
+        afterwards all may be looked at again.
 
         Args:
             views: At most this many.
 
         Returns:
-            What was looked at, empty where no view is worth its time: no frame mapped yet, too few keyframes, or all
+            What was rendered, empty where no view is worth its time: no frame mapped yet, too few keyframes, or all
             that they see is clear or was looked at.
         """
-        looks: list[VirtualLook] = []
-        with self.corrector.turn:
-            while len(looks) < views and (look := self._look_once()) is not None:
-                looks.append(look)
-        return tuple(looks)
+        rendered: list[RenderedVirtualView] = []
+        with self.corrector.lock:
+            while len(rendered) < views and (view := self._render_virtual_view()) is not None:
+                rendered.append(view)
+        return tuple(rendered)
 
     def encode_anchor(self, anchor: PosedFrame) -> Keyframe:
         """A labelled keyframe that a field was finetuned on, as ``exchange_field`` takes it."""
@@ -222,9 +271,8 @@ class MappingPipeline:
         frame = self.corrector.place(frame)
         resized = FrameViews(frame)
         current = self._encode(resized)
-        own = [current] if self.config.keyframes.use_current_view else []
-        sources = [k.encoded for k in self._choose_sources(resized, current.size, keyframes)]
-        view = self._render(resized, [*sources, *own], self.config.render.scale, renderer)
+        sources = self._choose_sources(resized, current.size, keyframes)
+        view = self._render(resized, self._with_own(sources, current), self.config.render.scale, renderer)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
         seen = self.voxel_map.ray_cast(frame.T_world_camera, low)
         sure = view.known & (seen.confidence >= SURE) & (seen.label != self.label_set.ignore_id)
@@ -238,7 +286,7 @@ class MappingPipeline:
         label = self.label_set.to_ids(view.probabilities.argmax(axis=2))
         return np.where(view.known, label, np.uint8(self.label_set.ignore_id)).astype(np.uint8)
 
-    def _look_once(self) -> VirtualLook | None:
+    def _render_virtual_view(self) -> RenderedVirtualView | None:
         known = [k for k in self.keyframes.keyframes if k.camera_id in self._intrinsics]
         if not known:
             return None
@@ -264,74 +312,90 @@ class MappingPipeline:
         resized = FrameViews(frame)
         sources = self._choose_sources(resized, size)
         rendered = self._render(resized, [k.encoded for k in sources], self.config.render.scale / fraction)
-        depth, rows, _ = self._lift(resized, rendered, self.voxel_map)
-        table = rendered.probabilities.reshape(-1, len(self.label_set)), rows
-        blocks = add_votes(self.voxel_map, view.T_world_camera, smaller, depth, table, self.config.virtual)
-        return VirtualLook(view, tuple(k.seq for k in sources), blocks)
+        full = self._upsample(resized, rendered, self.voxel_map)
+        table = rendered.probabilities.reshape(-1, len(self.label_set)), full.rows
+        blocks = add_votes(self.voxel_map, view.T_world_camera, smaller, full.depth_m, table)
+        return RenderedVirtualView(view, tuple(k.seq for k in sources), blocks)
 
-    def _map_frame(self, frame: PosedFrame) -> MapUpdate:
-        self._check(frame)
-        self._stage_ms = {}
-        resized = FrameViews(frame)
-        with self._stage("encode"):
-            current = self._encode(resized)
-        with self._stage("choose"):
-            sources = self._choose_sources(resized, current.size)
-        with self._stage("render"):
-            own = [current] if self.config.keyframes.use_current_view else []
-            view = self._render(resized, [*(k.encoded for k in sources), *own], self.config.render.scale)
-            votes = add_own_image(view, self.field, current, self._own_image_weight)
-        seen, by_motion, by_class = frame, None, None
-        if self.moving.on and is_measured(frame):
-            with self._stage("motion"):
-                by_motion = self.moving.find(frame)
-                if by_motion.any():
-                    frame = self.moving.leave_out(seen, by_motion)
-                    resized = FrameViews(frame)
-        with self._stage("lift"):
-            depth, rows, trust = self._lift(resized, votes, self.voxel_map)
-            if by_motion is not None and self.moving.uses_classes:
-                own, _ = self._at_rows(votes.probabilities.reshape(-1, len(self.label_set)), rows)
-                by_class = self.moving.of_classes(own)
-                if (by_class & ~by_motion).any():
-                    frame = self.moving.leave_out(seen, by_motion | by_class)
-                    resized = FrameViews(frame)
-                    depth, rows, trust = self._lift(resized, votes, self.voxel_map)
-        moving = by_motion if by_motion is None or by_class is None else by_motion | by_class
-        if moving is not None:
-            self.moving.note(seen, moving)
-        with self._stage("fuse"):
-            measured = is_measured(frame)
-            table = votes.probabilities.reshape(-1, len(self.label_set))
-            touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust, measured=measured)
-        if self.corrector.records:
-            with self._stage("history"):
-                rendered = votes.probabilities, votes.known, votes.depth_m
-                self.corrector.record(FusedFrame(seen, *rendered, by_motion, by_class))
-        with self._stage("keyframe"):
-            is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
-            if is_keyframe:
-                keyframe = self._make_keyframe(resized, current)
-                if is_measured(frame):  # computed depth follows from the poses and cannot contradict them
-                    self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
-                self.keyframes.add(keyframe)
-            self._keep_place(frame)
+    def _find_moving(self, frame: PosedFrame) -> Bool | None:
+        """Pixels (H, W) of what moves by depth; None where nothing is looked for."""
+        if not self.moving.looks_at(frame):
+            return None
+        with self._stage("motion"):
+            return self.moving.find(frame)
+
+    def _upsample_still(self, views: FrameViews, votes: RenderedView, moving: Bool | None) -> _FullSize:
+        """The view at full size, without what moves by depth or by class."""
+        if moving is None:
+            return self._upsample(views, votes, self.voxel_map)
+        full = self._upsample(self.moving.leave_out(views, moving), votes, self.voxel_map)
+        if self.moving.uses_classes:
+            label, _ = self._at_rows(votes, full.rows)
+            by_class = self.moving.of_classes(label)
+            if (by_class & ~moving).any():
+                moving = moving | by_class
+                full = self._upsample(self.moving.leave_out(views, moving), votes, self.voxel_map)
+        self.moving.note(views.frame, moving)
+        return full._replace(moving=moving)
+
+    def _fuse(self, voxel_map: VoxelMap, full: _FullSize, votes: RenderedView) -> int:
+        """Integrate a frame into a map; blocks touched."""
+        frame, table = full.views.frame, votes.probabilities.reshape(-1, len(self.label_set))
+        measured = is_measured(frame)
+        return voxel_map.integrate(frame, full.depth_m, table, rows=full.rows, trust=full.trust, measured=measured)
+
+    def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame) -> None:
+        """Integrate a frame of the history into a map."""
+        view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
+        self._fuse(voxel_map, self._upsample(FrameViews(fused.frame), view, voxel_map), view)
+
+    def _keep_view(self, views: FrameViews, current: EncodedViews, sources: Sequence[Keyframe]) -> bool:
+        """Keep a frame as a source view, and as a place that the map is found again by, where it shows something new;
+        whether it became a source view."""
+        frame = views.frame
+        is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
+        if is_keyframe:
+            keyframe = self._make_keyframe(views, current)
+            if is_measured(frame):  # computed depth follows from the poses and cannot contradict them
+                self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
+            self.keyframes.add(keyframe)
+        places, pose = self.voxel_map.places, frame.T_world_camera
+        if self.config.keyframes.save_places and is_measured(frame) and places.wants(pose):
+            assert frame.depth_m is not None
+            found = find_place_features(frame.rgb, frame.depth_m, MAX_FEATURES)
+            places.add(make_place(frame.camera_id, frame.stamp_ns, pose, found, frame.intrinsics))
+        return is_keyframe
+
+    def _note_step(self, frame: PosedFrame) -> None:
+        """Take note of a frame that is in the map, and render virtual views where they are due."""
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
-        label, confidence = self._at_rows(view.probabilities.reshape(-1, len(self.label_set)), rows)
         spent = self._stage_ms
         self._renderer.note(spent["render"], sum(spent.values()) - spent["render"])
         self._steps += 1
-        virtual = self.config.virtual
-        if virtual.every_n_frames and self._steps % virtual.every_n_frames == 0:
+        every = self.config.virtual.every_n_frames
+        if every and self._steps % every == 0:
             with self._stage("virtual"):
                 try:
-                    self.look_around(virtual.views)
+                    self.render_virtual_views()
                 except FrameError as error:  # the frame itself is in the map
                     _log.warning("virtual_view_refused", seq=frame.seq, reason=str(error))
-        told_m = depth if moving is None or seen.depth_m is None else np.where(moving, seen.depth_m, depth)
+
+    def _update(
+        self,
+        frame: PosedFrame,
+        view: RenderedView,
+        full: _FullSize,
+        sources: Sequence[Keyframe],
+        is_keyframe: bool,
+        touched: int,
+    ) -> MapUpdate:
+        label, confidence = self._at_rows(view, full.rows)
+        depth_m = full.depth_m
+        if full.moving is not None and frame.depth_m is not None:
+            depth_m = np.where(full.moving, frame.depth_m, depth_m)
         if self.config.voxel_map.no_return_range_m > 0:
-            told_m = np.where(told_m == BEYOND_M, np.float32(0), told_m)
+            depth_m = np.where(depth_m == BEYOND_M, np.float32(0), depth_m)
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -341,24 +405,14 @@ class MappingPipeline:
             source_seqs=tuple(k.seq for k in sources),
             label=label,
             confidence=confidence,
-            depth_m=told_m,
+            depth_m=depth_m,
             blocks=self.voxel_map.block_count,
             blocks_touched=touched,
             rays=view.rays,
             samples=view.samples,
             stage_ms=self._stage_ms,
-            moving=moving,
+            moving=full.moving,
         )
-
-    def _keep_place(self, frame: PosedFrame) -> None:
-        """Note what the map can be found again by, where a view with measured depth shows a new place."""
-        places = self.voxel_map.places
-        if not self.config.keyframes.save_places or frame.depth_m is None or not is_measured(frame):
-            return
-        if places.wants(frame.T_world_camera):
-            found = find_place_features(frame.rgb, frame.depth_m, MAX_FEATURES)
-            pose = frame.T_world_camera
-            places.add(make_place(frame.camera_id, frame.stamp_ns, pose, found, frame.intrinsics))
 
     @property
     def _delay_frames(self) -> int:
@@ -448,15 +502,15 @@ class MappingPipeline:
         config = self.config.keyframes
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
         depth = resized.depth(intrinsics)
-        count = config.source_views - (1 if config.use_current_view else 0)
+        count = config.source_views - int(self._uses_own_view)
         store = self.keyframes if keyframes is None else keyframes
         # Cameras of another shape have feature maps of another size; one render takes views of one size.
         chosen = store.choose(frame.T_world_camera, intrinsics, depth, count, size)
         if not chosen and self._holds_scene:  # what it says does not depend on the views
             chosen = [k for k in store.keyframes if k.encoded.size == size][-1:]
         others = sum(k.encoded.size != size for k in store.keyframes)
-        if others and not self._told_sizes:
-            self._told_sizes = True
+        if others and not self._warned_of_sizes:
+            self._warned_of_sizes = True
             _log.warning(
                 "source_views_left_out",
                 reason="keyframes were encoded at another size than this frame",
@@ -506,43 +560,34 @@ class MappingPipeline:
             return depth
         return fill_holes(self.voxel_map.ray_cast(frame.T_world_camera, intrinsics).depth_m)
 
-    def _lift(
-        self, resized: FrameViews, view: RenderedView, voxel_map: VoxelMap
-    ) -> tuple[Float32, NDArray[np.int32], Float32 | None]:
-        """Full-size depth to fuse, which coarse pixel each pixel takes its probabilities from, and trust in depth."""
-        frame = resized.frame
+    def _with_own(self, sources: Sequence[Keyframe], current: EncodedViews) -> list[EncodedViews]:
+        """Source views as they are rendered from, the frame itself among them where the settings say so."""
+        return [*(k.encoded for k in sources), *([current] if self._uses_own_view else [])]
+
+    def _upsample(self, views: FrameViews, view: RenderedView, voxel_map: VoxelMap) -> _FullSize:
+        """A rendered view at the size of its frame."""
+        frame = views.frame
         size = (frame.intrinsics.width, frame.intrinsics.height)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
-        rgb_low, depth_low = resized.rgb(low), resized.depth(low)
         if frame.depth_m is None:
             map_depth = voxel_map.ray_cast(frame.T_world_camera, low).depth_m
-            low_trust = depth_trust(view.depth_m, map_depth, voxel_map.truncation_m)
+            low_trust = rendered_trust(view.depth_m, map_depth, voxel_map.truncation_m)
             trust = np.asarray(cv2.resize(low_trust, size, interpolation=cv2.INTER_NEAREST), np.float32)
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
-            depth, trust = resized.depth(frame.intrinsics), None
+            depth, trust = views.depth(frame.intrinsics), None
             if self.config.voxel_map.no_return_range_m > 0:  # what is left out is no free space
                 depth = np.where(frame.depth_m == BEYOND_M, BEYOND_M, depth)
             if frame.depth_sigma_m is not None:
                 trust = computed_trust(depth, frame.depth_sigma_m)
-        return depth, upsample(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth), trust
+        rows = upsample(view.probabilities, view.known, views.rgb(low), views.depth(low), frame.rgb, depth)
+        return _FullSize(views, depth, rows, trust)
 
-    def _at_rows(self, table: Float32, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
-        """Class ids and confidence (H, W) of what the pixels take from a table (K, L); row -1 is unknown."""
+    def _at_rows(self, view: RenderedView, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
+        """Class ids and confidence (H, W) of what the pixels take from a view; row -1 is unknown."""
+        table = view.probabilities.reshape(-1, len(self.label_set))
         ids = np.append(self.label_set.to_ids(table.argmax(axis=1)), np.uint8(self.label_set.ignore_id))
         return ids[rows], np.append(table.max(axis=1), np.float32(0))[rows]
-
-    def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame, again: MovingAgain) -> None:
-        frame = fused.frame
-        if fused.moves_by_motion is not None:
-            by_class = fused.moves_by_class
-            none = np.zeros_like(fused.moves_by_motion)
-            frame = again.without_moving(frame, fused.moves_by_motion, none if by_class is None else by_class)
-        view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
-        depth, rows, trust = self._lift(FrameViews(frame), view, voxel_map)
-        table = view.probabilities.reshape(-1, len(self.label_set))
-        measured = is_measured(frame)
-        voxel_map.integrate(frame, depth, table, rows=rows, trust=trust, measured=measured)
 
     def _make_keyframe(self, resized: FrameViews, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
         frame = resized.frame
@@ -551,8 +596,3 @@ class MappingPipeline:
         return Keyframe(
             frame.seq, frame.stamp_ns, frame.T_world_camera, intrinsics, depth, encoded, labelled, frame.camera_id
         )
-
-
-def is_measured(frame: PosedFrame) -> bool:
-    """Whether a sensor measured the depth of a frame."""
-    return frame.depth_m is not None and frame.depth_sigma_m is None

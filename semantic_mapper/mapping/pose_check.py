@@ -43,7 +43,7 @@ PAIR_WINDOW = 128  # newest pairs that count: those of about 20 keyframes
 MIN_KEYFRAMES = 6  # that were compared, before anything is said
 MIN_PIXELS = 100
 MIN_PAIRS = 32  # before contradicting ones are counted
-PARTNERS = 3  # earlier keyframes that a new one is compared with, beside the newest
+PARTNERS = 3  # earlier keyframes that a new one is compared with, next to the newest
 OLDEST = 4  # of its neighbourhood, as many again
 NEIGHBOURS_M, NEIGHBOURS_DEG = 2.0, 40.0  # what counts as its neighbourhood
 FAR = 2  # times the range of the map; depth beyond may be noise
@@ -52,7 +52,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _REP_103 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # T_body_camera
 ALIKE = 0.8  # of the overlap that keyframes have as they are; a cause that leaves less has but moved them apart
 
-# What is often wrong with a recording, as the change that would mend it.
+# What is often wrong with a recording, as the change that would fix it.
 _CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
     ("poses inverted (they are T_camera_world; T_world_camera is needed)", invert_pose, 1.0),
     ("camera axes turned from OpenGL's (y up, z backward) to OpenCV's", lambda T: T @ _OPENGL, 1.0),
@@ -73,7 +73,7 @@ class PoseCheck:
         compared: Keyframes that overlap with earlier ones and were compared.
         worst: Largest ``recent`` so far; None before ``MIN_KEYFRAMES``.
         worst_contradicting: Largest ``contradicting`` so far; None before ``MIN_KEYFRAMES``.
-        warning: What is wrong and how to mend it, for people; empty where all is well. Stays once it is there, as the
+        warning: What is wrong and how to fix it, for people; empty where all is well. Stays once it is there, as the
             map keeps what was fused.
     """
 

@@ -1,9 +1,13 @@
 """Refining a map: a network that has seen many maps corrects what the votes say, and labels surface without votes.
 
 The map is read in tiles, so that memory does not grow with it. The network sees 1.9 m far, and tiles overlap by that.
-What it answers is written back as evidence that reads as exactly that (``views/readout.py``). TSDF, colour and weights
-stay as they are, bit for bit. Weights that know where centres of objects are also tell which voxels are one thing
-(``thing_grouping``): some 30 bytes for each voxel of a thing are held until the end for that.
+What it answers is written back as evidence that reads as exactly that. TSDF, colour and weights stay as they are, bit
+for bit.
+
+Weights that know where centres of objects are also tell which voxels are one thing (``group_things``): those that
+touch, have one class, and of which the network says the same centre. Inside of a thing the centres that its voxels
+point to are near each other, or drift slowly; where two things touch, they jump. Some 30 bytes for each voxel of a
+thing are held until the end for that.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -32,15 +36,13 @@ from semantic_mapper.fields.nesf import (
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.files.up_axis import find_up
-from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
-from semantic_mapper.mapping.fusion.evidence import PROBABILITY_FLOOR, STEPS_PER_NAT
-from semantic_mapper.mapping.instance_layer import InstanceLayer, instance_layer
-from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.fusion.fuse import PROBABILITY_FLOOR, SURFACE_WEIGHT
+from semantic_mapper.mapping.map_types import InstanceLayer, instance_layer, pack_voxels
+from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
-from semantic_mapper.mapping.thing_grouping import group_things
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import Float32, Float64
+from semantic_mapper.memory import check_room_for_scipy
+from semantic_mapper.types import Float32, Float64, Int64
 
 TILE_M = 8.0
 OVERLAP_M = 1.9
@@ -50,6 +52,10 @@ FILL_VOTES = 0.3  # of what is filled: later votes of frames outweigh it
 FILL = 0.5
 LEAST_LOG = np.float32(-30)  # of a probability that is written
 ANSWERED_AT_ONCE = 65_536
+AGREE_M = 0.09  # centres of neighbours that are farther apart belong to two things
+LEAST_VOXELS = 60  # of a piece that stands for itself where it touches others of its class
+_JOINS = 50  # rounds in which small pieces become part of larger ones
+_HALF_SPHERE = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)]) - 1  # 13 of 26 neighbours
 LOW_PERCENT = 1.0  # of the surface's points that lie below the floor, by noise
 
 
@@ -71,12 +77,12 @@ class SurfaceVoxels(NamedTuple):
     """
 
     key: NDArray[np.int32]
-    at: NDArray[np.int64]
+    at: Int64
     points: SurfacePoints
     core: NDArray[np.bool_]
 
     @property
-    def voxel(self) -> NDArray[np.int64]:
+    def voxel(self) -> Int64:
         """(N, 3) coordinates in voxels."""
         return _voxels(self.key, self.at)
 
@@ -91,7 +97,7 @@ class RefineReport:
         relabelled: Of them, those with another class than before.
         filled: Those that had no votes and have a class now.
         voted: Whether anything had votes.
-        things: Instances that were told apart; None where the weights do not know about them.
+        things: Instances that were distinguished; None where the weights do not know about them.
     """
 
     before: dict[str, int]
@@ -111,8 +117,8 @@ class _Written(NamedTuple):
 
     column: int
     key: NDArray[np.int32]
-    at: NDArray[np.int64]
-    evidence: NDArray[Any]
+    at: Int64
+    evidence: Float32
     votes: Float32
     things: _Things
 
@@ -120,8 +126,8 @@ class _Written(NamedTuple):
 class _Things(NamedTuple):
     """Voxels (N, 3) of things, their channels (N,), and the way (N, 3) to their centres, metres along world axes."""
 
-    voxel: NDArray[np.int64]
-    channel: NDArray[np.int64]
+    voxel: Int64
+    channel: Int64
     way_m: Float32
 
 
@@ -207,7 +213,7 @@ def check_refinable(voxel_map: VoxelMap) -> None:
         raise MapError("the map's lengths are not metres, which the network learned in; import the film with --scale")
 
 
-def shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple[Int64, Int64]:
     """Channels (S,) of the map and of the network that mean the same class.
 
     Raises:
@@ -240,9 +246,7 @@ def up_frame(voxel_map: VoxelMap, up: Float64 | None = None) -> UpFrame:
     return UpFrame(R, float(np.percentile(points.xyz @ R[2].astype(np.float32), LOW_PERCENT)))
 
 
-def surface_voxels(
-    voxel_map: VoxelMap, frame: UpFrame, low: NDArray[np.int64], high: NDArray[np.int64]
-) -> SurfaceVoxels:
+def surface_voxels(voxel_map: VoxelMap, frame: UpFrame, low: Int64, high: Int64) -> SurfaceVoxels:
     """Voxels near the surface in the blocks from ``low`` (3,) to before ``high`` (3,)."""
     config = voxel_map.config
     with voxel_map.locked() as whole:
@@ -269,12 +273,9 @@ def surface_voxels(
     return SurfaceVoxels(keys[row], at, points, core)
 
 
-def evidence_of(log_p: Float32, votes: Float32, vote_discount: float, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Evidence (N, L) that reads as log-probabilities (N, L) of voxels with ``votes`` (N,): ``views/readout.py``."""
-    effective = _effective(votes, vote_discount)[:, None]
-    if dtype == np.int16:
-        return np.maximum(np.rint(log_p / effective * STEPS_PER_NAT), np.iinfo(np.int16).min).astype(np.int16)
-    return (log_p * (votes[:, None] / effective)).astype(np.float32)
+def evidence_of(log_p: Float32, votes: Float32, vote_discount: float) -> Float32:
+    """Evidence (N, L) that reads as log-probabilities (N, L) of voxels with ``votes`` (N,)."""
+    return (log_p * (votes / _effective(votes, vote_discount))[:, None]).astype(np.float32)
 
 
 class _Counts:
@@ -284,7 +285,7 @@ class _Counts:
         self.before, self.after = np.zeros(classes + 1, np.int64), np.zeros(classes + 1, np.int64)
         self.relabelled = self.filled = self.voted = 0
 
-    def add(self, before: NDArray[np.int64], after: NDArray[np.int64]) -> None:
+    def add(self, before: Int64, after: Int64) -> None:
         size = len(self.before)
         self.before += np.bincount(before % size, minlength=size)
         self.after += np.bincount(after % size, minlength=size)
@@ -303,7 +304,7 @@ def _refined(
     model: Nesf,
     voxels: SurfaceVoxels,
     own: NDArray[np.bool_],
-    shared: tuple[NDArray[np.int64], NDArray[np.int64]],
+    shared: tuple[Int64, Int64],
     fill: float,
     counts: _Counts,
 ) -> _Written:
@@ -337,9 +338,7 @@ def _refined(
     old = np.where(voted, before.argmax(axis=1), -1)
     new = np.where(changed, after.argmax(axis=1), old)
     counts.add(old[core], new[core])
-    with voxel_map.locked() as grid:
-        dtype = grid.buffers().evidence.dtype
-    evidence = evidence_of(after[changed], votes, voxel_map.config.vote_discount, dtype)
+    evidence = evidence_of(after[changed], votes, voxel_map.config.vote_discount)
     is_thing = np.append(np.isin(voxel_map.label_set.ids, voxel_map.label_set.thing_ids(STUFF_NAMES)), [False])
     things = np.flatnonzero(core & is_thing[new])
     found = _Things(voxels.voxel[own][things], new[things], way[things])
@@ -374,7 +373,7 @@ def _write(voxel_map: VoxelMap, written: _Written) -> None:
             buffers.votes[where] = written.votes[here]
 
 
-def _tiles(voxel_map: VoxelMap, tile_m: float) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
+def _tiles(voxel_map: VoxelMap, tile_m: float) -> Iterator[tuple[int, Int64, Int64]]:
     """Number along x, first block and end of boxes that together hold all blocks, in the order of x."""
     with voxel_map.locked() as grid:
         keys = grid.all_keys().astype(np.int64)
@@ -393,14 +392,12 @@ def _overlap(voxel_map: VoxelMap) -> int:
     return int(np.ceil(OVERLAP_M / (BLOCK_SIDE * voxel_map.config.voxel_size_m)))
 
 
-def _voxels(key: NDArray[np.int32], at: NDArray[np.int64]) -> NDArray[np.int64]:
+def _voxels(key: NDArray[np.int32], at: Int64) -> Int64:
     inside = np.stack((at % BLOCK_SIDE, at // BLOCK_SIDE % BLOCK_SIDE, at // BLOCK_SIDE**2), axis=1)
     return key.astype(np.int64) * BLOCK_SIDE + inside
 
 
-def _gradients(
-    grid: BlockGrid, keys: NDArray[np.int32], blocks: NDArray[np.int32], row: NDArray[np.int64], at: NDArray[np.int64]
-) -> Float32:
+def _gradients(grid: BlockGrid, keys: NDArray[np.int32], blocks: NDArray[np.int32], row: Int64, at: Int64) -> Float32:
     """Unit normals (N, 3) of voxels, towards free space; zeros where neighbours say nothing."""
     buffers = grid.buffers()
     index = np.full(np.ptp(keys, axis=0) + 3, -1, np.int64)
@@ -426,13 +423,77 @@ def _effective(votes: Float32, vote_discount: float) -> Float32:
     return np.where(votes > 1, votes / (1 + vote_discount * (votes - 1)), 1).astype(np.float32)
 
 
-def _log_probabilities(evidence: NDArray[Any], votes: Float32, vote_discount: float) -> Float32:
+def _log_probabilities(evidence: Float32, votes: Float32, vote_discount: float) -> Float32:
     """(N, L) that stored evidence reads as; zeros without votes."""
-    effective = _effective(votes, vote_discount)
-    if evidence.dtype == np.int16:
-        said = evidence.astype(np.float32) * (effective / np.float32(STEPS_PER_NAT))[:, None]
-    else:
-        said = evidence * (effective / np.maximum(votes, np.float32(1e-6)))[:, None]
+    said = evidence * (_effective(votes, vote_discount) / np.maximum(votes, np.float32(1e-6)))[:, None]
     said -= said.max(axis=1, keepdims=True)
     said -= np.log(np.exp(said).sum(axis=1, keepdims=True))
     return np.where(votes[:, None] > 0, said, 0).astype(np.float32)
+
+
+def group_things(voxels: Int64, channel: Int64, way_m: Float32, voxel_m: float) -> Int64:
+    """The thing (N,) that each voxel belongs to, numbered from 0.
+
+    Args:
+        voxels: (N, 3) unique coordinates.
+        channel: (N,) class of each.
+        way_m: (N, 3) from each to the centre of its thing, along the axes of ``voxels``.
+        voxel_m: Edge of a voxel.
+    """
+    if not len(voxels):
+        return np.zeros(0, np.int64)
+    first, second = _neighbours(voxels)
+    same = channel[first] == channel[second]
+    first, second = first[same], second[same]
+    centre = voxels.astype(np.float64) * voxel_m + way_m.astype(np.float64)
+    agree = np.linalg.norm(centre[first] - centre[second], axis=1) < AGREE_M
+    piece = _components(len(voxels), first[agree], second[agree])
+    return _join_small_pieces(piece, first, second, centre)
+
+
+def _join_small_pieces(piece: Int64, first: Int64, second: Int64, centre: Float64) -> Int64:
+    """Pieces (N,); small ones that touch large ones, by the pairs ``first``, ``second``, are part of them now."""
+    size = np.bincount(piece)
+    middle = np.stack([np.bincount(piece, centre[:, axis]) for axis in range(3)], axis=1) / size[:, None]
+    large = size >= LEAST_VOXELS
+    for _ in range(_JOINS):
+        a, b = piece[first], piece[second]
+        touching = np.concatenate(
+            (np.stack((a, b), axis=1)[~large[a] & large[b]], np.stack((b, a), axis=1)[~large[b] & large[a]])
+        )
+        if not len(touching):
+            break
+        touching = np.unique(touching, axis=0)
+        apart = np.linalg.norm(middle[touching[:, 0]] - middle[touching[:, 1]], axis=1)
+        touching = touching[np.lexsort((apart, touching[:, 0]))]
+        small, row = np.unique(touching[:, 0], return_index=True)
+        becomes = np.arange(len(size))
+        becomes[small] = touching[row, 1]
+        piece = becomes[piece]
+    return np.unique(piece, return_inverse=True)[1].reshape(-1)
+
+
+def _neighbours(voxels: Int64) -> tuple[Int64, Int64]:
+    """Pairs of voxels that touch by face, edge or corner."""
+    keys = pack_voxels(voxels)
+    order = np.argsort(keys)
+    keys = keys[order]
+    first: list[Int64] = []
+    second: list[Int64] = []
+    for step in _HALF_SPHERE:
+        wanted = pack_voxels(voxels + step)
+        row = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        there = np.flatnonzero(keys[row] == wanted)
+        first.append(there)
+        second.append(order[row[there]])
+    return np.concatenate(first), np.concatenate(second)
+
+
+def _components(count: int, first: Int64, second: Int64) -> Int64:
+    """Number of the connected part that each belongs to. SciPy's libraries need 270 MB, and few sessions refine."""
+    check_room_for_scipy()
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(first), np.bool_), (first, second)), shape=(count, count))
+    return connected_components(links, directed=False)[1].astype(np.int64)

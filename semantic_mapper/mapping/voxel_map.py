@@ -18,33 +18,35 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.places import PlaceStore, moved_place, shared_places
 from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
-from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.files.map_manifest import MapManifest
+from semantic_mapper.mapping.files.map_file import MapManifest, open_map
 from semantic_mapper.mapping.files.map_saving import MapSaving
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
-from semantic_mapper.mapping.fusion.clearing import clear_in_view, clear_without_return
-from semantic_mapper.mapping.fusion.depth_bounds import NO_BOUNDS, depth_bounds
-from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
-from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
-from semantic_mapper.mapping.fusion.fuse import fuse_blocks, make_limits
-from semantic_mapper.mapping.instance_layer import InstanceLayer
+from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, clear_in_view, clear_without_return, depth_bounds
+from semantic_mapper.mapping.fusion.fuse import (
+    SURFACE_WEIGHT,
+    check_depth,
+    frame_votes,
+    fuse_blocks,
+    make_limits,
+    probability_table,
+    trusted_depth,
+)
 from semantic_mapper.mapping.map_scale import require_same_scale, scale_name
-from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
-from semantic_mapper.mapping.storage.block_grid import BlockGrid
-from semantic_mapper.mapping.storage.block_index import pack_keys
+from semantic_mapper.mapping.map_types import InstanceLayer, MapMesh, MapPoints, MapView
+from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.changes import (
+    NONE_CLEARED,
     BlockChanges,
     ChosenBlocks,
+    ClearedBlocks,
     CopiedChanges,
     choose_blocks,
     copy_changes,
     read_changes,
 )
-from semantic_mapper.mapping.storage.cleared_blocks import ClearedLog
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
-from semantic_mapper.mapping.views.ray_casting import cast_view
-from semantic_mapper.mapping.views.readout import read_points
+from semantic_mapper.mapping.views.ray_casting import cast_view, read_points
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 # One lock for all maps of a process: growth moves the memory that readers look at, and merging takes two maps at once.
@@ -90,7 +92,7 @@ class VoxelMap:
         self.instances: InstanceLayer | None = None
         self.places = PlaceStore()
         self.cleared = 0
-        self._cleared_log = ClearedLog()
+        self._cleared_rows = NONE_CLEARED
         self._bounds = NO_BOUNDS  # of the last frame that cleared
         self._grid = BlockGrid(
             config.voxel_size_m,
@@ -98,7 +100,6 @@ class VoxelMap:
             config.initial_blocks,
             config.max_blocks,
             int(config.memory_mb * 1e6),
-            config.evidence,
         )
         self.truncation_m = config.truncation_voxels * config.voxel_size_m
 
@@ -135,7 +136,7 @@ class VoxelMap:
         After a new ``epoch`` these are all blocks of the map, and those of before are gone.
         """
         with _KERNEL_LOCK:
-            return self._grid.changed_since(version)
+            return unpack_keys(self._grid.versions_since(version)[0])
 
     def changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> BlockChanges:
         """The blocks changed after ``version`` was ``since``, in compact form.
@@ -185,7 +186,7 @@ class VoxelMap:
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
                 which row is a pixel's, -1 = unknown. ``known`` is None then.
             trust: (H, W) float32 0..1, how much of its full weight each depth and its vote count; None = 1.
-            measured: Whether a sensor measured the depth; what was computed weighs less (``depth_trust``).
+            measured: Whether a sensor measured the depth; what was computed weighs less (``fusion/fuse.py``).
 
         Returns:
             Blocks touched, 0 where the depth image holds no measurement.
@@ -232,7 +233,6 @@ class VoxelMap:
                     rgb,
                     weights,
                     votes,
-                    self.frames,
                     measured=measured,
                     bounds=bounds,
                 )
@@ -244,7 +244,10 @@ class VoxelMap:
                     cleared += clear_without_return(grid, camera, limits, given, rgb, reach, self.version)
                 for keys, voxels in cleared:
                     self.cleared += int(voxels.sum())
-                    self._cleared_log.add(keys, voxels, self.version, frame.stamp_ns)
+                    some = np.flatnonzero(voxels)
+                    version, stamp = np.full(len(some), self.version), np.full(len(some), frame.stamp_ns)
+                    cleared_rows = ClearedBlocks(keys[some], voxels[some], version, stamp)
+                    self._cleared_rows = self._cleared_rows.followed_by(cleared_rows)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
         return len(packed)
@@ -289,6 +292,21 @@ class VoxelMap:
             self.refined, self.instances, self.places = other.refined, other.instances, other.places
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
+
+    def copy(self) -> VoxelMap:
+        """Another map with the same blocks, counters and places.
+
+        Raises:
+            MapError: there is no memory, or the disk fails.
+        """
+        other = VoxelMap(self.config, self.label_set)
+        with _KERNEL_LOCK:
+            copy_blocks(other._grid, self._grid, self.frames, measured=False)
+            other.frames = other.version = self.frames
+            other.last_stamp_ns = self.last_stamp_ns
+        other.note_scale(self.scale_known)
+        other.places = PlaceStore(self.places.places)
+        return other
 
     def points(self, min_weight: float = SURFACE_WEIGHT) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order.
@@ -404,18 +422,17 @@ class VoxelMap:
             config: In place of all saved settings.
 
         Raises:
-            ConfigError: ``config`` contradicts what is stored (``VoxelMapConfig.stored``).
+            ConfigError: ``config`` has voxels of another size.
             MapError: no such file, not a map, of another format version, or damaged (and what is).
         """
         with open_map(path) as reader:
             saved = reader.manifest
             config = config or saved.config
-            for name in VoxelMapConfig.stored:
-                if getattr(config, name) != (kept := getattr(saved.config, name)):
-                    raise ConfigError(
-                        f"{path}: was made with voxel_map.{name} = {kept!r} and cannot go on with "
-                        f"{getattr(config, name)!r}: leave that out"
-                    )
+            if config.voxel_size_m != saved.config.voxel_size_m:
+                raise ConfigError(
+                    f"{path}: was made with voxel_map.voxel_size_m = {saved.config.voxel_size_m:g} and cannot continue "
+                    f"with {config.voxel_size_m:g}: leave that out"
+                )
             config = config if memory_mb is None else replace(config, memory_mb=memory_mb)
             try:
                 loaded = cls(config, saved.label_set)
@@ -471,7 +488,7 @@ class VoxelMap:
         with _KERNEL_LOCK:
             version = self.version + other.frames
             if not self.block_count and (T_self_other == np.eye(4)).all():
-                copy_blocks(self._grid, other._grid, version)
+                copy_blocks(self._grid, other._grid, version, measured=True)
             else:
                 transform = voxel_transform(T_self_other, self.config.voxel_size_m)
                 add_blocks(self._grid, other._grid, transform, self.config.max_weight, version)
@@ -488,7 +505,7 @@ class VoxelMap:
         _check_min_weight(min_weight)
         decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
         chosen = choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
-        cleared = self._cleared_log.between(since, chosen.version)
+        cleared = self._cleared_rows.between(since, chosen.version)
         return chosen._replace(scale_known=self.scale_known, cleared=cleared)
 
     def _read(

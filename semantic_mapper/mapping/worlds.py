@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.errors import PoseError
-from semantic_mapper.geometry import check_pose, invert_pose
+from semantic_mapper.geometry import check_pose, invert_pose, move
 from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses, move
+from semantic_mapper.mapping.map_types import CorrectedPoses
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame, UInt8
 
@@ -74,7 +74,7 @@ class MapWorlds:
         classify: Class ids (h, w) of a frame as its pixels alone tell them; they have to agree with the map's. None =
             classes are not looked at.
         own_first: The first world that comes is the map's own, as in a map that begins empty.
-        whereabouts: Is told of every frame.
+        whereabouts: Is given the pose of every frame.
         motion: By how much frames to come of a world are moved later on, (4, 4); see ``MapCorrector.motion``.
         correcting: Whether the map is about to move; no world is looked for meanwhile.
 

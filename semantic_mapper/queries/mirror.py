@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.instance_layer import InstanceLayer
+from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, make_block_index, pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import BlockChanges

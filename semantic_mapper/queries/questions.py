@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.correction.pose_correction import CorrectionStatus
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.map_types import CorrectionStatus, MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.queries.instances import Instance, OrientedBox

@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.instance_layer import InstanceLayer
+from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
-from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS, BlockChanges, oldest_first
-from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED, ClearedBlocks
+from semantic_mapper.mapping.storage.changes import (
+    CONFIDENCE_STEPS,
+    NONE_CLEARED,
+    TSDF_STEPS,
+    BlockChanges,
+    ClearedBlocks,
+    oldest_first,
+)
 from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
 COMPUTED, MEASURED = 1, 2  # ``BlockVoxels.weight``: depth was computed, or a sensor measured it

@@ -20,17 +20,17 @@ LOG = FOLDER / "room.mcap"
 WEIGHTS = FOLDER / "small.safetensors"
 STORED = FOLDER / "stored"  # a run as `pytest --update-runs` stores it: map.npz (float32 evidence) and summary.json
 MAP = STORED / "map.npz"
-MAP_INT16 = FOLDER / "map-int16.npz"
+MAP_COARSE = FOLDER / "map-coarse.npz"
 POINTS = FOLDER / "points.npz"  # surface of the map of ROOM_SETTINGS
 FRAMES = 11  # of the log
 REFUSED_SEQ = 5  # the one whose pose is no rotation
 # Half of the frames' size is that of the feature maps, so that rays meet the middles of their pixels. At a quarter they
 # would meet the very borders between two, and rounding would say which of the two the current view looks up.
-ROOM_SETTINGS = "[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.05\ninitial_blocks = 200\n"
+ROOM_SETTINGS = "[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.05\n"
 STORED_SETTINGS = {  # of a time when frames told the map what was rendered, and nothing else
     "render": {"scale": 0.5},
     "keyframes": {"own_image_weight": 0.0},
-    "voxel_map": {"voxel_size_m": 0.12, "initial_blocks": 100},
+    "voxel_map": {"voxel_size_m": 0.12},
 }
 STORED_FRAMES = 3
 SMALL_ARRAY = 16  # numbers that are written down one by one; of larger arrays the digest

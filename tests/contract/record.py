@@ -24,7 +24,7 @@ from unittest.mock import patch
 
 from tests.contract import entry_points as api
 from tests.contract import golden, runs, samples
-from tests.contract.golden import FOLDER, LOG, MAP, MAP_INT16, POINTS, STORED, WEIGHTS
+from tests.contract.golden import FOLDER, LOG, MAP, MAP_COARSE, POINTS, STORED, WEIGHTS
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -108,15 +108,13 @@ def record_files(folder: Path) -> None:
         replays = api.LogReplays(FOLDER, lambda name: folder / name)
         made = replays(LOG, weights=WEIGHTS, config=golden.STORED_SETTINGS, max_frames=golden.STORED_FRAMES)
         made.store(STORED)
-    if not MAP_INT16.exists():
-        config = folder / "int16.toml"
-        config.write_text(
-            '[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.12\ninitial_blocks = 100\nevidence = "int16"\n'
-        )
-        out = folder / "int16"
+    if not MAP_COARSE.exists():
+        config = folder / "coarse.toml"
+        config.write_text("[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.12\n")
+        out = folder / "coarse"
         ran = api.run_here("replay", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, "--max-frames", "2")
         assert ran.code == 0, ran.stderr
-        shutil.copyfile(out / "map.npz", MAP_INT16)
+        shutil.copyfile(out / "map.npz", MAP_COARSE)
     test_files.make_small_files()
     golden.write("files", test_files.observe(folder))
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin
 import pytest
 
 from tests.contract import entry_points as api
-from tests.contract.golden import LOG, MAP, MAP_INT16, STORED, WEIGHTS, form, lacking, read
+from tests.contract.golden import LOG, MAP, MAP_COARSE, STORED, WEIGHTS, form, lacking, read
 
 # {..} are places of golden files and of a folder of its own for each recording or test, in which the commands run in
 # this order: later ones use what earlier ones have made.
@@ -51,11 +51,11 @@ COMMANDS: dict[str, str] = {
     "export a log as mesh": "export {log} --out {tmp}/log.glb",
     "export to an unknown format": "export {map} --out {tmp}/map.stl",
     "export without a file": "export {map}",
-    "merge": "merge {map} {int16} --transform 1.2|0|0|90 --out {tmp}/both.npz",
+    "merge": "merge {map} {coarse} --transform 1.2|0|0|90 --out {tmp}/both.npz",
     "merge a map with itself": "merge {map} {stored} --transform 0|0|0|0 --out {tmp}/no.npz",
     "merge maps of other voxels": "merge {map} {tmp}/none.npz --out {tmp}/no.npz",
     "compare equal runs": "compare {stored} {map} --json",
-    "compare other runs": "compare {map} {int16}",
+    "compare other runs": "compare {map} {coarse}",
     "compare with a tolerance that is none": "compare {map} {map} -t labels",
     "compare a log": "compare {log} {map}",
     "up with an unknown setting": "up replay --set camera.log={log} --set colour=red",
@@ -181,8 +181,8 @@ def make_places(folder: Path) -> dict[str, str]:
     (folder / "wrong.toml").write_text("[voxel_map]\nvoxel_sise_m = 0.1\n")
     stored = folder / "stored"  # commands that would write there by mistake must not reach golden files
     shutil.copytree(STORED, stored)
-    shutil.copyfile(MAP_INT16, folder / "int16.npz")
-    made = {"cut": "cut.mcap", "damaged": "damaged.mcap", "wrong": "wrong.toml", "int16": "int16.npz"}
+    shutil.copyfile(MAP_COARSE, folder / "coarse.npz")
+    made = {"cut": "cut.mcap", "damaged": "damaged.mcap", "wrong": "wrong.toml", "coarse": "coarse.npz"}
     given = {"log": LOG, "map": stored / MAP.name, "stored": stored, "weights": WEIGHTS, "tmp": folder}
     given["corrections"] = LOG.parent / "corrections.tum"
     return {name: str(path) for name, path in ({n: folder / f for n, f in made.items()} | given).items()}

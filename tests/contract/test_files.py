@@ -15,7 +15,7 @@ from tests.contract.golden import (
     FOLDER,
     LOG,
     MAP,
-    MAP_INT16,
+    MAP_COARSE,
     STORED,
     STORED_FRAMES,
     STORED_SETTINGS,
@@ -269,7 +269,7 @@ def look_at_learning(folder: Path) -> dict[str, Any]:
 
 _LOOKS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "map": lambda _: look_at_map(MAP),
-    "map_int16": lambda _: look_at_map(MAP_INT16),
+    "map_coarse": lambda _: look_at_map(MAP_COARSE),
     "weights": look_at_weights,
     "calibrations": look_at_calibrations,
     "keys": look_at_keys,
@@ -284,7 +284,7 @@ def test_a_file_of_then_says_what_it_said(name: str, tmp_path: Path) -> None:
     assert differences(read("files")[name], _LOOKS[name](tmp_path)) == []
 
 
-@pytest.mark.parametrize("name", ["map", "map_int16"])
+@pytest.mark.parametrize("name", ["map", "map_coarse"])
 def test_a_map_of_then_is_the_same_map(name: str, tmp_path: Path) -> None:
     then, now = read("files")[name], _LOOKS[name](tmp_path)
     surface, found = then.pop("surface"), now.pop("surface")
@@ -294,7 +294,7 @@ def test_a_map_of_then_is_the_same_map(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(found[key], surface[key], atol=POINT_M, rtol=0)
 
 
-@pytest.mark.parametrize("path", [MAP, MAP_INT16], ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [MAP, MAP_COARSE], ids=lambda p: p.stem)
 def test_a_map_of_then_can_go_on(path: Path, tmp_path: Path) -> None:
     voxel_map = api.VoxelMap.load(path)
     with api.LogReader(LOG) as log:

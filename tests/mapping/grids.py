@@ -6,14 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from semantic_mapper.mapping.storage.block_grid import GridBuffers
 from semantic_mapper.mapping.storage.block_index import BlockIndex, make_block_index
-from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
 from semantic_mapper.types import Float64
 
 
-def random_grid(
-    rng: np.random.Generator, evidence: str = "float32", classes: int = 4
-) -> tuple[BlockIndex, GridBuffers]:
+def random_grid(rng: np.random.Generator, classes: int = 4) -> tuple[BlockIndex, GridBuffers]:
     """Nine blocks around the origin, in any order; some voxels without a measurement, some without votes."""
     keys = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0) for z in (-1, 0)], np.int32)
     keys = rng.permutation(keys)[:9]
@@ -23,17 +21,11 @@ def random_grid(
     weight = np.where(rng.random((n, 512)) < 0.8, rng.uniform(0.5, 9, (n, 512)), 0).astype(np.float32)
     votes = np.where((weight > 0) & (rng.random((n, 512)) < 0.8), rng.uniform(0.1, 5, (n, 512)), 0).astype(np.float32)
     said = np.log(rng.dirichlet(np.full(classes, 0.5), (n, 512)) + 1e-4)
-    stored = np.rint(said * 3500) if evidence == "int16" else said * votes[..., None]
+    stored = said * votes[..., None]
     stored[votes == 0] = 0
     color = (rng.uniform(0, 255, (n, 512, 3)) * (weight > 0)[..., None]).astype(np.float32)
-    buffers = GridBuffers(keys, tsdf, weight, color, stored.astype(evidence), votes)
+    buffers = GridBuffers(keys, tsdf, weight, color, stored.astype(np.float32), votes)
     return make_block_index(keys, np.arange(n, dtype=np.int32)), buffers
-
-
-def sums_of(buffers: GridBuffers) -> Float64:
-    """Evidence (B, 512, L) as sums of log probabilities, however it is stored."""
-    scale = buffers.votes[..., None].astype(np.float64) / 3500 if buffers.evidence.dtype == np.int16 else 1.0
-    return buffers.evidence * scale
 
 
 def corners(buffers: GridBuffers, p: Float64) -> Iterator[tuple[float, tuple[int, int]]]:
@@ -47,3 +39,13 @@ def corners(buffers: GridBuffers, p: Float64) -> Iterator[tuple[float, tuple[int
         if row is not None:
             x, y, z = at % 8
             yield fraction, (row, int(z * 64 + y * 8 + x))
+
+
+def decided(evidence: np.ndarray, votes: float, rho: float, unknown_below: float = 0.0) -> tuple[int, float]:
+    """Channel and confidence of one voxel (L,); (-1, 0) without votes, channel -1 below ``unknown_below``."""
+    if votes <= 0:
+        return -1, 0.0
+    worth = 1 / (1 + rho * (votes - 1)) if votes > 1 else 1 / votes
+    p = np.exp((evidence - evidence.max()).astype(np.float64) * worth)
+    confidence = float(1 / p.sum())
+    return (int(evidence.argmax()) if confidence >= unknown_below else -1), confidence

@@ -13,17 +13,17 @@ import torch
 from scipy.spatial import cKDTree
 
 from research.scenes import TRAIN_SEEDS, room_frames
-from semantic_mapper.config import DepthConfig, DepthFromMotionConfig, PoseRefinerConfig
+from semantic_mapper.config import DepthConfig
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.frame_depth import MOST_SPREAD, SURE_SPREAD, FrameDepth, computed_trust
-from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, MEASURED
+from semantic_mapper.mapping.frame_depth import MOST_SPREAD, SURE_SPREAD, computed_trust
+from semantic_mapper.mapping.fusion.fuse import COMPUTED_CAP, MEASURED
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.small import SMALL_ENCODER, SMALL_MODEL, tiny_config, tiny_field
 
 CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)
@@ -92,46 +92,6 @@ def test_computed_depth_is_shown_to_an_encoder_that_has_learned_from_it_and_to_n
     computed = features(replace(frame, depth_sigma_m=0.02 * frame.depth_m))
     assert torch.equal(computed, features(frame if learned else replace(frame, depth_m=None)))
     assert not torch.equal(computed, features(replace(frame, depth_m=None) if learned else frame))
-
-
-def test_depth_counts_little_where_the_scale_of_the_poses_is_not_known() -> None:
-    def spread(sigma_m: float) -> list[float]:
-        pipeline = make_pipeline(depth={"poses": {"sigma_m": sigma_m}})
-        found = []
-        for frame in without_depth(walk(FINE)):
-            (ready,) = pipeline.prepare(frame)
-            assert ready.depth_m is not None and ready.depth_sigma_m is not None
-            known = ready.depth_m > 0
-            found.append(float(np.median(ready.depth_sigma_m[known] / ready.depth_m[known])) if known.any() else np.inf)
-        return found
-
-    sure, unsure = spread(0.005), spread(0.2)
-    assert 2 * sure[4] < unsure[4], "what is not known of the poses yet counts"
-    assert unsure[4] > 2 * unsure[-1], "a longer way, and poses that fit the pictures, tell more of the scale"
-
-
-def test_the_map_is_asked_for_a_hint_where_frames_are_fused() -> None:
-    asked: dict[int, Float64] = {}
-
-    def cast_map(frame: PosedFrame, k: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
-        asked[frame.seq] = frame.T_world_camera
-        return np.zeros((k.height, k.width), np.float32), np.zeros((k.height, k.width), bool)
-
-    computer = FrameDepth(DepthConfig(poses=PoseRefinerConfig(sigma_m=0.2)), cast_map)
-    rng = np.random.default_rng(0)
-    moved = 0.0
-    for frame in without_depth(walk(FINE)):
-        T = frame.T_world_camera.copy()
-        T[:3, 3] += 0.01 * rng.standard_normal(3)  # so that refined poses are elsewhere
-        for fused in computer.push(replace(frame, T_world_camera=T)):
-            assert np.array_equal(asked[fused.seq], fused.T_world_camera)
-            moved = max(moved, float(np.linalg.norm(fused.T_world_camera[:3, 3] - T[:3, 3])))
-    assert moved > 0.005
-
-
-def test_a_walk_with_depth_says_that_all_of_its_surface_is_measured() -> None:
-    points = mapped(walk()).voxel_map.points()
-    assert len(points.xyz) > 3000 and points.measured is not None and points.measured.all()
 
 
 def test_computed_depth_adds_to_a_measured_map_and_leaves_it_as_it_is() -> None:
@@ -212,23 +172,6 @@ def test_trust_is_the_inverse_variance_and_nothing_where_little_is_known() -> No
     expected = [[1, 1, 0.25, (SURE_SPREAD / 0.99 / MOST_SPREAD) ** 2, 0, 0]]
     np.testing.assert_allclose(computed_trust(depth, spread * depth), expected, rtol=1e-5)
     assert not computed_trust(np.zeros_like(depth), spread).any()
-
-
-def test_a_camera_that_changes_its_lens_is_still_mapped_without_depth() -> None:
-    zoomed = replace(FINE, fx=230.0, fy=230.0)
-    frames = without_depth([*walk(FINE)[:6], *walk(zoomed)[6:10]])
-    pipeline = mapped(frames)
-    assert pipeline.voxel_map.frames == len(frames) and pipeline.pose_disagreement_px is not None
-
-
-def test_frames_that_wait_are_done_before_another_lens_begins_another_world() -> None:
-    config = DepthConfig(from_motion=DepthFromMotionConfig(delay_frames=4))
-    computer = FrameDepth(config, lambda frame, k: (np.zeros((k.height, k.width), np.float32),) * 2)
-    zoomed = replace(FINE, fx=230.0, fy=230.0)
-    before = [f for frame in without_depth(walk(FINE)[:6]) for f in computer.push(frame)]
-    assert len(before) < 6
-    at_change = computer.push(without_depth(walk(zoomed)[6:7])[0])
-    assert [f.seq for f in [*before, *at_change]] == list(range(6))
 
 
 def test_what_is_kept_to_refine_poses_is_bounded() -> None:

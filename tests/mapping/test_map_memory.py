@@ -10,8 +10,7 @@ import pytest
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import LabelSet, make_label_set
-from semantic_mapper.mapping.files.map_file import BlockPart, describe_map, write_map
-from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS, MapManifest
+from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, BlockPart, MapManifest, describe_map, write_map
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
 from tests.mapping.files.crash_child import measure_memory, start_child
 
@@ -39,7 +38,7 @@ def parts(count: int) -> Iterator[BlockPart]:
 
 
 def manifest(labels: LabelSet = LABELS) -> MapManifest:
-    return MapManifest(config=VoxelMapConfig(initial_blocks=64), label_set=labels, frames=7, last_stamp_ns=5)
+    return MapManifest(config=VoxelMapConfig(), label_set=labels, frames=7, last_stamp_ns=5)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.files.map_file import describe_map
-from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.rendered_views import frame, small_map
 
@@ -41,12 +40,6 @@ def test_a_saved_map_says_it_and_one_in_metres_reads_as_before(tmp_path: Path) -
     assert VoxelMap.load(tmp_path / "known.npz").scale_known
 
 
-def test_one_stream_without_metres_is_enough() -> None:
-    voxel_map = a_map(scale_known=False)
-    voxel_map.note_scale(True)
-    assert not voxel_map.scale_known
-
-
 def test_merging_keeps_it_and_never_mixes() -> None:
     known, unknown = a_map(scale_known=True), a_map(scale_known=False)
     assert not unknown.merged(unknown, np.eye(4)).scale_known
@@ -62,9 +55,3 @@ def test_a_corrected_or_resumed_map_keeps_it() -> None:
     fresh = small_map()
     fresh.take_over(a_map(scale_known=False))
     assert not live.scale_known and not fresh.scale_known
-
-
-def test_the_error_says_how_to_mend_it() -> None:
-    require_metres(True, "nearest")
-    with pytest.raises(MapError, match=r"nearest: needs metres.*--distance, --square-mm, --camera-height or --scale"):
-        require_metres(False, "nearest")

@@ -10,14 +10,26 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.streaming import StreamingSRay
-from semantic_mapper.labels import CARLA, KITTI360, NYU40, ROOMS
-from semantic_mapper.mapping.moving import BEYOND_M, SETTLED_S, MotionDetector, MovingSpace
-from semantic_mapper.mapping.moving_filter import MUCH_LEFT_OUT, POSES_OFF, MovingFilter
+from semantic_mapper.geometry import invert_pose
+from semantic_mapper.labels import KITTI360, ROOMS
+from semantic_mapper.mapping.moving import (
+    BEYOND_M,
+    MUCH_LEFT_OUT,
+    POSES_OFF,
+    SETTLED_S,
+    MotionDetector,
+    MovingFilter,
+    MovingSpace,
+    SlopedViews,
+    align_pose,
+    depth_slopes,
+)
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.types import Bool, CameraIntrinsics, Float64, PosedFrame
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, PosedFrame
 from tests.small import tiny_config, tiny_field
 
 CAMERA = CameraIntrinsics(130.0, 130.0, 79.5, 59.5, 160, 120)
+MARGIN = (0.1, 0.03)
 WALL_M, POLE_M, THING_M = 3.0, 2.2, 1.8
 HZ = 10
 NOISE_M = 0.02
@@ -64,17 +76,6 @@ def test_what_stays_settles_and_forgetting_leaves_nothing_to_compare_with() -> N
     assert not detector.find(scene(103, 60)[0]).any()
 
 
-def test_each_camera_of_a_rig_sees_what_moves() -> None:
-    detector = MotionDetector(6.0)
-    for number in range(12):
-        for camera in ("left", "right"):
-            frame, thing = scene(number, None if number < 9 else 60)
-            found = detector.find(
-                replace(frame, camera_id=camera, stamp_ns=frame.stamp_ns + 1000 * (camera == "right"))
-            )
-            assert found.any() == thing.any(), (camera, number)
-
-
 def test_a_pose_that_jumps_is_no_motion() -> None:
     detector = MotionDetector(6.0)
     detector.find(scene(0, None)[0])
@@ -116,22 +117,6 @@ def test_poses_that_are_off_are_put_right_or_known_to_be_wrong(sigma_m: float, s
     assert found < 0.01 * 40 * 120 * 160 and (fits == 40 if fit else fits < 10)
 
 
-def test_what_fills_most_of_the_picture_is_found() -> None:
-    detector = MotionDetector(6.0)
-    for number in range(5):
-        assert not detector.find(corner(number, np.eye(4))).any()
-    found = detector.find(corner(5, np.eye(4), thing_m=0.8))
-    assert found[:, 22:118].mean() > 0.9 and found[:, 130:].mean() < 0.05
-
-
-def test_before_a_background_beyond_the_range_of_the_map_motion_is_found() -> None:
-    detector = MotionDetector(WALL_M - 0.3)
-    detector.find(scene(0, None)[0])
-    frame, thing = scene(3, 60)
-    found = detector.find(frame)
-    assert (found & thing).sum() > 0.8 * thing.sum() and (found & ~thing).sum() < 0.1 * thing.sum()
-
-
 def test_a_late_frame_keeps_what_newer_ones_saw_and_stamps_that_go_back_do_not() -> None:
     detector = MotionDetector(6.0)
     for number in range(9, 12):
@@ -151,7 +136,7 @@ def pipeline(**moving: bool) -> MappingPipeline:
     return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
 
 
-VOXELS = {"voxel_size_m": 0.05, "initial_blocks": 200, "clear_free_space": False}
+VOXELS = {"voxel_size_m": 0.05, "clear_free_space": False}
 
 
 def wall_of(p: MappingPipeline) -> int:
@@ -174,36 +159,6 @@ def test_a_passer_by_is_no_wall_neither_when_the_map_is_built_again() -> None:
         pass
     after = on.voxel_map.block_state()
     assert all(np.array_equal(before[name], after[name]) for name in before)
-
-
-def test_a_correction_of_poses_decides_again_what_moved() -> None:
-    frames = [scene(n, None if n < 3 else -30 + 15 * n, shift_m=0.03 * n)[0] for n in range(12)]
-    off_m = np.array((0.0, 0.0, 0.5))
-    wrong = [
-        replace(f, T_world_camera=shifted(f.T_world_camera, off_m if n in (5, 6) else 0 * off_m))
-        for n, f in enumerate(frames)
-    ]
-    right, corrected = pipeline(motion=True), pipeline(motion=True)
-    for true, given in zip(frames, wrong, strict=True):
-        right.step(true)
-        corrected.step(given)
-    assert corrected.moving.pixels != right.moving.pixels, "poses that are off look like motion"
-    corrected.correct_poses({f.stamp_ns: f.T_world_camera for f in frames})
-    while corrected.advance_correction(4):
-        pass
-    ours, theirs = corrected.voxel_map.block_state(), right.voxel_map.block_state()
-    assert all(np.array_equal(ours[name], theirs[name]) for name in ("keys", "tsdf", "weight"))
-    frame, _ = scene(12, 150, shift_m=0.36)
-    told, expected = corrected.step(frame).moving, right.step(frame).moving
-    assert told is not None and expected is not None and expected.any() and np.array_equal(told, expected), (
-        "and goes on with what it knows"
-    )
-
-
-def shifted(T_world_camera: np.ndarray, by_m: np.ndarray) -> np.ndarray:
-    T = T_world_camera.copy()
-    T[:3, 3] += by_m
-    return T
 
 
 def test_what_is_left_out_is_no_free_space_for_a_sensor_whose_missing_depth_is() -> None:
@@ -241,7 +196,7 @@ def test_where_it_moved_is_kept_for_a_second() -> None:
 
 
 def test_what_is_in_doubt_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semantic_mapper.mapping.moving_filter.RECENT", 10)
+    monkeypatch.setattr("semantic_mapper.mapping.moving.RECENT", 10)
     filter_, rng = MovingFilter(tiny_config(), ROOMS), np.random.default_rng(3)
 
     def told(number: int, T_world_camera: Float64, thing_m: float | None = None) -> str:
@@ -254,12 +209,6 @@ def test_what_is_in_doubt_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     filter_.clear()
     assert not filter_.warning and {told(n, np.eye(4)) for n in range(20, 32)} == {""}
     assert [told(n, np.eye(4), 0.8) for n in range(32, 46)][-1] == MUCH_LEFT_OUT
-
-
-def test_classes_that_move_by_themselves_have_names() -> None:
-    assert [NYU40.names[NYU40.ids.index(i)] for i in NYU40.moving_ids()] == ["person"]
-    assert [CARLA.names[CARLA.ids.index(i)] for i in CARLA.moving_ids()] == ["pedestrian"]
-    assert ROOMS.moving_ids() == (ROOMS.id_of("person"),) and not KITTI360.moving_ids()
 
 
 def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,3 +228,54 @@ def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPat
     ]
     assert len(shown) == 4 and all(np.array_equal(told, measured) for told, measured in shown)
     assert len(on.voxel_map.points().xyz) < 0.8 * len(off.voxel_map.points().xyz)
+
+
+def views(depth: Float32) -> SlopedViews:
+    focal, centre = ((CAMERA.fx, CAMERA.fy), (CAMERA.cx, CAMERA.cy))
+    at = np.eye(4)[None]
+    return SlopedViews(at, np.array([focal], np.float32), np.array([centre], np.float32), depth_slopes(depth)[None])
+
+
+def points(depth: Float32) -> Float32:
+    v, u = (3 * i for i in np.nonzero(depth[::3, ::3]))
+    rays = np.stack(((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))), axis=1)
+    return (depth[v, u][:, None] * rays).astype(np.float32)
+
+
+def depth_at(T_world_camera: Float64) -> Float32:
+    depth = corner(0, T_world_camera).depth_m
+    assert depth is not None
+    return depth
+
+
+def test_a_pose_that_is_a_little_off_is_put_right() -> None:
+    rng = np.random.default_rng(0)
+    seen = views(depth_at(np.eye(4)))
+    for _ in range(5):
+        right, wrong = off_by(0.02, 0.5, rng), np.eye(4)
+        aligned = align_pose(points(depth_at(right)), wrong, seen, MARGIN)
+        left = invert_pose(right) @ aligned.T_world_camera
+        assert np.linalg.norm(left[:3, 3]) < 0.01 and np.linalg.norm(left[:3, :3] - np.eye(3)) < 0.005
+        assert aligned.misfit < 0.1
+        np.testing.assert_allclose(aligned.moved[:3], right[:3, 3], atol=0.01)
+
+
+def test_a_pose_that_is_far_off_stays_and_does_not_fit() -> None:
+    far = np.eye(4)
+    far[2, 3] = -1.0
+    aligned = align_pose(points(depth_at(np.eye(4))), far, views(depth_at(np.eye(4))), MARGIN)
+    assert aligned.misfit == np.inf and np.array_equal(aligned.T_world_camera, far) and not aligned.moved.any()
+
+
+def test_without_a_surface_to_compare_with_a_pose_is_trusted() -> None:
+    nothing = np.zeros((120, 160), np.float32)
+    aligned = align_pose(points(depth_at(np.eye(4))), np.eye(4), views(nothing), MARGIN)
+    assert aligned.misfit == 0 and np.array_equal(aligned.T_world_camera, np.eye(4))
+
+
+def test_edges_and_holes_are_no_surface() -> None:
+    depth = np.full((8, 8), 2.0, np.float32)
+    depth[:, 4:], depth[2, 1] = 3.0, 0.0
+    known = np.isfinite(depth_slopes(depth)[0])
+    assert known[5, 2] and not known[:, 3:5].any() and not known[1:4, 1].any() and not known[2, :3].any()
+    assert not known[[0, -1]].any() and not known[:, [0, -1]].any()

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.geometry import look_at, transform, turn_onto
+from semantic_mapper.geometry import look_at, turn_onto
 from semantic_mapper.mapping.files.formats import write_map_server
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, floor_height, occupancy_grid
+from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy_grid
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from tests.mapping.rendered_views import frame, ray_directions, small_map
 
@@ -99,23 +99,6 @@ def test_a_hole_in_the_floor_is_unknown_not_free(room: MapPoints) -> None:
     assert (grid.cells[inside(x, y, (1.3, -1.3), (1.7, -0.7), -0.03)] == UNKNOWN).all()
 
 
-def test_the_height_band_says_what_is_in_the_way(room: MapPoints) -> None:
-    grid = occupancy_grid(room, UP, 0.05, (0.03, 1.9))
-    x, y = centres(grid)
-    for name in ("sill", "lamp"):
-        assert (grid.cells[inside(x, y, *BOXES[name], -0.05)] == OCCUPIED).mean() > 0.95, name
-
-
-def test_a_world_that_looks_along_z_gets_the_same_plan() -> None:
-    """x right, y down, z forward, as where a camera is the world: the plan's x and y are the world's x and z."""
-    T_map_room = np.eye(4)
-    T_map_room[:3, :3] = ((1, 0, 0), (0, 0, -1), (0, 1, 0))
-    T_map_room[:3, 3] = (0.0, 1.3, 0.0)
-    grid = occupancy_grid(seen_from_all_round(T_map_room), np.array((0.0, -1.0, 0.0)), 0.05, HEIGHT)
-    np.testing.assert_allclose(transform(grid.T_grid_world @ T_map_room, ROOM), ROOM, atol=0.005)
-    check_room(grid)
-
-
 def test_map_server_files_read_as_nav2_reads_them(tmp_path: Path) -> None:
     cells = np.array([[FREE, OCCUPIED, UNKNOWN], [FREE, FREE, UNKNOWN]], np.int8)  # the second row has the larger y
     T = np.eye(4)
@@ -153,18 +136,6 @@ def test_a_cell_costs_as_much_as_the_dearest_surface_in_it(tmp_path: Path) -> No
     body = (tmp_path / "plan_costs.pgm").read_bytes().split(b"\n", 3)[3]
     assert list(body) == [255, 255, 255, 255, 0, 0, 20, 100, 60, 255]
     assert occupancy_grid(points, UP, 1.0, HEIGHT, floor_m=0.5).costs is None
-
-
-def test_the_floor_is_the_lowest_full_layer() -> None:
-    rng = np.random.default_rng(5)
-    layers = (
-        (-0.4, 30, 0.1),
-        (0.13, 2000, 0.01),
-        (0.9, 1500, 0.01),
-        (2.6, 4000, 0.01),
-    )  # specks, floor, table, ceiling
-    height = np.concatenate([rng.normal(z, spread, n) for z, n, spread in layers])
-    assert abs(floor_height(height) - 0.13) < 0.005
 
 
 def test_impossible_plans_are_refused(room: MapPoints) -> None:

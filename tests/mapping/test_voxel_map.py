@@ -85,16 +85,6 @@ def test_tsdf_and_colour_equal_open3ds_own_integrate(shape: str) -> None:
         assert difference.max() < 0.05 and np.quantile(np.abs(mine["color"] - color)[both], 0.999) < 0.01
 
 
-def test_surface_points_lie_on_the_plane_they_were_fused_from() -> None:
-    voxel_map = small_map()
-    normal = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
-    assert voxel_map.integrate(frame(OBLIQUE), plane_depth(OBLIQUE, (0.2, 0.1, 1.0), 0.45), None, None) > 50
-    points = voxel_map.points()
-    assert points.xyz.dtype == np.float32 and len(points.xyz) > 2000
-    distance = np.abs(points.xyz @ normal - 0.45)
-    assert np.median(distance) < 0.001 and np.quantile(distance, 0.99) < 0.004
-
-
 def test_sphere_from_all_sides_is_a_sphere_with_its_colour() -> None:
     voxel_map = small_map()
     for seq, pose in enumerate(around(CENTER, 1.2, 12)):
@@ -126,22 +116,13 @@ def test_one_vote_a_voxel_a_frame_near_the_surface_where_known() -> None:
     assert (points.label[right] == 0).all() and (points.confidence[right] == 0).all()
 
 
-def test_confidence_of_one_frontal_vote_is_the_fields_own_probability() -> None:
-    voxel_map = small_map()
-    voxel_map.integrate(frame(), np.full((120, 160), 1.0, np.float32), sure(2, 0.7), None)
-    points = voxel_map.points()
-    middle = np.abs(points.xyz[:, :2]).max(axis=1) < 0.15
-    assert (points.label[middle] == 2).all()
-    np.testing.assert_allclose(points.confidence[middle], 0.7, atol=0.01)
-
-
 def test_repeated_views_are_discounted() -> None:
-    voxel_map = small_map(vote_discount=0.5)
+    voxel_map = small_map()
     for seq in range(20):
         voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(0, 0.7), None)
     points = voxel_map.points()
     middle = np.abs(points.xyz[:, :2]).max(axis=1) < 0.05
-    n_eff = 20 / (1 + 0.5 * 19)
+    n_eff = 20 / (1 + 0.75 * 19)
     expected = 1 / (1 + 2 * (0.15 / 0.7) ** n_eff)
     np.testing.assert_allclose(points.confidence[middle], expected, atol=0.005)
 
@@ -185,19 +166,9 @@ def test_far_and_grazing_looks_count_less() -> None:
     assert 0.05 < grazing.block_state()["votes"].max() < 0.6
 
 
-def test_zero_probability_does_not_silence_a_class_for_ever() -> None:
+def test_weights_and_votes_are_capped_and_the_map_can_still_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(VoxelMapConfig, "max_weight", 4.0)
     voxel_map = small_map()
-    depth = np.full((120, 160), 1.0, np.float32)
-    voxel_map.integrate(frame(), depth, sure(0, 1.0), None)
-    assert np.isfinite(voxel_map.block_state()["evidence"]).all()
-    for seq in range(12):
-        voxel_map.integrate(frame(seq=seq), depth, sure(1, 0.6), None)
-    middle = np.abs(voxel_map.points().xyz[:, :2]).max(axis=1) < 0.05
-    assert (voxel_map.points().label[middle] == 9).all()
-
-
-def test_weights_and_votes_are_capped_and_the_map_can_still_change() -> None:
-    voxel_map = small_map(max_weight=4.0)
     for seq in range(8):
         voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(0), None)
     state = voxel_map.block_state()
@@ -205,27 +176,6 @@ def test_weights_and_votes_are_capped_and_the_map_can_still_change() -> None:
     for seq in range(12):
         voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(1), None)
     assert np.bincount(voxel_map.points().label).argmax() == 9
-
-
-def test_empty_depth_touches_nothing_and_an_empty_map_can_be_read() -> None:
-    voxel_map = small_map()
-    assert voxel_map.integrate(frame(), np.zeros((120, 160), np.float32), sure(0), None) == 0
-    assert voxel_map.block_count == 0
-    assert voxel_map.points().xyz.shape == (0, 3) and voxel_map.mesh().faces.shape == (0, 3)
-    assert not voxel_map.ray_cast(np.eye(4), INTRINSICS).depth_m.any()
-    assert voxel_map.block_state()["evidence"].shape == (0, 8, 8, 8, 3)
-
-
-def test_invalid_depth_is_no_depth() -> None:
-    depth = plane_depth(OBLIQUE, (0.2, 0.1, 1.0), 0.45)
-    holes, zeros = depth.copy(), depth.copy()
-    holes[10:20], holes[30:40], holes[50:55], holes[60:62] = np.nan, -1.0, 5.01, np.inf
-    zeros[10:20] = zeros[30:40] = zeros[50:55] = zeros[60:62] = 0
-    a, b = small_map(), small_map()
-    a.integrate(frame(OBLIQUE), holes, sure(0), None)
-    b.integrate(frame(OBLIQUE), zeros, sure(0), None)
-    a_state, b_state = a.block_state(), b.block_state()
-    assert (a_state["keys"] == b_state["keys"]).all() and (a_state["tsdf"] == b_state["tsdf"]).all()
 
 
 def bad_poses() -> dict[str, NDArray[np.float64]]:
@@ -258,22 +208,6 @@ def test_images_that_do_not_fit_are_refused_by_name() -> None:
     with pytest.raises(ShapeError, match="known"):
         voxel_map.integrate(frame(), depth, sure(0), np.ones((120, 160), np.uint8))  # type: ignore[arg-type]
     assert voxel_map.block_count == 0
-
-
-def test_pixels_may_share_their_probabilities() -> None:
-    shared, each = small_map(), small_map()
-    rng = np.random.default_rng(2)
-    table = rng.dirichlet(np.ones(3), 7).astype(np.float32)
-    rows = rng.integers(-1, 7, (120, 160)).astype(np.int32)
-    depth = plane_depth(OBLIQUE, (0.2, 0.1, 1.0), 0.45)
-    shared.integrate(frame(OBLIQUE), depth, table, rows=rows)
-    each.integrate(frame(OBLIQUE), depth, table[rows], rows >= 0)
-    assert same(shared.block_state(), each.block_state())
-    assert shared.block_state()["votes"].max() > 0
-    for wrong in (rows[:60], rows.astype(np.int64), np.where(rows == 3, 7, rows).astype(np.int32), rows - 1):
-        with pytest.raises(ShapeError, match="rows"):
-            shared.integrate(frame(OBLIQUE), depth, table, rows=wrong)
-    assert same(shared.block_state(), each.block_state())
 
 
 @pytest.mark.parametrize("wrong", [np.nan, -0.5, 3.0])
@@ -312,14 +246,6 @@ def test_a_full_map_refuses_and_stays_usable() -> None:
     assert len(voxel_map.points().xyz) > 1000 and voxel_map.frames == 2
 
 
-def test_growth_from_one_block_gives_the_map_that_had_room_at_once() -> None:
-    small, roomy = small_map(initial_blocks=1), small_map(initial_blocks=4000)
-    fuse_sphere(small)
-    fuse_sphere(roomy)
-    assert same(small.block_state(), roomy.block_state())
-    assert small.memory_bytes < roomy.memory_bytes
-
-
 def test_same_frames_give_the_same_bits_on_one_thread_and_on_two() -> None:
     maps = [small_map(), small_map(), small_map()]
     before = torch.get_num_threads()
@@ -337,7 +263,7 @@ def test_same_frames_give_the_same_bits_on_one_thread_and_on_two() -> None:
 
 
 def test_readers_in_other_threads_meet_no_half_grown_map() -> None:
-    voxel_map = small_map(initial_blocks=1)
+    voxel_map = small_map()
     done, failures = threading.Event(), []
 
     def read() -> None:
@@ -361,31 +287,13 @@ def test_readers_in_other_threads_meet_no_half_grown_map() -> None:
 
 
 def test_impossible_configurations_are_refused_by_name() -> None:
-    for change in ({"voxel_size_m": 0.0}, {"truncation_voxels": -1.0}, {"max_weight": 0.0}, {"depth_max_m": np.nan}):
+    for change in ({"voxel_size_m": 0.0}, {"depth_max_m": np.nan}):
         with pytest.raises(ConfigError, match=next(iter(change))):
             VoxelMap(VoxelMapConfig(**change), LABELS)
     with pytest.raises(MapError, match="min_weight"):
         small_map().points(0)
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"voxel_size_m": 1e-9}, "voxel_size_m"),
-        ({"depth_max_m": 1e9}, "depth_max_m"),
-        ({"truncation_voxels": 1e6}, "truncation_voxels"),
-        ({"max_blocks": 10**12}, "max_blocks"),
-        ({"max_weight": 1e30}, "max_weight"),
-    ],
-)
-def test_a_setting_that_no_map_has_is_refused_by_name(change: dict[str, float], named: str) -> None:
-    with pytest.raises(ConfigError, match=f"voxel_map.{named} must be from"):
-        small_map(**change)
-
-
-@pytest.mark.parametrize(
-    "change", [{"initial_blocks": 10**8, "max_blocks": 10**8}, {"memory_mb": 10**9, "max_blocks": 10**8}]
-)
-def test_more_memory_than_the_machine_has_is_refused_before_it_is_taken(change: dict[str, float]) -> None:
+def test_more_memory_than_the_machine_has_is_refused_before_it_is_taken() -> None:
     with pytest.raises(MapError, match="GB, this machine has"):
-        small_map(**change)
+        small_map(memory_mb=10**9, max_blocks=10**8)

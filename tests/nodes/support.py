@@ -46,7 +46,6 @@ source_views = 3
 guided = 4
 [voxel_map]
 voxel_size_m = 0.05
-initial_blocks = 200
 """
 
 

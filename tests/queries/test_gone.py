@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.mapping.storage import cleared_blocks
+from semantic_mapper.mapping.storage import changes
 from semantic_mapper.mapping.storage.block_index import pack_keys
-from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED, ClearedLog
+from semantic_mapper.mapping.storage.changes import NONE_CLEARED, ClearedBlocks
 from semantic_mapper.queries import instances
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
@@ -167,15 +167,13 @@ def test_changes_say_which_blocks_lost_surface_and_when() -> None:
 
 
 def test_rows_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cleared_blocks, "MAX_ROWS", 5)
-    log, seen = ClearedLog(), NONE_CLEARED
+    monkeypatch.setattr(changes, "MAX_ROWS", 5)
+    seen = NONE_CLEARED
     for version in range(1, 9):
-        log.add(np.arange(3), np.array([1, 0, version]), version, 1000 + version)
-        seen = seen.followed_by(log.between(version - 1, version))
-    assert log.between(0, 8).version.tolist() == seen.version.tolist() == [6, 7, 7, 8, 8]
-    assert log.between(7, 8).voxels.tolist() == [1, 8] and len(log.between(8, 8).packed) == 0
-    log.add(np.arange(9), np.arange(1, 10), 9, 1009)
-    assert log.between(0, 9).voxels.tolist() == [5, 6, 7, 8, 9]
+        columns = np.array([0, 2]), np.array([1, version]), np.full(2, version), np.full(2, 1000 + version)
+        seen = seen.followed_by(ClearedBlocks(*columns))
+    assert seen.version.tolist() == [6, 7, 7, 8, 8]
+    assert seen.between(7, 8).voxels.tolist() == [1, 8] and len(seen.between(8, 8).packed) == 0
 
 
 def test_a_client_is_told_and_its_mirror_keeps_no_ghost(tmp_path_factory: pytest.TempPathFactory) -> None:

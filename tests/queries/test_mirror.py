@@ -9,7 +9,6 @@ import threading
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -17,8 +16,8 @@ import pytest
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS
-from semantic_mapper.mapping.instance_layer import InstanceLayer
+from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS
+from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import mirror as mirror_module
@@ -179,11 +178,8 @@ def test_queries_see_whole_versions_while_another_thread_applies() -> None:
     assert not wrong and min(asked) >= 5
 
 
-@pytest.mark.parametrize("evidence", ["float32", "int16"])
-def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(
-    evidence: Literal["float32", "int16"], tmp_path: Path
-) -> None:
-    voxel_map = VoxelMap(VoxelMapConfig(evidence=evidence, unknown_below=0.6), LABELS)
+def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path) -> None:
+    voxel_map = VoxelMap(VoxelMapConfig(unknown_below=0.6), LABELS)
     for seq, pose in enumerate(poses(4)):
         integrate(voxel_map, pose, seq)
     voxel_map.note_scale(False)

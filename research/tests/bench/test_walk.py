@@ -25,7 +25,7 @@ PLAN = WalkPlan(rooms=3, returns=2, minutes=1.0, hz=0.5, width=96)
 MEMORY_MB = 30  # 541 blocks of 5 cm voxels, where a room has some 700
 CONFIG = tiny_config(
     render={"encode_width": 96, "scale": 0.25},
-    voxel_map={"voxel_size_m": 0.05, "initial_blocks": 200, "memory_mb": MEMORY_MB},
+    voxel_map={"voxel_size_m": 0.05, "memory_mb": MEMORY_MB},
     keyframes={"source_views": 2},
 )
 

@@ -30,7 +30,7 @@ guard = 1
 shares = [1.0]
 [mapper]
 render = { encode_width = 48, scale = 0.125 }
-voxel_map = { voxel_size_m = 0.05, initial_blocks = 400 }
+voxel_map = { voxel_size_m = 0.05 }
 """
 
 

@@ -5,7 +5,7 @@ typedef struct {
     F32 weight, votes; /* (capacity, 512) */
     I32 rows;          /* (B,) blocks to pack */
     I64 ends;          /* (B + 1,) to fill: where packed blocks begin and end, in float32 */
-    int64_t width;     /* float32 that the evidence of one voxel takes up */
+    int64_t classes;
 } PackedEndsArguments;
 
 KERNEL(packed_block_ends, PackedEndsArguments) {
@@ -18,7 +18,7 @@ KERNEL(packed_block_ends, PackedEndsArguments) {
             measured += weight[voxel] > 0;
             voted += votes[voxel] > 0;
         }
-        a->ends.data[n + 1] = a->ends.data[n] + MASK_FLOATS + 5 * measured + (a->width + 1) * voted;
+        a->ends.data[n + 1] = a->ends.data[n] + MASK_FLOATS + 5 * measured + (a->classes + 1) * voted;
     }
     return 0;
 }
@@ -42,14 +42,13 @@ typedef struct {
 
 KERNEL(pack_block_values, PackArguments) {
     const BlockValues *values = &a->values;
-    int64_t classes = values->evidence.shape[2], voxel_bytes = classes * values->evidence.itemsize;
-    int64_t width = evidence_floats(classes, values->evidence.itemsize);
+    int64_t classes = values->evidence.shape[2];
     for (int64_t n = 0; n < a->rows.shape[0]; n++) {
         int64_t first = (int64_t)a->rows.data[n] * BLOCK_VOXELS;
         float *data = a->data.data + a->ends.data[n];
         int64_t measured = write_mask(values->weight.data + first, (uint8_t *)data);
         int64_t voted = write_mask(values->votes.data + first, (uint8_t *)data + MASK_BYTES);
-        PackedBlock block = packed_parts(data, measured, voted, width);
+        PackedBlock block = packed_parts(data, measured, voted, classes);
         for (int64_t voxel = 0; voxel < BLOCK_VOXELS; voxel++) {
             int64_t at = first + voxel;
             if (in_mask(block.measured, voxel)) {
@@ -58,9 +57,9 @@ KERNEL(pack_block_values, PackArguments) {
                 for (int c = 0; c < 3; c++) *block.color++ = values->color.data[3 * at + c];
             }
             if (in_mask(block.voted, voxel)) {
-                memcpy(block.evidence, (const char *)values->evidence.data + at * voxel_bytes, (size_t)voxel_bytes);
+                memcpy(block.evidence, values->evidence.data + at * classes, (size_t)classes * sizeof(float));
                 *block.votes++ = values->votes.data[at];
-                block.evidence += width;
+                block.evidence += classes;
             }
         }
     }
@@ -77,12 +76,11 @@ typedef struct {
 /* Returns how many were unpacked: fewer than B where the data of the next are no packed block of this many classes. */
 KERNEL(unpack_block_values, UnpackArguments) {
     const BlockValues *values = &a->values;
-    int64_t classes = values->evidence.shape[2], voxel_bytes = classes * values->evidence.itemsize;
-    int64_t width = evidence_floats(classes, values->evidence.itemsize);
+    int64_t classes = values->evidence.shape[2];
     for (int64_t n = 0; n < a->rows.shape[0]; n++) {
         PackedBlock block;
         int64_t begin = a->ends.data[n], end = a->ends.data[n + 1];
-        if (!open_packed(a->data.data + begin, end - begin, width, &block)) return n;
+        if (!open_packed(a->data.data + begin, end - begin, classes, &block)) return n;
         for (int64_t voxel = 0; voxel < BLOCK_VOXELS; voxel++) {
             int64_t at = a->rows.data[n] * BLOCK_VOXELS + voxel;
             if (in_mask(block.measured, voxel)) {
@@ -91,9 +89,9 @@ KERNEL(unpack_block_values, UnpackArguments) {
                 for (int c = 0; c < 3; c++) values->color.data[3 * at + c] = *block.color++;
             }
             if (in_mask(block.voted, voxel)) {
-                memcpy((char *)values->evidence.data + at * voxel_bytes, block.evidence, (size_t)voxel_bytes);
+                memcpy(values->evidence.data + at * classes, block.evidence, (size_t)classes * sizeof(float));
                 values->votes.data[at] = *block.votes++;
-                block.evidence += width;
+                block.evidence += classes;
             }
         }
     }

@@ -9,7 +9,6 @@
 typedef struct {
     F32 data;                         /* packed blocks */
     I64 ends;                         /* (B + 1,) */
-    int64_t itemsize;                 /* of their evidence */
     I64 rows;                         /* (B,) of the result */
     U8 ids;                           /* (L + 1,) of the classes, and the ignore id */
     double vote_discount, unknown_below;
@@ -27,7 +26,7 @@ static int8_t tsdf_steps(float tsdf) {
 }
 
 KERNEL(compact_blocks, CompactArguments) {
-    int64_t classes = a->ids.shape[0] - 1, width = evidence_floats(classes, a->itemsize);
+    int64_t classes = a->ids.shape[0] - 1;
     uint8_t ignore_id = a->ids.data[classes];
     for (int64_t n = 0; n < a->rows.shape[0]; n++) {
         int64_t first = a->rows.data[n] * BLOCK_VOXELS;
@@ -38,7 +37,7 @@ KERNEL(compact_blocks, CompactArguments) {
         memset(a->computed.data + first, 0, BLOCK_VOXELS);
         PackedBlock block;
         int64_t begin = a->ends.data[n], end = a->ends.data[n + 1];
-        if (!open_packed(a->data.data + begin, end - begin, width, &block)) continue;
+        if (!open_packed(a->data.data + begin, end - begin, classes, &block)) continue;
         for (int64_t voxel = 0; voxel < BLOCK_VOXELS; voxel++) {
             int64_t at = first + voxel;
             bool observed = false;
@@ -54,12 +53,12 @@ KERNEL(compact_blocks, CompactArguments) {
             if (in_mask(block.voted, voxel)) {
                 if (observed) {
                     double confidence;
-                    int64_t best = decide(block.evidence, a->itemsize, classes, *block.votes, a->vote_discount,
+                    int64_t best = decide_stored(block.evidence, classes, *block.votes, a->vote_discount,
                                           a->unknown_below, &confidence);
                     a->label.data[at] = best < 0 ? ignore_id : a->ids.data[best];
                     a->confidence.data[at] = to_byte(confidence * CONFIDENCE_STEPS);
                 }
-                block.evidence += width, block.votes++;
+                block.evidence += classes, block.votes++;
             }
         }
     }

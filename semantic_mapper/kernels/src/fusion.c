@@ -3,7 +3,7 @@
 
 #include "see_through.h"
 
-#define PROBABILITY_FLOOR 1e-4f /* of mapping/fusion/evidence.py */
+#define PROBABILITY_FLOOR 1e-4f /* of mapping/fusion/fuse.py */
 #define FULL_TRUST_RANGE_M 2.0f /* of mapping/fusion/fuse.py, as the next */
 #define LEAST_COSINE 0.2f
 
@@ -95,8 +95,6 @@ typedef struct {
     U8 rgb;    /* (H, W, 3) */
     F32 trust; /* (H, W) fraction of `look` that each depth weighs, or (0, 0): 1 */
     Votes votes;
-    F32 dither; /* see evidence.h */
-    int64_t moment;
     double look, weight_cap; /* what one depth weighs, and what all of its kind together may */
     DepthBounds bounds;      /* of the depth; no levels: nothing is cleared */
     I64 cleared;             /* (B,) to fill: voxels of a surface that were cleared */
@@ -114,7 +112,6 @@ static int64_t fuse_block(const FuseArguments *a, int64_t block, const VoxelOffs
     bool weighted = a->trust.shape[0] > 0, clears = a->bounds.nearest.shape[0] > 0;
     int64_t cleared = 0;
     int64_t classes = a->votes.log_p.shape[1];
-    uint64_t seed = dither_seed(key, a->moment);
     VoxelsInView found;
     int64_t count = look_up_voxels(key, offsets, &a->camera, a->limits.voxel_size, &a->depth, truncation,
                                    (float)a->limits.depth_max, &found);
@@ -136,8 +133,7 @@ static int64_t fuse_block(const FuseArguments *a, int64_t block, const VoxelOffs
         }
         float weight = a->votes.weights.data[pixel];
         if (weight > 0 && fabsf(found.distance[k]) <= band)
-            add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap,
-                     a->dither.data, first_dither(seed, voxel));
+            add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap);
     }
     return cleared;
 }

@@ -1,4 +1,4 @@
-/* The memory of the voxel grid; see mapping/storage/grid_buffers.py. */
+/* The memory of the voxel grid; see mapping/storage/block_grid.py. */
 #pragma once
 
 #include "block_index.h"
@@ -8,7 +8,7 @@
 #define MAX_CLASSES 256   /* class ids are bytes */
 #define LARGEST_STEP 0.95 /* of the TSDF: two neighbours that differ by more straddle a depth edge, not a surface */
 
-/* Weights of mapping/fusion/depth_trust.py: from the first on a surface was measured, up to the second computed. */
+/* Weights of mapping/fusion/fuse.py: from the first on a surface was measured, up to the second computed. */
 #define MEASURED 1.0f
 #define COMPUTED_CAP (31.0f / 32.0f)
 
@@ -17,7 +17,7 @@ typedef struct {
     F32 tsdf;          /* (capacity, 512) signed distance over truncation, -1 to 1 */
     F32 weight;        /* (capacity, 512) */
     F32 color;         /* (capacity, 512, 3) 0 to 255 */
-    AnyArray evidence; /* (capacity, 512, L) float32 or int16; see evidence.h */
+    F32 evidence;      /* (capacity, 512, L) sum of weighted log probabilities */
     F32 votes;         /* (capacity, 512) */
 } GridBuffers;
 

@@ -18,7 +18,7 @@ typedef struct {
     F64 R, t; /* their point p is the source's R (p - t), in voxels; (3, 3) and (3,) */
     BlockIndex index;
     GridBuffers buffers; /* of the source */
-    BlockValues moved;   /* (B, ...) zeros, to fill; float32 evidence */
+    BlockValues moved;   /* (B, ...) zeros, to fill */
 } ResampleArguments;
 
 static void find_corners(const double *p, const BlockIndex *index, Corners *corners) {
@@ -73,7 +73,7 @@ static void blend_geometry(const Corners *corners, const GridBuffers *buffers, c
 }
 
 static void blend_votes(const Corners *corners, const GridBuffers *buffers, const BlockValues *moved, int64_t to) {
-    int64_t classes = moved->evidence.shape[2], itemsize = buffers->evidence.itemsize, first[8];
+    int64_t classes = moved->evidence.shape[2], first[8];
     double votes = 0.0, voted = 0.0, factor[8];
     int count = 0;
     for (int i = 0; i < corners->count; i++) {
@@ -82,15 +82,14 @@ static void blend_votes(const Corners *corners, const GridBuffers *buffers, cons
         voted += corners->fraction[i];
         votes += corners->fraction[i] * voxel_votes;
         first[count] = corners->at[i] * classes;
-        factor[count++] = corners->fraction[i] * evidence_scale(itemsize, voxel_votes);
+        factor[count++] = corners->fraction[i];
     }
     if (voted == 0 || voted < LEAST_OBSERVED * corners->total) return;
     moved->votes.data[to] = (float)(votes / voted);
     for (int64_t c = 0; c < classes; c++) {
         double evidence = 0.0;
-        for (int i = 0; i < count; i++)
-            evidence += factor[i] * evidence_at(buffers->evidence.data, itemsize, first[i] + c);
-        ((float *)moved->evidence.data)[to * classes + c] = (float)(evidence / voted);
+        for (int i = 0; i < count; i++) evidence += factor[i] * (double)buffers->evidence.data[first[i] + c];
+        moved->evidence.data[to * classes + c] = (float)(evidence / voted);
     }
 }
 
@@ -119,12 +118,12 @@ KERNEL(resample_blocks, ResampleArguments) {
 typedef struct {
     I32 blocks;          /* (B,) buffer indices of the blocks to add to */
     GridBuffers buffers; /* of the target */
-    BlockValues added;   /* (B, ...) float32 evidence */
+    BlockValues added;   /* (B, ...) */
     double cap;          /* of weights and votes */
 } AddBlocksArguments;
 
 static void add_voxel(const GridBuffers *buffers, int64_t at, const BlockValues *added, int64_t from, double cap) {
-    int64_t classes = buffers->evidence.shape[2], itemsize = buffers->evidence.itemsize;
+    int64_t classes = buffers->evidence.shape[2];
     double mine = buffers->weight.data[at], theirs = added->weight.data[from];
     if (theirs > 0) {
         double weight = mine + theirs;
@@ -139,12 +138,11 @@ static void add_voxel(const GridBuffers *buffers, int64_t at, const BlockValues 
     }
     double old = buffers->votes.data[at], votes = old + (double)added->votes.data[from];
     if (!(added->votes.data[from] > 0)) return;
-    double keep = min_d(1.0, cap / votes), scale = evidence_scale(itemsize, old);
+    double keep = min_d(1.0, cap / votes);
     buffers->votes.data[at] = (float)(votes * keep);
     for (int64_t c = 0; c < classes; c++) {
-        double sum = scale * evidence_at(buffers->evidence.data, itemsize, at * classes + c);
-        sum += (double)((const float *)added->evidence.data)[from * classes + c];
-        store_evidence(buffers->evidence, at * classes + c, sum, votes, keep);
+        float *evidence = buffers->evidence.data + at * classes + c;
+        *evidence = (float)(((double)*evidence + (double)added->evidence.data[from * classes + c]) * keep);
     }
 }
 

@@ -12,7 +12,7 @@
 typedef struct {
     F32 tsdf, weight;  /* (B, 512) */
     F32 color;         /* (B, 512, 3) */
-    AnyArray evidence; /* (B, 512, L) float32 or int16 */
+    F32 evidence;      /* (B, 512, L) */
     F32 votes;         /* (B, 512) */
 } BlockValues;
 
@@ -31,21 +31,18 @@ static inline int64_t count_mask(const uint8_t *mask) {
     return count;
 }
 
-/* How many float32 the evidence of one voxel takes up: whole ones. */
-static inline int64_t evidence_floats(int64_t classes, int64_t itemsize) { return (classes * itemsize + 3) / 4; }
-
 /* The parts of a packed block with this many measured and voted voxels. */
-static inline PackedBlock packed_parts(float *data, int64_t measured, int64_t voted, int64_t width) {
+static inline PackedBlock packed_parts(float *data, int64_t measured, int64_t voted, int64_t classes) {
     float *tsdf = data + MASK_FLOATS, *evidence = tsdf + 5 * measured;
     uint8_t *masks = (uint8_t *)data;
     return (PackedBlock){masks,    masks + MASK_BYTES,     tsdf, tsdf + measured, tsdf + 2 * measured,
-                         evidence, evidence + voted * width};
+                         evidence, evidence + voted * classes};
 }
 
 /* The parts of a packed block as its masks say; false where it has not the size that they ask for. */
-static inline bool open_packed(float *data, int64_t floats, int64_t width, PackedBlock *block) {
+static inline bool open_packed(float *data, int64_t floats, int64_t classes, PackedBlock *block) {
     if (floats < MASK_FLOATS) return false;
     int64_t measured = count_mask((uint8_t *)data), voted = count_mask((uint8_t *)data + MASK_BYTES);
-    *block = packed_parts(data, measured, voted, width);
-    return floats == MASK_FLOATS + 5 * measured + (width + 1) * voted;
+    *block = packed_parts(data, measured, voted, classes);
+    return floats == MASK_FLOATS + 5 * measured + (classes + 1) * voted;
 }

@@ -1,4 +1,4 @@
-/* Color, class and confidence of points; see mapping/views/readout.py. */
+/* Color, class and confidence of points; see mapping/views/ray_casting.py. */
 #include "readout.h"
 
 typedef struct {
@@ -23,12 +23,12 @@ KERNEL(read_map_points, ReadPointsArguments) {
 }
 
 typedef struct {
-    AnyArray evidence; /* (L,) float32, float64 or int16 */
+    F32 evidence; /* (L,) */
     double votes, vote_discount, unknown_below;
     F64 confidence; /* (1,) */
 } DecideArguments;
 
 KERNEL(decide_voxel, DecideArguments) {
-    return decide(a->evidence.data, a->evidence.itemsize, a->evidence.shape[0], a->votes, a->vote_discount,
+    return decide_stored(a->evidence.data, a->evidence.shape[0], a->votes, a->vote_discount,
                   a->unknown_below, a->confidence.data);
 }

@@ -49,7 +49,7 @@ ALWAYS_INLINE double sample_tsdf(const double *p, const BlockIndex *index, const
  * votes. */
 static inline double gather(const double *p, const BlockIndex *index, const GridBuffers *buffers, double *color,
                             double *evidence, float *least_weight) {
-    int64_t classes = buffers->evidence.shape[2], itemsize = buffers->evidence.itemsize;
+    int64_t classes = buffers->evidence.shape[2];
     int64_t x0 = floor_int(p[0]), y0 = floor_int(p[1]), z0 = floor_int(p[2]);
     double fx = p[0] - (double)x0, fy = p[1] - (double)y0, fz = p[2] - (double)z0;
     double color_sum = 0.0, vote_sum = 0.0, votes = 0.0;
@@ -72,9 +72,8 @@ static inline double gather(const double *p, const BlockIndex *index, const Grid
         if (voxel_votes > 0) {
             vote_sum += fraction;
             votes += fraction * (double)voxel_votes;
-            double scale = fraction * evidence_scale(itemsize, voxel_votes);
-            for (int64_t c = 0; c < classes; c++)
-                evidence[c] += scale * evidence_at(buffers->evidence.data, itemsize, at * classes + c);
+            const float *own = buffers->evidence.data + at * classes;
+            for (int64_t c = 0; c < classes; c++) evidence[c] += fraction * (double)own[c];
         }
     }
     if (color_sum > 0)
@@ -86,30 +85,30 @@ static inline double gather(const double *p, const BlockIndex *index, const Grid
     return votes;
 }
 
-/* How much more evidence there is for one class than for another, in the precision of the array. */
-static inline double evidence_difference(const void *evidence, int64_t itemsize, int64_t a, int64_t b) {
-    if (itemsize == 4) return ((const float *)evidence)[a] - ((const float *)evidence)[b];
-    return evidence_at(evidence, itemsize, a) - evidence_at(evidence, itemsize, b);
+/* What evidence is multiplied with to be that of independent votes: n_eff / n. */
+static inline double vote_worth(double votes, double vote_discount) {
+    return votes > 1 ? 1.0 / (1.0 + vote_discount * (votes - 1.0)) : 1.0 / votes;
 }
 
-/* Channel and confidence of one voxel's evidence (L,), of any type; -1 and 0 without votes. Below `unknown_below` the
- * channel is -1, too, and the confidence that of the likeliest class. */
-static inline int64_t decide(const void *evidence, int64_t itemsize, int64_t classes, double votes,
-                             double vote_discount, double unknown_below, double *confidence) {
-    *confidence = 0.0;
-    if (votes <= 0) return -1;
-    double worth = votes > 1 ? 1.0 / (1.0 + vote_discount * (votes - 1.0)) : 1.0 / votes; /* n_eff / n */
-    worth *= evidence_scale(itemsize, votes);
-    int64_t best = 0;
-    double most = evidence_at(evidence, itemsize, 0), total = 0.0;
-    for (int64_t c = 1; c < classes; c++) {
-        double value = evidence_at(evidence, itemsize, c);
-        if (value > most) most = value, best = c;
+/* Channel and confidence of one voxel's evidence (L,); -1 and 0 without votes. Below `unknown_below` the channel is -1,
+ * too, and the confidence that of the likeliest class. One function for evidence as it is stored (float) and one for
+ * evidence that was interpolated (double): differences are taken in the precision of the array. */
+#define DECIDE(name, type)                                                                                          \
+    static inline int64_t name(const type *evidence, int64_t classes, double votes, double vote_discount,           \
+                               double unknown_below, double *confidence) {                                          \
+        *confidence = 0.0;                                                                                          \
+        if (votes <= 0) return -1;                                                                                  \
+        double worth = vote_worth(votes, vote_discount), total = 0.0;                                               \
+        int64_t best = 0;                                                                                           \
+        for (int64_t c = 1; c < classes; c++)                                                                       \
+            if (evidence[c] > evidence[best]) best = c;                                                             \
+        for (int64_t c = 0; c < classes; c++) total += exp((evidence[c] - evidence[best]) * worth);                 \
+        *confidence = 1.0 / total;                                                                                  \
+        return *confidence < unknown_below ? -1 : best;                                                             \
     }
-    for (int64_t c = 0; c < classes; c++) total += exp(evidence_difference(evidence, itemsize, c, best) * worth);
-    *confidence = 1.0 / total;
-    return *confidence < unknown_below ? -1 : best;
-}
+DECIDE(decide_stored, float)
+DECIDE(decide_interpolated, double)
+#undef DECIDE
 
 /* Channel and confidence of a point; writes its color to `rgb` (3,) and whether all around it was measured. At most
  * MAX_CLASSES classes. */
@@ -121,5 +120,5 @@ static inline int64_t read_point(const double *p, const BlockIndex *index, const
     double votes = gather(p, index, buffers, color, evidence, &least_weight);
     *measured = least_weight >= MEASURED && least_weight < INFINITY;
     for (int c = 0; c < 3; c++) rgb[c] = to_byte(color[c]);
-    return decide(evidence, sizeof(double), buffers->evidence.shape[2], votes, vote_discount, unknown_below, confidence);
+    return decide_interpolated(evidence, buffers->evidence.shape[2], votes, vote_discount, unknown_below, confidence);
 }

@@ -66,11 +66,11 @@ static inline bool weaken(const GridBuffers *buffers, int64_t at, const uint8_t 
         buffers->weight.data[at] = kept;
         return false;
     }
-    int64_t classes = buffers->evidence.shape[2], bytes = classes * buffers->evidence.itemsize;
+    int64_t classes = buffers->evidence.shape[2];
     buffers->tsdf.data[at] = 1.0f;
     buffers->weight.data[at] = MEASURED;
     for (int c = 0; c < 3; c++) buffers->color.data[3 * at + c] = rgb[c];
     buffers->votes.data[at] = 0.0f;
-    memset((uint8_t *)buffers->evidence.data + at * bytes, 0, (size_t)bytes);
+    memset(buffers->evidence.data + at * classes, 0, (size_t)classes * sizeof(float));
     return true;
 }

@@ -1,4 +1,4 @@
-/* The surface of a map in patches of one block; see mapping/views/surface_patches.py. */
+/* The surface of a map in patches of one block; see mapping/views/virtual_views.py. */
 #include "readout.h"
 
 typedef struct {
@@ -14,15 +14,14 @@ typedef struct {
 
 KERNEL(sum_surface_patches, SumPatchesArguments) {
     const GridBuffers *buffers = &a->buffers;
-    int64_t classes = buffers->evidence.shape[2], itemsize = buffers->evidence.itemsize;
+    int64_t classes = buffers->evidence.shape[2];
     for (int64_t n = start; n < stop; n++) {
         for (int64_t voxel = 0; voxel < BLOCK_VOXELS; voxel++) {
             int64_t at = a->blocks.data[n] * (int64_t)BLOCK_VOXELS + voxel;
             if (buffers->weight.data[at] <= 0 || fabsf(buffers->tsdf.data[at]) > a->near) continue;
             double votes = buffers->votes.data[at], confidence;
             if (votes < a->max_votes) {
-                decide((const char *)buffers->evidence.data + at * classes * itemsize, itemsize, classes, votes,
-                       a->vote_discount, 0.0, &confidence);
+                decide_stored(buffers->evidence.data + at * classes, classes, votes, a->vote_discount, 0.0, &confidence);
                 a->need.data[n] += (1.0 - confidence) / (1.0 + votes);
             }
             for (int axis = 0; axis < 3; axis++)

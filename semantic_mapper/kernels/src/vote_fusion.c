@@ -1,4 +1,4 @@
-/* Class votes without a measurement; see mapping/fusion/vote_fusion.py. */
+/* Class votes without a measurement; see mapping/fusion/fuse.py. */
 #include "voxel_lookup.h"
 
 typedef struct {
@@ -9,8 +9,6 @@ typedef struct {
     F32 depth; /* (H, W) metres */
     Votes votes;
     double max_votes; /* voxels with this many take none */
-    F32 dither;       /* see evidence.h */
-    int64_t moment;
 } VoteArguments;
 
 /* As fuse_block of fusion.c votes, at voxels that a frame has measured before. */
@@ -19,7 +17,6 @@ static void vote_block(const VoteArguments *a, int64_t block, const VoxelOffsets
     const int32_t *key = buffers->keys.data + 3 * block;
     float band = (float)a->limits.vote_band, cap = (float)a->limits.max_weight, max_votes = (float)a->max_votes;
     int64_t classes = a->votes.log_p.shape[1];
-    uint64_t seed = dither_seed(key, a->moment);
     VoxelsInView found;
     int64_t count = look_up_voxels(key, offsets, &a->camera, a->limits.voxel_size, &a->depth, band,
                                    (float)a->limits.depth_max, &found);
@@ -28,8 +25,7 @@ static void vote_block(const VoteArguments *a, int64_t block, const VoxelOffsets
         float weight = a->votes.weights.data[pixel];
         if (weight <= 0 || fabsf(found.distance[k]) > band) continue;
         if (buffers->weight.data[at] > 0 && buffers->votes.data[at] < max_votes)
-            add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap,
-                     a->dither.data, first_dither(seed, voxel));
+            add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap);
     }
 }
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid, GridBuffers
 from semantic_mapper.mapping.storage.block_index import BlockIndex, find_blocks, pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE, GridBuffers
 from semantic_mapper.types import Float32, Float64, Int32, Int64
 
 MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh

@@ -113,7 +113,7 @@ def _escaped(name: str) -> str:
 def write_obj(
     path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials: bool, scale_known: bool = True
 ) -> tuple[Path, Path]:
-    """Write ``path`` and, beside it, the material library of the same stem (.mtl).
+    """Write ``path`` and, next to it, the material library of the same stem (.mtl).
 
     OBJ knows neither units nor an up axis: vertices are in the world frame, metres, to the micrometre. Each has its
     colour behind its position (``v x y z r g b``), as most programs read it. A face is of the class that most of its
@@ -279,7 +279,7 @@ _UNKNOWN_RAW = 255  # mode raw: grey levels 0 to 100 are the costs themselves, a
 
 
 def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
-    """Write the YAML and, beside it, the PGM of the same stem; of a grid with costs, these as ``STEM_costs``, too.
+    """Write the YAML and, next to it, the PGM of the same stem; of a grid with costs, these as ``STEM_costs``, too.
 
     The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
     pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.

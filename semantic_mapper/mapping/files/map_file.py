@@ -3,7 +3,7 @@
 ``numpy.load`` opens it: array ``tsdf`` of the first chunk is ``"000000/tsdf"``. Only voxels that hold something are
 stored: TSDF, weight and colour where there was a measurement, evidence and votes where there was a vote. Blocks stand
 in lexicographic order, and nothing in the file depends on when or where it was written: the same map gives the same
-bytes. The manifest (``map_manifest``) holds a SHA-256 of each chunk; its own is the comment of the zip.
+bytes. The manifest holds the settings, the classes, and a SHA-256 of each chunk; its own is the comment of the zip.
 
 Writing and reading take memory for one chunk, whatever the size of the map.
 """
@@ -17,32 +17,33 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.config import Config, NotNegative, VoxelMapConfig, convert_config
 from semantic_mapper.errors import ConfigError, MapError, PoseError
 from semantic_mapper.files import atomic_write, open_regular
 from semantic_mapper.geometry import check_pose
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
-from semantic_mapper.mapping.files.map_manifest import (
-    MEND,
-    InstanceTable,
-    MapChunk,
-    MapManifest,
-    PlaceTable,
-    digest,
-    encode_manifest,
-    parse_manifest,
-)
-from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
-from semantic_mapper.mapping.instance_layer import InstanceLayer
+from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
+from semantic_mapper.mapping.map_types import InstanceLayer
+from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
 from semantic_mapper.mapping.storage.changes import BlockChanges, ChosenBlocks, compact_saved
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
+
+FORMAT = "semantic-mapper voxel map"
+FORMAT_VERSION = 3
+CHUNK_BLOCKS = 256  # at most; what is in memory at a time while a map is saved or loaded
+ADVICE = "Use another copy, or make the map again from its log with `semantic-mapper replay`"
+
+Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+Corner = tuple[float, float, float]
 
 BlockPart = tuple[NDArray[np.int32], BlockValues]  # keys (B, 3) and voxels
 
@@ -59,7 +60,7 @@ _ARRAYS = {  # name -> dtype; in the order of the file
     "tsdf": "<f4",  # (M,)
     "weight": "<f4",  # (M,)
     "color": "<f4",  # (M, 3)
-    "evidence": "<f4",  # (V, L); of ``voxel_map.evidence`` "int16" "<i2"
+    "evidence": "<f4",  # (V, L)
     "votes": "<f4",  # (V,)
 }
 _INSTANCES = {"packed": "<i8", "number": "<i4"}  # (N,) each, of ``InstanceLayer``; only where there is one
@@ -71,8 +72,118 @@ _PLACES = {  # of ``Place``; only where there are any
     "points": "<f4",  # (N, 3)
     "descriptors": "|u1",  # (N, 128)
 }
-_EVIDENCE = {"float32": "<f4", "int16": "<i2"}
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
+
+
+class MapChunk(Config, frozen=True):
+    """Blocks that are stored together.
+
+    Args:
+        blocks: How many.
+        measured, voted: Their voxels with a depth measurement, and with a class vote.
+        sha256: Of the chunk's arrays, in their order.
+    """
+
+    blocks: Annotated[int, msgspec.Meta(ge=1, le=CHUNK_BLOCKS)]
+    measured: Annotated[int, msgspec.Meta(ge=0, le=CHUNK_BLOCKS * BLOCK_VOXELS)]
+    voted: Annotated[int, msgspec.Meta(ge=0, le=CHUNK_BLOCKS * BLOCK_VOXELS)]
+    sha256: Digest
+
+
+class InstanceTable(Config, frozen=True):
+    """The voxels that belong to things (``instance_layer``).
+
+    Args:
+        voxels: How many.
+        sha256: Of its arrays, in their order.
+    """
+
+    voxels: NotNegative
+    sha256: Digest
+
+
+class PlaceTable(Config, frozen=True):
+    """The places that the map is found again by (``localization.places``).
+
+    Args:
+        places: How many.
+        features: Of all of them.
+        cameras: Names of the cameras that have seen them.
+        sha256: Of its arrays, in their order.
+    """
+
+    places: NotNegative
+    features: NotNegative
+    cameras: tuple[str, ...]
+    sha256: Digest
+
+
+class MapManifest(Config, frozen=True, kw_only=True):
+    """What is known of a saved map without reading its blocks.
+
+    Args:
+        format, version: Of the file.
+        config, label_set: Of the map.
+        frames: Frames fused so far.
+        last_stamp_ns: Stamp of the last of them, 0 before the first.
+        blocks: Blocks of 8^3 voxels.
+        bounds_m: Lowest and highest corner of all blocks, metres in the world; None of an empty map.
+        chunks: In the order of the file.
+        scale: Whether lengths are metres.
+        refined: Digest of the weights that refined the map; empty where none did.
+        instances: Which voxels belong to which thing, of maps that were refined so.
+        places: What it is found again by.
+    """
+
+    format: str = FORMAT
+    version: int = FORMAT_VERSION
+    config: VoxelMapConfig
+    label_set: LabelSet
+    frames: NotNegative
+    last_stamp_ns: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+    blocks: NotNegative = 0
+    bounds_m: tuple[Corner, Corner] | None = None
+    chunks: tuple[MapChunk, ...] = ()
+    scale: Literal["metres", "unknown"] = "metres"
+    refined: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
+    instances: InstanceTable | None = None
+    places: PlaceTable | None = None
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether lengths are metres."""
+        return self.scale != SCALE_UNKNOWN
+
+
+def encode_manifest(manifest: MapManifest) -> bytes:
+    """JSON that is the same for the same map."""
+    return msgspec.json.format(msgspec.json.encode(manifest), indent=1)
+
+
+def parse_manifest(content: bytes, where: str) -> MapManifest:
+    """Read a manifest and check it.
+
+    Raises:
+        MapError: it is not one, of another format version, or says what cannot be.
+    """
+    plain = _plain(content, where)
+    try:
+        manifest = convert_config(plain, MapManifest, where)
+    except ConfigError as error:
+        raise MapError(f"{error}. {ADVICE}") from error
+    if manifest.blocks != sum(chunk.blocks for chunk in manifest.chunks):
+        raise MapError(f"{where}: its chunks do not hold {manifest.blocks} blocks. {ADVICE}")
+    if manifest.blocks > manifest.config.max_blocks:
+        raise MapError(f"{where}: {manifest.blocks} blocks, but max_blocks {manifest.config.max_blocks}. {ADVICE}")
+    for n, chunk in enumerate(manifest.chunks):
+        if max(chunk.measured, chunk.voted) > chunk.blocks * BLOCK_VOXELS:
+            raise MapError(f"{where}: chunk {n} has more voxels than its {chunk.blocks} blocks can hold. {ADVICE}")
+    return manifest
+
+
+def digest(content: bytes) -> str:
+    """SHA-256 in hex."""
+    return hashlib.sha256(content).hexdigest()
 
 
 def write_map(
@@ -99,14 +210,13 @@ def write_map(
     """
     chunks: list[MapChunk] = []
     corners: list[NDArray[np.int32]] = []
-    dtypes = _dtypes(manifest)
     try:
         with (
             atomic_write(path, sync="folder") as file,
             zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL) as archive,
         ):
             for keys, values in parts:
-                chunks.append(_write_chunk(archive, len(chunks), keys, values, dtypes))
+                chunks.append(_write_chunk(archive, len(chunks), keys, values))
                 corners += [keys.min(axis=0), keys.max(axis=0) + 1]
             blocks = sum(chunk.blocks for chunk in chunks)
             bounds = _bounds_m(corners, manifest.config.voxel_size_m)
@@ -153,7 +263,7 @@ def open_map(path: Path) -> Iterator[MapReader]:
     except OSError as error:
         raise MapError(f"{path}: damaged or not a map: {error.strerror}") from error
     with file:
-        with _told(f"{path}: damaged or not a map"):
+        with _explained(f"{path}: damaged or not a map"):
             archive = zipfile.ZipFile(file)
         with archive:
             yield MapReader(path, archive, _read_manifest(path, file, archive))
@@ -187,7 +297,7 @@ class MapReader:
             keys, values = _unpack(self._read_chunk(n, chunk, where), chunk, where)
             packed = pack_keys(keys)
             if np.abs(keys.astype(np.int64)).max() >= KEY_LIMIT or not (np.diff(packed, prepend=last) > 0).all():
-                raise MapError(f"{where}: block coordinates are out of range or not in order. {MEND}")
+                raise MapError(f"{where}: block coordinates are out of range or not in order. {ADVICE}")
             last = int(packed[-1])
             yield keys, values
             del values  # while the next ones are read
@@ -220,7 +330,7 @@ class MapReader:
         shapes = dict.fromkeys(_INSTANCES, (table.voxels,))
         layer = InstanceLayer(**self._read_arrays("instances", shapes, _INSTANCES, table.sha256, where))
         if not layer.is_sound:
-            raise MapError(f"{where}: voxels are not in order, or numbers are negative. {MEND}")
+            raise MapError(f"{where}: voxels are not in order, or numbers are negative. {ADVICE}")
         return layer
 
     def places(self) -> tuple[Place, ...]:
@@ -239,14 +349,14 @@ class MapReader:
         counts, camera = arrays["features"], arrays["camera"]
         sound = (counts >= 0).all() and counts.sum() == all_ and np.isfinite(arrays["points"]).all()
         if not (sound and (camera >= 0).all() and (camera < len(table.cameras)).all()):
-            raise MapError(f"{where}: their numbers do not fit each other. {MEND}")
+            raise MapError(f"{where}: their numbers do not fit each other. {ADVICE}")
         ends = np.cumsum(counts)
         places: list[Place] = []
         for n, pose in enumerate(arrays["pose"]):
             try:
                 check_pose(pose, where)
             except PoseError as error:
-                raise MapError(f"{error}. {MEND}") from error
+                raise MapError(f"{error}. {ADVICE}") from error
             rows = slice(int(ends[n] - counts[n]), int(ends[n]))
             name, stamp_ns = table.cameras[camera[n]], int(arrays["stamp_ns"][n])
             places.append(Place(name, stamp_ns, pose, arrays["points"][rows], arrays["descriptors"][rows]))
@@ -254,7 +364,7 @@ class MapReader:
 
     def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> dict[str, NDArray[Any]]:
         shapes = _shapes(chunk, len(self.manifest.label_set))
-        return self._read_arrays(f"{n:06d}", shapes, _dtypes(self.manifest), chunk.sha256, where)
+        return self._read_arrays(f"{n:06d}", shapes, _ARRAYS, chunk.sha256, where)
 
     def _read_arrays(
         self, folder: str, shapes: dict[str, tuple[int, ...]], dtypes: dict[str, str], sha256: str, where: str
@@ -266,21 +376,15 @@ class MapReader:
             size = len(head) + int(np.prod(shape)) * np.dtype(dtypes[name]).itemsize
             content = _read_member(self._archive, f"{folder}/{name}.npy", size, f"{where}: {name}")
             if not content.startswith(head):
-                raise MapError(f"{where}: {name} is not an array {dtypes[name]} of shape {shape}. {MEND}")
+                raise MapError(f"{where}: {name} is not an array {dtypes[name]} of shape {shape}. {ADVICE}")
             hashed.update(content)
             arrays[name] = np.frombuffer(content, dtypes[name], offset=len(head)).reshape(shape)
         if hashed.hexdigest() != sha256:
-            raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {MEND}")
+            raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {ADVICE}")
         return arrays
 
 
-def _dtypes(manifest: MapManifest) -> dict[str, str]:
-    return {**_ARRAYS, "evidence": _EVIDENCE[manifest.config.evidence]}
-
-
-def _write_chunk(
-    archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], values: BlockValues, dtypes: dict[str, str]
-) -> MapChunk:
+def _write_chunk(archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], values: BlockValues) -> MapChunk:
     measured, voted = values.weight > 0, values.votes > 0
     arrays = {
         "keys": keys,
@@ -292,7 +396,7 @@ def _write_chunk(
         "evidence": values.evidence[voted],
         "votes": values.votes[voted],
     }
-    found = _write_arrays(archive, f"{n:06d}", arrays, dtypes)
+    found = _write_arrays(archive, f"{n:06d}", arrays, _ARRAYS)
     return MapChunk(blocks=len(keys), measured=int(measured.sum()), voted=int(voted.sum()), sha256=found)
 
 
@@ -333,7 +437,7 @@ def _unpack(arrays: dict[str, NDArray[Any]], chunk: MapChunk, where: str) -> Blo
     measured = np.unpackbits(arrays["measured"], axis=1).astype(np.bool_)
     voted = np.unpackbits(arrays["voted"], axis=1).astype(np.bool_)
     if (int(measured.sum()), int(voted.sum())) != (chunk.measured, chunk.voted):
-        raise MapError(f"{where}: its masks and its values do not fit each other. {MEND}")
+        raise MapError(f"{where}: its masks and its values do not fit each other. {ADVICE}")
     full: dict[str, NDArray[Any]] = {}
     for name in BlockValues._fields:
         mask = voted if name in ("evidence", "votes") else measured
@@ -369,21 +473,21 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
         raise MapError(f"{path}: not a map file: there is no {_MANIFEST} in it")
     size = archive.getinfo(_MANIFEST).file_size
     if size > _MAX_MANIFEST_BYTES:
-        raise MapError(f"{where} is damaged: {size} bytes are too many. {MEND}")
+        raise MapError(f"{where} is damaged: {size} bytes are too many. {ADVICE}")
     content = _read_member(archive, _MANIFEST, size, where)
     manifest = parse_manifest(content, where)
-    with _told(f"{path}: cannot be read"):
+    with _explained(f"{path}: cannot be read"):
         file.seek(-_END_BYTES, 2)
         end = file.read()
     if not (end.startswith(b"PK\5\6") and end[-_COMMENT_BYTES:].startswith(_COMMENT)):
-        raise MapError(f"{path}: damaged: it is cut off, or something stands behind its end. {MEND}")
+        raise MapError(f"{path}: damaged: it is cut off, or something stands behind its end. {ADVICE}")
     if archive.comment != _COMMENT + digest(content).encode():
-        raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
+        raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {ADVICE}")
     expected = [f"{n:06d}/{name}.npy" for n in range(len(manifest.chunks)) for name in _ARRAYS]
     expected += [] if manifest.instances is None else [f"instances/{name}.npy" for name in _INSTANCES]
     expected += [] if manifest.places is None else [f"places/{name}.npy" for name in _PLACES]
     if names != [*expected, _MANIFEST]:
-        raise MapError(f"{path}: damaged: arrays are missing, or others are there. {MEND}")
+        raise MapError(f"{path}: damaged: arrays are missing, or others are there. {ADVICE}")
     return manifest
 
 
@@ -391,18 +495,34 @@ def _read_member(archive: zipfile.ZipFile, name: str, size: int, where: str) -> 
     """A member that must have ``size`` bytes."""
     info = archive.getinfo(name)
     if info.file_size != size or info.compress_type != zipfile.ZIP_DEFLATED or info.flag_bits & 1:
-        raise MapError(f"{where} is damaged: not {size} compressed bytes. {MEND}")
-    with _told(f"{where} is damaged"), archive.open(info) as member:
+        raise MapError(f"{where} is damaged: not {size} compressed bytes. {ADVICE}")
+    with _explained(f"{where} is damaged"), archive.open(info) as member:
         content = member.read()
     if len(content) != size:
-        raise MapError(f"{where} is damaged: {len(content)} bytes instead of {size}. {MEND}")
+        raise MapError(f"{where} is damaged: {len(content)} bytes instead of {size}. {ADVICE}")
     return content
 
 
 @contextmanager
-def _told(what: str) -> Iterator[None]:
+def _explained(what: str) -> Iterator[None]:
     """What zip and decompression find wrong is an error of ours."""
     try:
         yield
     except _UNREADABLE as error:
-        raise MapError(f"{what}: {error}. {MEND}") from error
+        raise MapError(f"{what}: {error}. {ADVICE}") from error
+
+
+def _plain(content: bytes, where: str) -> dict[str, Any]:
+    try:
+        plain = msgspec.json.decode(content, type=dict[str, Any])
+        kind, version = plain["format"], plain["version"]
+    except (msgspec.DecodeError, KeyError, ValueError, RecursionError) as error:
+        raise MapError(f"{where}: not a map file: cannot be read ({error}). {ADVICE}") from error
+    if kind != FORMAT:
+        raise MapError(f"{where}: not a voxel map but '{kind}'")
+    if version != FORMAT_VERSION:
+        raise MapError(
+            f"{where}: map format {version}, this version reads format {FORMAT_VERSION}; make the map again from its "
+            "log with `semantic-mapper replay`, or read it with the version of semantic-mapper that wrote it"
+        )
+    return plain

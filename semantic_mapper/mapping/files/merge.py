@@ -21,10 +21,9 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid, GridBuffers
 from semantic_mapper.mapping.storage.block_index import BlockIndex, pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE, GridBuffers
+from semantic_mapper.mapping.storage.block_store import BlockValues, empty_blocks
 from semantic_mapper.types import Float64, Int32
 
 MERGED_AT_ONCE = 128  # blocks
@@ -53,15 +52,13 @@ def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapCo
     """Refuse maps whose voxels mean different things.
 
     Raises:
-        MapError: another voxel size or truncation, or other classes (their colours and the set's name do not matter).
+        MapError: another voxel size, or other classes (their colours and the set's name do not matter).
     """
-    for name in ("voxel_size_m", "truncation_voxels"):
-        a, b = getattr(config_a, name), getattr(config_b, name)
-        if a != b:
-            raise MapError(
-                f"maps of different voxel_map.{name} ({a:g} and {b:g}) cannot be merged; make one of them again from "
-                "its log with the setting of the other"
-            )
+    if config_a.voxel_size_m != config_b.voxel_size_m:
+        raise MapError(
+            f"maps of different voxel_map.voxel_size_m ({config_a.voxel_size_m:g} and {config_b.voxel_size_m:g}) "
+            "cannot be merged; make one of them again from its log with the setting of the other"
+        )
     a, b = (set(zip(labels.ids, labels.names, strict=True)) for labels in (labels_a, labels_b))
     if a != b or labels_a.ids != labels_b.ids or labels_a.ignore_id != labels_b.ignore_id:
         differing = ", ".join(f"{i} {name}" for i, name in sorted(a ^ b)) or "their order, or the ignore id"
@@ -84,7 +81,7 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
     Raises:
         MapError: the target has no room.
     """
-    pairs = overlaps(pack_keys(source.all_keys()), T_target_source)
+    pairs = overlaps(source.all_packed(), T_target_source)
     for packed, added in moved_blocks(source, T_target_source, pairs):
         add_values(target, packed, added, cap, version)
 
@@ -100,12 +97,12 @@ def moved_blocks(
         pairs: (P, 2) of ``overlaps``: all, or all pairs of some target blocks.
 
     Yields:
-        Packed keys (B,), sorted, and their values, evidence as float32 sums; at most ``MERGED_AT_ONCE`` at a time.
+        Packed keys (B,), sorted, and their values; at most ``MERGED_AT_ONCE`` at a time.
     """
     R_source_target = np.ascontiguousarray(T_target_source.R.T)
     for wanted, needed in _parts(pairs):
         grid = source.holding(needed)
-        moved = _empty_blocks(len(wanted), grid.buffers().evidence.shape[2])
+        moved = empty_blocks(len(wanted), source.classes)
         _resample_blocks(
             len(wanted), unpack_keys(wanted), R_source_target, T_target_source.t, grid.index, grid.buffers(), moved
         )
@@ -125,20 +122,25 @@ def add_values(target: BlockGrid, packed: NDArray[np.int64], added: BlockValues,
     target.mark_changed(blocks, version)
 
 
-def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
-    """Make ``target``, which is empty, hold what ``source`` holds; blocks without a measurement are left out.
+def copy_blocks(target: BlockGrid, source: BlockGrid, version: int, *, measured: bool) -> None:
+    """Make ``target``, which is empty, hold what ``source`` holds.
+
+    Args:
+        target, source: Grids of the same classes.
+        version: That the blocks are marked as changed at.
+        measured: Leave out blocks without a measurement.
 
     Raises:
         MapError: the target has no room.
     """
-    for keys, _, grid in source.tiles():
-        packed = pack_keys(keys)
-        for start in range(0, len(packed), MERGED_AT_ONCE):
-            part = packed[start : start + MERGED_AT_ONCE]
-            values = grid.read(part)
+    packed = source.all_packed()
+    for start in range(0, len(packed), MERGED_AT_ONCE):
+        part = packed[start : start + MERGED_AT_ONCE]
+        values = source.read(part)
+        if measured:
             holds = (values.weight > 0).any(axis=1)
-            blocks = target.fill(part[holds], BlockValues(*(array[holds] for array in values)))
-            target.mark_changed(blocks, version)
+            part, values = part[holds], BlockValues(*(array[holds] for array in values))
+        target.mark_changed(target.fill(part, values), version)
 
 
 def count_empty(source: BlockGrid) -> int:
@@ -177,12 +179,6 @@ def _parts(pairs: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], NDArra
         yield wanted[start:stop], np.unique(pairs[starts[start] : ends[stop - 1], 1])
 
 
-def _empty_blocks(count: int, classes: int) -> BlockValues:
-    flat = (count, BLOCK_VOXELS)
-    shapes = (flat, flat, (*flat, 3), (*flat, classes), flat)
-    return BlockValues(*(np.zeros(shape, np.float32) for shape in shapes))
-
-
 @parallel_kernel()
 def _resample_blocks(
     count: int, keys: Int32, R: Float64, t: Float64, index: BlockIndex, buffers: GridBuffers, moved: BlockValues
@@ -194,12 +190,12 @@ def _resample_blocks(
         keys: (B, 3) of the blocks.
         R, t: (3, 3) and (3,): their point p is the source's ``R @ (p - t)``, in voxels.
         index, buffers: Of the source.
-        moved: B blocks of zeros, to fill; evidence float32, sums.
+        moved: B blocks of zeros, to fill.
     """
     ...
 
 
 @parallel_kernel()
 def _add_block_values(count: int, blocks: Int32, buffers: GridBuffers, added: BlockValues, cap: float) -> None:
-    """Add blocks ``added`` (evidence float32, sums) to those with buffer indices ``blocks`` (B,), in place."""
+    """Add blocks ``added`` to those with buffer indices ``blocks`` (B,), in place."""
     ...

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64
 
 _BANDS = 8  # image bands with a key set of their own: enough to share among cores, few enough to merge at no cost

@@ -25,17 +25,15 @@ too.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.kernels import kernel, parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
-from semantic_mapper.mapping.fusion.depth_bounds import DepthBounds, depth_bounds
-from semantic_mapper.mapping.fusion.fuse import FusionLimits
-from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_grid import BlockGrid, GridBuffers
 from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
 from semantic_mapper.types import Float32, Int32, Int64, UInt8
 
 LARGEST_TSDF = 0.5
@@ -43,6 +41,64 @@ MARGIN_VOXELS, MARGIN_PER_M = 2.0, 0.015
 ASIDE_VOXELS, ASIDE_PER_M = 1.4, 0.005  # a pose that is off by 5 mm and one of 0.2 degrees at 1.5 m, say
 MOST_HOLES = 2
 MOST_KEPT = 3.5
+_CELLS = 320  # along the longer side of an image, at least; a cell has 2 x 2 pixels at 640 x 480
+_COARSE = 8  # cells a side of those of ``farthest``
+_LEVELS = 6  # squares of up to 64 cells a side
+
+
+class FusionLimits(NamedTuple):
+    """Lengths in metres, and the caps.
+
+    Args:
+        voxel_size: Edge of a voxel.
+        truncation: TSDF truncation.
+        depth_max: Farther depth is ignored.
+        vote_band: Voxels at most this far from the surface take votes.
+        max_weight: Cap of TSDF weight and of votes; beyond it old measurements fade.
+    """
+
+    voxel_size: float
+    truncation: float
+    depth_max: float
+    vote_band: float
+    max_weight: float
+
+
+class DepthBounds(NamedTuple):
+    """Least and greatest depth of parts of an image that is cut into square cells, for any square at once.
+
+    The least depth of a square of pixels is the least of four entries, whatever its size: those of the largest square
+    of 2^level cells a side that fits, put into each of its corners.
+
+    Args:
+        nearest: (levels, h, w) float32 metres: of the 2^level x 2^level cells from each one on; inf where there is no
+            depth. No levels: nothing is to be cleared.
+        farthest: (ceil(h / 8), ceil(w / 8)) float32 metres, of 8 x 8 cells; 0 where there is no depth.
+        cell: Pixels a side.
+    """
+
+    nearest: Float32
+    farthest: Float32
+    cell: int
+
+
+NO_BOUNDS = DepthBounds(np.empty((0, 0, 0), np.float32), np.empty((0, 0), np.float32), 1)
+
+
+def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BOUNDS) -> DepthBounds:
+    """Bounds of depth (H, W) in metres; what is farther than ``depth_max_m`` is not measured.
+
+    They take the memory of ``before``, which nobody looks at any more, where the size is the same: new memory of 2 MB
+    costs as much as filling it.
+    """
+    cell = max(1, max(depth.shape) // _CELLS)
+    h, w = depth.shape[0] // cell, depth.shape[1] // cell
+    bounds = before
+    if before.cell != cell or before.nearest.shape != (_LEVELS, h, w):
+        farthest = np.empty((-(-h // _COARSE), -(-w // _COARSE)), np.float32)
+        bounds = DepthBounds(np.empty((_LEVELS, h, w), np.float32), farthest, cell)
+    _bound_depth(depth, depth_max_m, bounds)
+    return bounds
 
 
 def clear_in_view(
@@ -172,4 +228,11 @@ def _clear_blocks(
     cleared: Int64,
 ) -> None:
     """Weaken voxels that the frame sees through where ``changes``; count them, and those that were cleared: (B,)."""
+    ...
+
+
+# Serial: it takes less time than to wake another thread would.
+@kernel
+def _bound_depth(depth: Float32, depth_max: float, bounds: DepthBounds) -> None:
+    """Fill the bounds."""
     ...

@@ -4,6 +4,11 @@ TSDF and colour are the running means of Open3D's ``integrate``. Class evidence 
 ``w * log p`` at the pixel a voxel projects to: one vote a voxel a frame, only near the surface, where the field
 knows. ``w`` (0..1) trusts near and frontal looks more; see ``make_votes``.
 
+Depth of a sensor weighs ``MEASURED`` in the TSDF. Computed depth (from the pictures, or rendered by a field) weighs at
+most ``COMPUTED_LOOK``, and all of it together at most ``COMPUTED_CAP``: so one measurement outweighs it, and the weight
+of a voxel says whether its surface was measured (from ``MEASURED`` on) or computed. Computed depth never changes what
+was measured.
+
 The kernels (``fusion.c``) depend on no order among threads, so a frame gives the same bits every time.
 """
 
@@ -15,46 +20,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, FrameError, ShapeError
+from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
-from semantic_mapper.mapping.fusion.depth_bounds import NO_BOUNDS, DepthBounds
-from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, COMPUTED_LOOK, MEASURED
-from semantic_mapper.mapping.fusion.evidence import DITHER
-from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
-from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8
+from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, DepthBounds, FusionLimits
+from semantic_mapper.mapping.storage.block_grid import GridBuffers
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, Int64, UInt8
 
+MEASURED = 1.0
+COMPUTED_LOOK = 1 / 32
+COMPUTED_CAP = 31 / 32
+SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surface: four sure looks, or more unsure ones
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
 LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
-
+PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
+ProbabilityTable = tuple[Float32, NDArray[np.int32]]  # probabilities (K, L), row of each pixel (H, W), -1 = unknown
 
 _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
     "voxel_size_m": (1e-4, 10.0),
-    "truncation_voxels": (1e-3, 100.0),
     "depth_max_m": (1e-3, 1000.0),
     "no_return_range_m": (0.0, 1000.0),
-    "initial_blocks": (1, 1 << 27),
     "max_blocks": (1, 1 << 27),
-    "max_weight": (1.0, 1e6),
 }
-
-
-class FusionLimits(NamedTuple):
-    """Lengths in metres, and the caps.
-
-    Args:
-        voxel_size: Edge of a voxel.
-        truncation: TSDF truncation.
-        depth_max: Farther depth is ignored.
-        vote_band: Voxels at most this far from the surface take votes.
-        max_weight: Cap of TSDF weight and of votes; beyond it old measurements fade.
-    """
-
-    voxel_size: float
-    truncation: float
-    depth_max: float
-    vote_band: float
-    max_weight: float
 
 
 def make_limits(config: VoxelMapConfig) -> FusionLimits:
@@ -67,8 +55,6 @@ def make_limits(config: VoxelMapConfig) -> FusionLimits:
         value = getattr(config, name)
         if not least <= value <= most:  # NaN, too
             raise ConfigError(f"voxel_map.{name} must be from {least:g} to {most:g}, got {value}")
-    if not (config.vote_discount >= 0 and config.vote_band_voxels >= 0):
-        raise ConfigError("voxel_map.vote_discount and vote_band_voxels must not be negative")
     return FusionLimits(
         voxel_size=config.voxel_size_m,
         truncation=config.truncation_voxels * config.voxel_size_m,
@@ -118,6 +104,93 @@ def no_votes(height: int, width: int, classes: int) -> Votes:
     return Votes(np.zeros((1, classes), np.float32), rows, weights)
 
 
+def check_depth(depth_m: Float32, intrinsics: CameraIntrinsics, where: str) -> Float32:
+    """Depth (H, W) as one piece of memory.
+
+    Raises:
+        ShapeError: it does not fit the intrinsics, or is not float32.
+    """
+    expect_shape(depth_m, f"{intrinsics.height} {intrinsics.width}", f"{where}: depth_m")
+    _expect_dtype(depth_m, np.float32, f"{where}: depth_m")
+    return np.ascontiguousarray(depth_m)
+
+
+def probability_table(
+    depth: Float32,
+    probabilities: Float32,
+    known: NDArray[np.bool_] | None,
+    rows: NDArray[np.int32] | None,
+    classes: int,
+    where: str,
+) -> ProbabilityTable:
+    """Class probabilities and the row of each pixel, however they were given; see ``VoxelMap.integrate``.
+
+    Raises:
+        ShapeError: something does not fit the depth (H, W), or is of another dtype.
+    """
+    size = f"{depth.shape[0]} {depth.shape[1]}"
+    _expect_dtype(probabilities, np.float32, f"{where}: probabilities")
+    if rows is None:
+        expect_shape(probabilities, f"{size} {classes}", f"{where}: probabilities")
+        rows = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
+        if known is not None:
+            expect_shape(known, size, f"{where}: known")
+            _expect_dtype(known, np.bool_, f"{where}: known")
+            rows[~known] = -1
+    else:
+        expect_shape(probabilities, f"K {classes}", f"{where}: probabilities")
+        expect_shape(rows, size, f"{where}: rows")
+        _expect_dtype(rows, np.int32, f"{where}: rows")
+        if known is not None or rows.min() < -1 or rows.max() >= len(probabilities):
+            raise ShapeError(f"{where}: rows must be -1 ... {len(probabilities) - 1}, and known None")
+    return np.ascontiguousarray(probabilities).reshape(-1, classes), np.ascontiguousarray(rows)
+
+
+def frame_votes(
+    depth: Float32,
+    table: ProbabilityTable | None,
+    camera: Camera,
+    depth_max_m: float,
+    classes: int,
+    where: str,
+    trust: Float32 | None = None,
+) -> Votes:
+    """Votes of a frame, none without a table; each weighs what the depth under it does, where ``trust`` says so.
+
+    Raises:
+        FrameError: probabilities that are none.
+    """
+    if table is None:
+        return no_votes(depth.shape[0], depth.shape[1], classes)
+    votes, bad = make_votes(*table, depth, camera, depth_max_m)
+    if bad:
+        raise FrameError(
+            f"{where}: {bad} known pixels hold class probabilities that are NaN, negative or do not sum to 1; "
+            "give a softmax, or mark the pixels as not known"
+        )
+    return votes if trust is None or not trust.size else votes._replace(weights=votes.weights * trust)
+
+
+def trusted_depth(depth: Float32, trust: Float32 | None, where: str) -> tuple[Float32, Float32]:
+    """Depth (H, W) without what is not trusted, and its weights as ``fuse_blocks`` takes them.
+
+    Raises:
+        ShapeError: the weights do not fit the depth, or are not float32 in 0..1.
+    """
+    if trust is None:
+        return depth, np.empty((0, 0), np.float32)
+    expect_shape(trust, f"{depth.shape[0]} {depth.shape[1]}", f"{where}: trust")
+    _expect_dtype(trust, np.float32, f"{where}: trust")
+    if not ((trust >= 0) & (trust <= 1)).all():
+        raise ShapeError(f"{where}: trust must be 0 ... 1 everywhere")
+    return np.where(trust > 0, depth, np.float32(0)), np.ascontiguousarray(trust)
+
+
+def _expect_dtype(array: NDArray[np.generic], dtype: type[np.generic], name: str) -> None:
+    if array.dtype != dtype:
+        raise ShapeError(f"{name}: expected dtype {np.dtype(dtype).name}, got {array.dtype.name}")
+
+
 def fuse_blocks(
     indices: Int32,
     buffers: GridBuffers,
@@ -127,7 +200,6 @@ def fuse_blocks(
     rgb: UInt8,
     trust: Float32,
     votes: Votes,
-    moment: int,
     *,
     measured: bool = True,
     bounds: DepthBounds = NO_BOUNDS,
@@ -143,8 +215,7 @@ def fuse_blocks(
         rgb: (H, W, 3) uint8.
         trust: (H, W) float32 fraction of its full weight that each depth counts, or (0, 0): 1.
         votes: Of the frame.
-        moment: A number that changes from frame to frame; see ``evidence``.
-        measured: Whether a sensor measured the depth; see ``depth_trust``.
+        measured: Whether a sensor measured the depth.
         bounds: Of the depth, where what the frame sees through is to be cleared; see ``clearing``.
 
     Returns:
@@ -152,7 +223,7 @@ def fuse_blocks(
     """
     cleared = np.empty(len(indices), np.int64)
     look, cap = (MEASURED, limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
-    args = (indices, buffers, camera, limits, depth, rgb, trust, votes, DITHER, moment, look, cap)
+    args = (indices, buffers, camera, limits, depth, rgb, trust, votes, look, cap)
     _fuse_frame_into_blocks(len(indices), *args, bounds, cleared)
     return cleared
 
@@ -200,10 +271,30 @@ def _fuse_frame_into_blocks(
     rgb: UInt8,
     trust: Float32,
     votes: Votes,
-    dither: Float32,
-    moment: int,
     look: float,
     weight_cap: float,
     bounds: DepthBounds,
     cleared: Int64,
 ) -> None: ...
+
+
+@parallel_kernel()
+def vote_into_blocks(
+    count: int,
+    indices: Int32,
+    buffers: GridBuffers,
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    votes: Votes,
+    max_votes: float,
+) -> None:
+    """Vote as ``fuse_blocks`` does, at measured voxels with fewer than ``max_votes``, and change nothing else.
+
+    Args:
+        count: B.
+        indices: (B,) buffer indices, each once.
+        buffers, camera, limits, depth, votes: As of ``fuse_blocks``.
+        max_votes: Voxels with this many take none.
+    """
+    ...

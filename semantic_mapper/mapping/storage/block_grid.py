@@ -9,15 +9,18 @@ A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block 
 
 from __future__ import annotations
 
+import math
+import mmap
 import os
 from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernels import kernel
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.fusion.evidence import EVIDENCE_DTYPES
 from semantic_mapper.mapping.storage.block_index import (
     BlockIndex,
     find_blocks,
@@ -27,26 +30,53 @@ from semantic_mapper.mapping.storage.block_index import (
     pack_keys,
     unpack_keys,
 )
-from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockStore, BlockValues, PackedBlocks, pack_blocks
-from semantic_mapper.mapping.storage.grid_buffers import (
-    ATTRIBUTES,
-    GridBuffers,
-    advised_mb,
-    blocks_hold_surface,
-    make_buffers,
+from semantic_mapper.mapping.storage.block_store import (
+    BLOCK_VOXELS,
+    BlockStore,
+    BlockValues,
+    PackedBlocks,
+    empty_blocks,
+    pack_blocks,
 )
-from semantic_mapper.types import UInt8
+from semantic_mapper.types import Bool, Float32, Int32, UInt8
 
+BLOCK_SIDE = 8
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
 EVICTED_AT_ONCE = 32  # at least, and
 EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting out what to evict looks at all of it
 TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
+SPARE_SHARE = 1.5  # of what one frame touches, where memory is to have room for it without pushing the last one out
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
-_READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room beside both
+_READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room next to both
 _FREE = -1  # no packed key is negative
 _NO_SURFACE, _SURFACE, _UNKNOWN = 0, 1, 2  # whether a block holds a surface; unknown since it was last changed
 
 _log = get_logger(__name__)
+
+
+class GridBuffers(NamedTuple):
+    """The grid's memory; growing replaces it.
+
+    Args:
+        keys: (capacity, 3) int32 block coordinates.
+        tsdf: (capacity, 512) float32, signed distance over truncation in [-1, 1].
+        weight: (capacity, 512) float32, number of depth measurements (capped); below 1 the depth was computed.
+        color: (capacity, 512, 3) float32 in 0..255.
+        evidence: (capacity, 512, L) float32, sum of log probabilities by weight.
+        votes: (capacity, 512) float32, sum of vote weights.
+    """
+
+    keys: NDArray[np.int32]
+    tsdf: Float32
+    weight: Float32
+    color: Float32
+    evidence: Float32
+    votes: Float32
+
+    @property
+    def values(self) -> BlockValues:
+        """The same without the keys."""
+        return BlockValues(*self[1:])
 
 
 class BlockGrid:
@@ -58,28 +88,22 @@ class BlockGrid:
         initial_blocks: Capacity at start.
         max_blocks: Blocks at most, in memory and on disk.
         memory_bytes: For blocks in memory; 0 = no limit.
-        evidence: Key of ``EVIDENCE_DTYPES``.
+
+    Attributes:
+        watchers: Called with the packed keys that ``activate`` gets, before anything is done with them.
     """
 
     def __init__(
-        self,
-        voxel_size_m: float,
-        classes: int,
-        initial_blocks: int,
-        max_blocks: int,
-        memory_bytes: int = 0,
-        evidence: str = "float32",
+        self, voxel_size_m: float, classes: int, initial_blocks: int, max_blocks: int, memory_bytes: int = 0
     ) -> None:
         self._max_blocks = max_blocks
         self._voxel_size_m = voxel_size_m
         self.classes = classes
-        self.evidence = evidence
-        value_bytes = 4 * (1 + 1 + 3 + 1) + np.dtype(EVIDENCE_DTYPES[evidence]).itemsize * classes
-        self.block_bytes = BLOCK_VOXELS * value_bytes + 12
+        self.block_bytes = 4 * BLOCK_VOXELS * (1 + 1 + 3 + 1 + classes) + 12
         self._max_resident = max_blocks
         if memory_bytes > 0:
             self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self.block_bytes))
-            initial_blocks = self._max_resident  # at once: growing needs room for the old memory beside the new
+            initial_blocks = self._max_resident  # at once: growing needs room for the old memory and the new one
         capacity = max(1, min(initial_blocks, max_blocks))
         self._buffers = self._make_buffers(capacity)
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
@@ -88,13 +112,11 @@ class BlockGrid:
         self._clock = 0
         # By buffer index:
         self._packed = np.full(capacity, _FREE, np.int64)  # key of the block there
-        self._used = np.zeros(capacity, np.int64)  # when last asked for
+        self._used = np.zeros(capacity, np.int64)  # when last requested
         self._version = np.zeros(capacity, np.int64)  # see ``mark_changed``
         self._surface = np.zeros(capacity, np.uint8)
-        self.stored_surface = np.empty(0, np.int64)  # packed keys, sorted, of blocks on disk that hold a surface
         self._resident_count = 0
         self._ever_used = 0  # from here on, buffers are as they were made: zero
-        # Called with the packed keys that ``activate`` gets, before anything is done with them.
         self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
 
     @property
@@ -105,12 +127,7 @@ class BlockGrid:
     @property
     def block_count(self) -> int:
         """Blocks in the map, in memory and on disk."""
-        return self.resident_count + self.stored_count
-
-    @property
-    def resident_count(self) -> int:
-        """Blocks in memory."""
-        return self._resident_count
+        return self._resident_count + self.stored_count
 
     @property
     def stored_count(self) -> int:
@@ -121,6 +138,11 @@ class BlockGrid:
     def stored_bytes(self) -> int:
         """Bytes that the file of those on disk takes."""
         return 0 if self._store is None else self._store.file_bytes
+
+    @property
+    def stored_surface(self) -> NDArray[np.int64]:
+        """Packed keys, sorted, of blocks on disk that hold a surface."""
+        return np.empty(0, np.int64) if self._store is None else self._store.keys[self._store.surface]
 
     @property
     def capacity(self) -> int:
@@ -142,10 +164,27 @@ class BlockGrid:
         return self._buffers
 
     def sorted_blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Keys (B, 3) in lexicographic order and their buffer indices (B,)."""
+        """Keys (B, 3) in lexicographic order and their buffer indices (B,), of blocks in memory."""
         indices = np.flatnonzero(self._packed != _FREE).astype(np.int32)
         indices = indices[np.argsort(self._packed[indices])]
         return self._buffers.keys[indices], indices
+
+    def all_packed(self) -> NDArray[np.int64]:
+        """Packed keys (B,) of all blocks, sorted."""
+        resident = self._packed[self._packed != _FREE]
+        return np.sort(resident if self._store is None else np.concatenate((resident, self._store.keys)))
+
+    def all_keys(self) -> NDArray[np.int32]:
+        """Keys (B, 3) of all blocks in lexicographic order."""
+        return unpack_keys(self.all_packed())
+
+    def keys_between(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Those of ``all_keys`` from ``low`` (3,) to ``high`` (3,), both included, without sorting the others."""
+        keys = self._buffers.keys[self._packed != _FREE]
+        if self._store is not None:
+            keys = np.concatenate((keys, unpack_keys(self._store.keys)))
+        keys = keys[((keys >= low) & (keys <= high)).all(axis=1)]
+        return keys[np.argsort(pack_keys(keys))]
 
     def activate(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
         """Make sure that the blocks of unique packed keys (B,), about to change, are in memory; return indices (B,).
@@ -162,19 +201,6 @@ class BlockGrid:
         self._surface[found] = _UNKNOWN
         return found
 
-    def _bring_together(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
-        self._clock += 1
-        found = find_blocks(self._index, packed)
-        missing = packed[found < 0]
-        if len(missing):
-            self._check_room(missing)
-            if len(packed) > self._max_resident:
-                raise MapError(f"{len(packed)} blocks at once, memory has room for {self._max_resident} of them")
-            self._bring_in(packed, missing)
-            found = find_blocks(self._index, packed)
-        self._used[found] = self._clock
-        return found
-
     def batches(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
         """``activate`` unique packed keys (B,) this many at a time as memory has room for.
 
@@ -187,29 +213,25 @@ class BlockGrid:
         if len(packed) > self._max_resident:
             found = find_blocks(self._index, packed)
             self._check_room(packed[found < 0])
-            self._tell_of_portions(len(packed))
+            self._warn_of_batches(len(packed))
             packed = packed[np.argsort(found < 0, kind="stable")]  # first those in memory: they need not come back
         for start in range(0, max(len(packed), 1), self._max_resident):
             yield self.activate(packed[start : start + self._max_resident])
+
+    def page_in(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Bring the first of these existing blocks (B,) into memory to be read, as many as have room: their indices."""
+        return self._bring_together(packed[: self._max_resident])
 
     def reserve(self, blocks: int) -> None:
         """Make room for this many blocks at once, as far as the limit on memory goes."""
         if min(blocks, self._max_resident) > self.capacity:
             self._grow(blocks)
 
-    def page_in(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Make sure that the first of these existing blocks (B,) are in memory to be read: as many as have room.
-
-        Returns:
-            Their buffer indices.
-        """
-        return self._bring_together(packed[: self._max_resident])
-
     def may_hold_surface(self) -> UInt8:
         """A copy of (capacity,), by buffer index: 0 where there is no block, or one without a surface."""
         return self._surface.copy()
 
-    def hold_surface(self, blocks: NDArray[np.int32]) -> NDArray[np.bool_]:
+    def hold_surface(self, blocks: NDArray[np.int32]) -> Bool:
         """Whether the blocks (B,) in memory hold a surface: a voxel that ``fusion/clearing`` may have to clear."""
         unknown = blocks[self._surface[blocks] == _UNKNOWN]
         holds = np.empty(len(unknown), np.uint8)
@@ -231,36 +253,16 @@ class BlockGrid:
             self._store.versions = versions[len(indices) :].copy()
         return version + max(count - 1, 0) // each
 
-    def changed_since(self, version: int) -> NDArray[np.int32]:
-        """Keys (B, 3) of all blocks that were changed after ``version``, in lexicographic order."""
-        return unpack_keys(self.versions_since(version)[0])
-
     def versions_since(self, version: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Packed keys (B,) of all blocks that were changed after ``version``, sorted, and when each was: (B,)."""
-        keys, indices = self.sorted_blocks()
-        packed, versions = pack_keys(keys), self._version[indices]
+        there = self._packed != _FREE
+        packed, versions = self._packed[there], self._version[there]
         if self._store is not None:
             packed = np.concatenate((packed, self._store.keys))
             versions = np.concatenate((versions, self._store.versions))
         newer = np.flatnonzero(versions > version)
         newer = newer[np.argsort(packed[newer])]
         return packed[newer], versions[newer]
-
-    def stored_keys(self) -> NDArray[np.int32]:
-        """Keys (B, 3) of the blocks on disk."""
-        return unpack_keys(np.empty(0, np.int64) if self._store is None else self._store.keys)
-
-    def all_keys(self) -> NDArray[np.int32]:
-        """Keys (B, 3) of all blocks in lexicographic order."""
-        keys = np.concatenate((self.sorted_blocks()[0], self.stored_keys()))
-        return keys[np.argsort(pack_keys(keys))]
-
-    def keys_between(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Those of ``all_keys`` from ``low`` (3,) to ``high`` (3,), both included, without sorting the others."""
-        resident = self._buffers.keys[self._packed != _FREE]
-        parts = [keys[((keys >= low) & (keys <= high)).all(axis=1)] for keys in (resident, self.stored_keys())]
-        keys = np.concatenate(parts)
-        return keys[np.argsort(pack_keys(keys))]
 
     def tiles(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], BlockGrid]]:
         """All blocks, in lexicographic order, in parts that fit in memory.
@@ -269,36 +271,34 @@ class BlockGrid:
             Keys (B, 3), their buffer indices (B,) in a grid, and that grid: this one where nothing is on disk, else a
             temporary one, which also holds the next blocks along each axis.
         """
-        if self._store is None or not len(self._store):
+        if not self.stored_count:
             yield (*self.sorted_blocks(), self)
             return
-        everything = pack_keys(self.all_keys())
+        everything = self.all_packed()
         for start in range(0, len(everything), TILE_BLOCKS):
             part = everything[start : start + TILE_BLOCKS]
             around = np.unique(pack_keys((unpack_keys(part)[:, None] + NEIGHBOURS).reshape(-1, 3)))
-            wanted = around[np.isin(around, everything)]
-            tile = self.holding(wanted)
+            tile = self.holding(around[np.isin(around, everything)])
             yield unpack_keys(part), find_blocks(tile.index, part), tile
 
     def holding(self, packed: NDArray[np.int64]) -> BlockGrid:
         """A grid with these existing blocks (B,) in memory: this one where nothing is on disk, else a temporary one."""
         if not self.stored_count:
             return self
-        copy = BlockGrid(self._voxel_size_m, self.classes, len(packed), len(packed), evidence=self.evidence)
+        copy = BlockGrid(self._voxel_size_m, self.classes, len(packed), len(packed))
         copy.fill(packed, self.read(packed))
         return copy
 
     def read(self, packed: NDArray[np.int64]) -> BlockValues:
         """A copy of blocks (B,) that exist, from memory or disk."""
         found = find_blocks(self._index, packed)
-        here = found >= 0
-        buffers = self.buffers()
-        values = BlockValues(*(getattr(buffers, name)[found] for name in ATTRIBUTES))
-        if not here.all():
+        away = np.flatnonzero(found < 0)
+        values = BlockValues(*(array[found] for array in self._buffers.values))
+        if len(away):
             assert self._store is not None
-            stored = self._store.get(packed[~here])
-            for mine, theirs in zip(values, stored, strict=True):
-                mine[~here] = theirs
+            for array in values:
+                array[away] = 0
+            self._store.read_into(values, away, packed[away])
         return values
 
     def pack(self, packed: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], PackedBlocks]]:
@@ -309,8 +309,7 @@ class BlockGrid:
         """
         found = find_blocks(self._index, packed)
         here, away = np.flatnonzero(found >= 0), np.flatnonzero(found < 0)
-        buffers = self.buffers()
-        yield here, pack_blocks(BlockValues(*(getattr(buffers, name) for name in ATTRIBUTES)), found[here])
+        yield here, pack_blocks(self._buffers.values, found[here])
         for start in range(0, len(away), _READ_AT_ONCE):
             part = away[start : start + _READ_AT_ONCE]
             yield part, pack_blocks(self.read(packed[part]), np.arange(len(part), dtype=np.int32))
@@ -318,21 +317,33 @@ class BlockGrid:
     def fill(self, packed: NDArray[np.int64], values: BlockValues) -> NDArray[np.int32]:
         """Make blocks (B,) be ``values``, new or not; returns their buffer indices."""
         blocks = self.activate(packed)
-        buffers = self.buffers()
-        for name in ATTRIBUTES:
-            getattr(buffers, name)[blocks] = getattr(values, name)
+        for own, given in zip(self._buffers.values, values, strict=True):
+            own[blocks] = given
         return blocks
 
+    def _bring_together(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+        self._clock += 1
+        found = find_blocks(self._index, packed)
+        missing = packed[found < 0]
+        if len(missing):
+            self._check_room(missing)
+            if len(packed) > self._max_resident:
+                raise MapError(f"{len(packed)} blocks at once, memory has room for {self._max_resident} of them")
+            self._bring_in(packed, missing)
+            found = find_blocks(self._index, packed)
+        self._used[found] = self._clock
+        return found
+
     def _check_room(self, missing: NDArray[np.int64]) -> None:
-        new = len(missing) - (0 if self._store is None else int(self._store.holds(missing).sum()))
+        new = len(missing) - (0 if self._store is None else int(self._store.find(missing)[1].sum()))
         if self.block_count + new > self._max_blocks:
             raise MapError(
-                f"the map is full: {self.block_count} blocks, {new} more asked for, limit {self._max_blocks} "
+                f"the map is full: {self.block_count} blocks, {new} more requested, limit {self._max_blocks} "
                 f"(voxel_map.max_blocks; {self.block_bytes / 1024:.0f} KiB a block). Raise the limit, use larger "
                 "voxels, or start a new map; what is in this one stays usable"
             )
 
-    def _tell_of_portions(self, blocks: int) -> None:
+    def _warn_of_batches(self, blocks: int) -> None:
         if self._warned_of_batches:
             return
         self._warned_of_batches = True
@@ -344,34 +355,35 @@ class BlockGrid:
 
     def _bring_in(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
         """Make room for the missing blocks, add them, and read those that were on disk."""
-        needed = self.resident_count + len(missing)
+        needed = self._resident_count + len(missing)
         if needed > self._max_resident:
             self._evict(needed - self._max_resident, packed)
         elif needed > self.capacity:
             self._grow(needed)
         stored = self._store
-        back = missing[:0] if stored is None else missing[stored.holds(missing)]
-        if stored is None or not len(back):
+        if stored is None:
             self._add(missing)
             return
-        new = missing[~stored.holds(missing)]
+        _, there = stored.find(missing)
+        back = missing[there]
         for start in range(0, len(back), _READ_AT_ONCE):
             part = back[start : start + _READ_AT_ONCE]
-            values, versions = stored.get(part), stored.versions_of(part)
+            rows, _ = stored.find(part)
+            versions, surface = stored.versions[rows], stored.surface[rows]
+            values = empty_blocks(len(part), self.classes)
+            stored.read_into(values, np.arange(len(part)), part)
             stored.drop(part)  # may fail, and then the blocks are there still; what comes now does not
-            self._add(part)
-            indices, buffers = find_blocks(self._index, part), self.buffers()
-            for name in ATTRIBUTES:
-                getattr(buffers, name)[indices] = getattr(values, name)
+            indices = self._add(part)
+            for own, read in zip(self._buffers.values, values, strict=True):
+                own[indices] = read
             self._version[indices] = versions
-            self._surface[indices] = np.where(np.isin(part, self.stored_surface), _SURFACE, _NO_SURFACE)
-            self.stored_surface = np.setdiff1d(self.stored_surface, part, assume_unique=True)
-        self._add(new)
+            self._surface[indices] = np.where(surface, _SURFACE, _NO_SURFACE)
+        self._add(missing[~there])
 
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
         if self._store is None:
-            self._store = BlockStore(self.classes, self.evidence)
+            self._store = BlockStore()
             _log.info("map_pages", resident=self._max_resident, reason="voxel_map.memory_mb is used up")
         keys, indices = self.sorted_blocks()
         packed = pack_keys(keys)
@@ -379,39 +391,45 @@ class BlockGrid:
         oldest = np.flatnonzero(free)[np.argsort(self._used[indices[free]], kind="stable")]
         count = max(count, EVICTED_AT_ONCE, self._max_resident // EVICTED_SHARE)
         going = np.sort(oldest[:count])
-        buffers = self.buffers()
-        values = BlockValues(*(getattr(buffers, name) for name in ATTRIBUTES))
         try:
             for start in range(0, len(going), _READ_AT_ONCE):
                 part = going[start : start + _READ_AT_ONCE]
-                blobs = pack_blocks(values, indices[part]).blobs()
-                self._store.put_packed(packed[part], self._version[indices[part]], blobs)
-                surface = packed[part][self.hold_surface(indices[part])]
-                self.stored_surface = np.union1d(self.stored_surface, surface)
-                self._surface[indices[part]] = _NO_SURFACE
-                self._packed[indices[part]] = _FREE
-                self._resident_count -= len(indices[part])
+                blocks = indices[part]
+                copied = pack_blocks(self._buffers.values, blocks)
+                self._store.put(packed[part], copied, self._version[blocks], self.hold_surface(blocks))
+                self._surface[blocks] = _NO_SURFACE
+                self._packed[blocks] = _FREE
+                self._resident_count -= len(blocks)
         finally:  # also where the disk is full: blocks that are there have left memory
             self._index = make_block_index(*self.sorted_blocks())
 
     def _make_buffers(self, capacity: int) -> GridBuffers:
-        """Memory for this many blocks, all zero.
+        """Zeros for this many blocks; the machine gives the memory page by page as it is written.
 
         Raises:
             MapError: the machine does not have so much memory, or none that is free.
         """
         needed, there = capacity * self.block_bytes, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        mend = "lower voxel_map.initial_blocks, max_blocks or memory_mb, or use larger voxels"
+        advice = "lower voxel_map.max_blocks or memory_mb, or use larger voxels"
         if needed > there:
             raise MapError(
-                f"memory for {capacity} blocks is {needed / 1e9:.1f} GB, this machine has {there / 1e9:.1f} GB; {mend}"
+                f"memory for {capacity} blocks is {needed / 1e9:.1f} GB, this machine has {there / 1e9:.1f} GB; "
+                f"{advice}"
             )
+        flat = (capacity, BLOCK_VOXELS)
         try:
-            return make_buffers(capacity, self.classes, self.evidence)
+            return GridBuffers(
+                keys=_zeros((capacity, 3), np.int32),
+                tsdf=_zeros(flat, np.float32),
+                weight=_zeros(flat, np.float32),
+                color=_zeros((*flat, 3), np.float32),
+                evidence=_zeros((*flat, self.classes), np.float32),
+                votes=_zeros(flat, np.float32),
+            )
         except OSError as error:
             raise MapError(
                 f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB): {error}; free some, raise the limit "
-                f"(ulimit -v), or {mend}"
+                f"(ulimit -v), or {advice}"
             ) from error
 
     def _grow(self, needed: int) -> None:
@@ -423,24 +441,48 @@ class BlockGrid:
             grown[:before] = values
         self._buffers = larger
         more = capacity - before
-        self._packed = np.concatenate((self._packed, np.full(more, _FREE)))
-        self._used = np.concatenate((self._used, np.zeros(more, np.int64)))
-        self._version = np.concatenate((self._version, np.zeros(more, np.int64)))
-        self._surface = np.concatenate((self._surface, np.zeros(more, np.uint8)))
+        self._packed = np.pad(self._packed, (0, more), constant_values=_FREE)
+        self._used, self._version = np.pad(self._used, (0, more)), np.pad(self._version, (0, more))
+        self._surface = np.pad(self._surface, (0, more))
 
-    def _add(self, packed: NDArray[np.int64]) -> None:
+    def _add(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
         """Give new blocks (B,) a place in the buffers, which have room; all their voxels are zero."""
         added = np.flatnonzero(self._packed == _FREE)[: len(packed)].astype(np.int32)
         self._packed[added] = packed
         self._resident_count += len(packed)
         self._buffers.keys[added] = unpack_keys(packed)
-        if not has_room(self._index, self.resident_count):
+        if not has_room(self._index, self._resident_count):
             self._index = make_block_index(*self.sorted_blocks())
         else:
             insert_blocks(self._index, packed, added)
         used_before = added[added < self._ever_used]
-        for values in self._buffers[1:]:
+        for values in self._buffers.values:
             values[used_before] = 0
         self._ever_used = max(self._ever_used, int(added.max(initial=-1)) + 1)
         self._version[added] = 0
         self._surface[added] = _NO_SURFACE
+        return added
+
+
+def advised_mb(blocks: int, block_bytes: int) -> int:
+    """The ``voxel_map.memory_mb`` that this many blocks of one frame, and some of the frames before, fit in."""
+    return math.ceil(SPARE_SHARE * blocks * block_bytes / 1e6)
+
+
+def _zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
+    """As ``np.zeros``, which asks for huge pages: to find these holds up a frame for long when the map grows."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return np.frombuffer(memory, dtype).reshape(shape)
+
+
+@kernel
+def blocks_hold_surface(indices: Int32, tsdf: Float32, weight: Float32, holds: UInt8) -> None:
+    """Which blocks have a voxel that may have to be cleared one day (``fusion/clearing``).
+
+    Args:
+        indices: (B,) buffer indices.
+        tsdf, weight: Of the grid.
+        holds: (B,) to fill, 0 or 1.
+    """
+    ...

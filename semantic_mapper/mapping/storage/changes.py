@@ -1,7 +1,7 @@
 """What changed in a map since a version, small enough to be sent: 3.1 KB a block instead of 12 KB and 2 KB a class.
 
 The TSDF is rounded to 1/127 of the truncation (0.6 mm at 2 cm voxels) without ever changing its sign, so that the
-surface stays between the same voxels. Class evidence is decided where it lies (``readout.decide``): one class and its
+surface stays between the same voxels. Class evidence is decided where it lies : one class and its
 probability a voxel.
 """
 
@@ -17,16 +17,46 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.storage.block_grid import BLOCK_VOXELS, BlockGrid
+from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import unpack_keys
-from semantic_mapper.mapping.storage.block_store import BlockValues, PackedBlocks, pack_blocks
-from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED, ClearedBlocks
+from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues, PackedBlocks, pack_blocks
 from semantic_mapper.types import Float32, Int64, UInt8
 
 TSDF_STEPS = 127  # of the quantised TSDF, a truncation
 UNOBSERVED = -128  # in the quantised TSDF
 CONFIDENCE_STEPS = 255
 _READ_AT_ONCE = 512  # blocks copied at a time
+MAX_ROWS = 1 << 16  # that a map and a mirror keep: 2 MB
+
+
+class ClearedBlocks(NamedTuple):
+    """N times that a frame cleared voxels of a block, oldest frame first.
+
+    Args:
+        packed: (N,) int64 key of the block.
+        voxels: (N,) int64 how many of its voxels were part of a surface, or behind one, and are free now.
+        version: (N,) int64 of the map, with that frame.
+        stamp_ns: (N,) int64 of the frame.
+    """
+
+    packed: NDArray[np.int64]
+    voxels: NDArray[np.int64]
+    version: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+
+    def between(self, after: int, up_to: int) -> ClearedBlocks:
+        """The rows of versions above ``after``, up to ``up_to``."""
+        chosen = (self.version > after) & (self.version <= up_to)
+        return ClearedBlocks(*(column[chosen] for column in self))
+
+    def followed_by(self, later: ClearedBlocks) -> ClearedBlocks:
+        """The latest ``MAX_ROWS`` of both."""
+        if not len(later.packed):
+            return self
+        return ClearedBlocks(*(np.concatenate(pair)[-MAX_ROWS:] for pair in zip(self, later, strict=True)))
+
+
+NONE_CLEARED = ClearedBlocks(*(np.empty(0, np.int64) for _ in range(4)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,7 +246,6 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
     _compact_blocks(
         blocks.data,
         blocks.ends,
-        blocks.evidence.itemsize,
         np.ascontiguousarray(rows),
         ids,
         chosen.vote_discount,
@@ -230,12 +259,11 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
     )
 
 
-# Serial: it runs beside the mapper, which needs the other threads.
+# Serial: it runs next to the mapper, which needs the other threads.
 @kernel
 def _compact_blocks(
     data: Float32,
     ends: Int64,
-    evidence_itemsize: int,
     rows: Int64,
     ids: UInt8,
     vote_discount: float,
@@ -251,7 +279,6 @@ def _compact_blocks(
 
     Args:
         data, ends: Of ``PackedBlocks``.
-        evidence_itemsize: 4 (float32) or 2 (int16).
         rows: (B,) of the output.
         ids: (L + 1,) of the classes, and the ignore id.
         vote_discount, unknown_below, min_weight: See ``ChosenBlocks``.

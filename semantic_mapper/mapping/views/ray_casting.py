@@ -1,8 +1,16 @@
-"""The map seen from a pose: a compiled ray caster over the sparse blocks.
+"""The map seen from a pose, and read at points: a compiled ray caster over the sparse blocks.
 
 Open3D's own ``ray_cast`` is off by half a voxel and can crash when its range buffer overflows; this one walks from
-block to block, steps by the TSDF and finds the zero crossing on the interpolated field. Its C code is in
-``ray_casting.h``.
+block to block, steps by the TSDF and finds the zero crossing on the interpolated field. There, and at any other point,
+the map is read by interpolation over the eight voxels around it, then label and confidence.
+
+With n votes of evidence e, what the votes say together is ``p = softmax(e * n_eff / n)``, where
+``n_eff = n / (1 + rho (n - 1))`` for n > 1: views of one place repeat each other's errors, so a hundred of them are
+worth at most 1 / rho independent ones. A vote that is trusted less, n < 1, weighs less against others, but where it is
+the only one it means what the field said: n_eff = 1. The label is the argmax, its confidence p[label]. Below
+``unknown_below`` the label is unknown; the confidence stays that of the likeliest class.
+
+The C code of it is in ``ray_casting.h`` and ``readout.h``.
 """
 
 from __future__ import annotations
@@ -15,11 +23,11 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.fusion.allocation import Camera, blocks_in_view, view_bounds
-from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_grid import BlockGrid, GridBuffers
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
-from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int64, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int64, UInt8
 
 
 class Window(NamedTuple):
@@ -101,6 +109,35 @@ def _windows(
             waiting += [(half, unpack_keys(seen)) for half in reversed(window.halves())]
 
 
+def read_points(
+    voxels: Float64,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    label_set: LabelSet,
+    vote_discount: float,
+    unknown_below: float,
+) -> tuple[UInt8, UInt8, Float32, Bool]:
+    """Colour, label and confidence at points, and whether their surface was measured.
+
+    Args:
+        voxels: (N, 3) float64 world points in units of voxels.
+        index, buffers: Of the grid.
+        label_set: For the ids.
+        vote_discount: rho.
+        unknown_below: Confidence below which a label is the ignore id.
+
+    Returns:
+        rgb (N, 3) uint8, label (N,) uint8 ids (ignore id = unknown), confidence (N,) float32 (0 = no votes), measured
+        (N,) bool, False where depth of a voxel around was computed, or none lies around.
+    """
+    rgb, channel = np.zeros((len(voxels), 3), np.uint8), np.full(len(voxels), -1, np.int64)
+    confidence, measured = np.zeros(len(voxels), np.float32), np.zeros(len(voxels), np.bool_)
+    points = np.ascontiguousarray(voxels)
+    decision = (vote_discount, unknown_below)
+    _read_map_points(len(points), points, index, buffers, *decision, rgb, channel, confidence, measured)
+    return rgb, label_set.to_ids(channel), confidence, measured
+
+
 @parallel_kernel()
 def _cast_view_rows(
     rows: int,
@@ -120,4 +157,21 @@ def _cast_view_rows(
     measured: Bool,
 ) -> None:
     """Fill the rows of a window of what ``cast_view`` returns."""
+    ...
+
+
+@parallel_kernel()
+def _read_map_points(
+    count: int,
+    voxels: Float64,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    vote_discount: float,
+    unknown_below: float,
+    rgb: UInt8,
+    channel: Int64,
+    confidence: Float32,
+    measured: Bool,
+) -> None:
+    """Fill rgb (N, 3), channel (N,), -1 = unknown, confidence (N,) and measured (N,) of points (N, 3)."""
     ...

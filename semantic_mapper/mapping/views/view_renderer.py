@@ -1,23 +1,34 @@
-"""The semantics of one view, with as many rays and samples as the settings, or the rate to hold, allow."""
+"""The semantics of one view, with as many rays and samples as the settings, or the rate to hold, allow.
+
+``add_own_image`` joins it with what the frame's image says by itself. A rendered view has the image among its sources,
+but few rays: what lies between them is filled in. The image's own features are classified at every coarse pixel.
+"""
 
 from __future__ import annotations
 
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.nn import functional
 
 from semantic_mapper.config import RenderConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews, Sampled, SemanticField
+from semantic_mapper.fields.base import EncodedViews, ImageClassifier, Sampled, SemanticField
 from semantic_mapper.fields.render import render_sparse_view, render_view
 from semantic_mapper.fields.volume import around_computed
-from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.rate_controller import RateController
+from semantic_mapper.mapping.fusion.fuse import PROBABILITY_FLOOR
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
-_log = get_logger(__name__)
+SAMPLES_WITHOUT_DEPTH = 32  # a ray, of views of which neither sensor nor map knows any depth
+LEAST_SAMPLES = 2
+LEAST_SHARE = 0.1  # of the pixels; below, samples go first
+RESERVE = 0.9  # of a frame's time is planned for: frames differ
+MEMORY = 0.7  # of what was known stays when a new frame is measured
 
 
 class RenderedView(NamedTuple):
@@ -43,7 +54,7 @@ class ViewRenderer:
 
     Args:
         field: Whose samples a ray can be set, where a rate is to be held.
-        config: Fraction of the rays, samples of views without any depth, rate.
+        config: Fraction of the rays, rate.
         sampling: Of a ray with a depth prior.
 
     Raises:
@@ -99,16 +110,14 @@ class ViewRenderer:
             fraction, sampling = self._rate_controller.choose(prior_m.size)
         blind = not prior_m.any()
         if blind:
-            sampling = msgspec.structs.replace(
-                sampling, guided=max(self._config.samples_without_depth, sampling.guided)
-            )
+            sampling = msgspec.structs.replace(sampling, guided=max(SAMPLES_WITHOUT_DEPTH, sampling.guided))
         elif computed:
             sampling = around_computed(sampling)
         samples = 0
         if isinstance(self._field, Sampled) and sampling.mode == "streaming":
             self._field.sampling = sampling
             samples = sampling.guided
-        scene = (self._field, sources, intrinsics, T_world_camera, prior_m, sampling, self._config.rays_per_chunk)
+        scene = (self._field, sources, intrinsics, T_world_camera, prior_m, sampling, 0)
         if fraction == 1:
             probabilities, known, depth_m = render_view(*scene, measured, stamp_ns)
             rays = prior_m.size
@@ -116,3 +125,69 @@ class ViewRenderer:
             probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, fraction, measured, stamp_ns)
         self._last = (0 if blind else rays, samples)
         return RenderedView(probabilities, known, depth_m, rays, samples)
+
+
+def add_own_image(view: RenderedView, field: SemanticField, current: EncodedViews, weight: float) -> RenderedView:
+    """The weighted geometric mean of the class probabilities of both, where the view is known.
+
+    Args:
+        view: Rendered, (h, w).
+        field: The view is returned as it is where this has no opinion of single images.
+        current: The frame's own image, encoded.
+        weight: Of what the image says by itself, 0..1; 0 = the view as it is.
+    """
+    if weight == 0 or not isinstance(field, ImageClassifier):
+        return view
+    with torch.inference_mode():
+        logits = field.source_logits(current)
+        if logits is None:
+            return view
+        own = logits.float().cpu()
+        if own.shape[2:] != view.known.shape:
+            own = functional.interpolate(own, size=view.known.shape, mode="bilinear", align_corners=False)
+        own = torch.log_softmax(own[0].permute(1, 2, 0), dim=-1).clamp_min(float(np.log(PROBABILITY_FLOOR)))
+        rendered = torch.from_numpy(view.probabilities).clamp_min(PROBABILITY_FLOOR).log()
+        joined = torch.softmax(weight * own + (1 - weight) * rendered, dim=-1).numpy()
+    return view._replace(probabilities=np.where(view.known[..., None], joined, view.probabilities))
+
+
+class RateController:
+    """Trades rays, then samples, for a target rate.
+
+    What a frame takes is modelled as a part that does not depend on rays, and a cost a ray and sample; both are
+    followed from frame to frame. What it chooses depends on the machine, so a map made with it is not reproducible.
+
+    Args:
+        target_hz: Frames a second to hold.
+        fraction: Largest fraction of the pixels that may have rays.
+        sampling: The most samples a ray.
+    """
+
+    def __init__(self, target_hz: float, fraction: float, sampling: SamplingConfig) -> None:
+        self._budget_ms = RESERVE * 1e3 / target_hz
+        self._share = fraction
+        self._sampling = sampling
+        self._other_ms: float | None = None
+        self._sample_ms: float | None = None  # of one sample of one ray
+
+    def choose(self, pixels: int) -> tuple[float, SamplingConfig]:
+        """Fraction of the ``pixels`` of the rendered view that may have rays, and the samples a ray."""
+        if self._other_ms is None or self._sample_ms is None:
+            return self._share, self._sampling
+        samples = max(self._budget_ms - self._other_ms, 0.0) / self._sample_ms
+        count = self._sampling.guided
+        while count > LEAST_SAMPLES and samples / (count * pixels) < min(LEAST_SHARE, self._share):
+            count -= 1
+        free = min(self._sampling.free_space, count - LEAST_SAMPLES)
+        sampling = msgspec.structs.replace(self._sampling, guided=count, free_space=free)
+        return min(samples / (count * pixels), self._share), sampling
+
+    def note(self, render_ms: float, other_ms: float, rays: int, samples: int) -> None:
+        """What a frame took: its rendering, and all else."""
+        self._other_ms = _follow(self._other_ms, other_ms)
+        if rays:
+            self._sample_ms = _follow(self._sample_ms, render_ms / (rays * samples))
+
+
+def _follow(old: float | None, new: float) -> float:
+    return new if old is None else MEMORY * old + (1 - MEMORY) * new

@@ -1,8 +1,10 @@
-"""Where to look next without moving: novel viewpoints that keyframes cover and from where the map has most to learn.
+"""Virtual views: novel viewpoints that keyframes cover and from where the map has most to learn, and their votes.
 
-A candidate stands where a keyframe stood, or a step beside it in air that a keyframe has looked through, and looks at
+A candidate stands where a keyframe stood, or a step to its side in air that a keyframe has looked through, and looks at
 surface that is in need of class votes (``surface_patches``). Its score is the need of what it sees, weighted by how
 many keyframes see that, too, and by its nearness, as votes are. What was looked at once is not looked at again.
+
+A rendered view measures nothing: TSDF, colour and weight stay as they are, to the bit, and no block is added.
 """
 
 from __future__ import annotations
@@ -13,28 +15,77 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.config import VirtualViewConfig
-from semantic_mapper.geometry import invert_pose, look_at, nearest_pixels, scale_intrinsics, transform
-from semantic_mapper.mapping.fusion.fuse import FULL_TRUST_RANGE_M
+from semantic_mapper.geometry import check_pose, invert_pose, look_at, nearest_pixels, scale_intrinsics, transform
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.mapping.fusion.allocation import blocks_in_band, make_camera
+from semantic_mapper.mapping.fusion.fuse import (
+    FULL_TRUST_RANGE_M,
+    ProbabilityTable,
+    check_depth,
+    frame_votes,
+    make_limits,
+    probability_table,
+    vote_into_blocks,
+)
 from semantic_mapper.mapping.keyframes import Keyframe
-from semantic_mapper.mapping.views.surface_patches import SurfacePatches, surface_patches
+from semantic_mapper.mapping.storage.block_grid import GridBuffers
+from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import CameraIntrinsics, Float64
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, Int64
 from semantic_mapper.view_selection import visible_points
 
+VOTE_WEIGHT = 0.3  # of a vote, against one of a frame
+MAX_VOTES = 0.3  # only voxels with fewer take votes; a frame's vote from up to 2 m, head on, is 1
+LEAST_KEYFRAMES = 2  # that must see a surface for a virtual view to look at it
 ENOUGH_KEYFRAMES = 4  # more that see a surface add nothing to its score
 TARGET_CELL_M = 0.5  # surface in need is gathered in cells of this size ...
 TARGETS = 4  # ... of which the neediest this many are looked at, each from where ...
 EYES = 6  # ... this many of the keyframes that see it stood, and from ...
-STEPS_ASIDE = 2  # ... this many places beside each, ...
+STEPS_ASIDE = 2  # ... this many places next to each, ...
 STEP_M = 0.25  # ... this far away (one sigma)
 NEAREST_M, FARTHEST_M = 0.5, 3.5  # of what is looked at
 MARGIN_M = 0.15  # of free space round a place
 PATCHES = 2000  # at most, the neediest, that candidates are scored on
 CAST_WIDTH = 40  # pixels of the ray casts that tell what hides what
 CASTS = 4  # of the best candidates before occlusion
+SURFACE_VOXELS = 0.75  # voxels at most this many of their edges from the surface are of it
 LEAST_GAIN = 20.0  # voxels without votes, seen from within 2 m and by enough keyframes; less is not worth the time
 ALONG_UP = 0.95  # cosine with up, beyond which a view has no clear roll
+
+
+class SurfacePatches(NamedTuple):
+    """N patches of the surface, in the order of their keys.
+
+    Args:
+        packed: (N,) int64 keys of their blocks.
+        xyz: (N, 3) float64 metres in the world, mean of their voxels.
+        need: (N,) float64, sum over their voxels of ``(1 - confidence) / (1 + votes)``: 1 without votes, little where
+            the class is clear, and 0 where there are votes enough.
+    """
+
+    packed: NDArray[np.int64]
+    xyz: Float64
+    need: Float64
+
+
+def surface_patches(voxel_map: VoxelMap) -> SurfacePatches:
+    """Patches of the blocks in memory; those on disk are left out.
+
+    Args:
+        voxel_map: Whose surface it is.
+    """
+    config = voxel_map.config
+    with voxel_map.locked() as grid:
+        keys, blocks = grid.sorted_blocks()
+        near = SURFACE_VOXELS / config.truncation_voxels
+        total, need = np.zeros((len(blocks), 3)), np.zeros(len(blocks))
+        count = np.zeros(len(blocks), np.int64)
+        _sum_surface_patches(
+            len(blocks), keys, blocks, grid.buffers(), near, config.vote_discount, MAX_VOTES, total, need, count
+        )
+    has = count > 0
+    xyz = total[has] / count[has, None] * config.voxel_size_m
+    return SurfacePatches(pack_keys(keys[has]), xyz, need[has])
 
 
 class VirtualView(NamedTuple):
@@ -51,7 +102,7 @@ class VirtualView(NamedTuple):
     packed: NDArray[np.int64]
 
 
-class VirtualLook(NamedTuple):
+class RenderedVirtualView(NamedTuple):
     """A virtual view that was rendered and fused.
 
     Args:
@@ -71,12 +122,10 @@ class ViewpointChooser:
     Deterministic: the same map, keyframes, seed and number of choices before give the same view.
 
     Args:
-        config: How many keyframes must see what is looked at.
-        seed: Of the places beside the keyframes.
+        seed: Of the places next to the keyframes.
     """
 
-    def __init__(self, config: VirtualViewConfig, seed: int) -> None:
-        self._config = config
+    def __init__(self, seed: int) -> None:
         self._seed = seed
         self._choices = 0
         self._looked_at = np.empty(0, np.int64)
@@ -94,10 +143,10 @@ class ViewpointChooser:
         """
         if voxel_map.epoch != self._epoch:
             self._looked_at, self._epoch = np.empty(0, np.int64), voxel_map.epoch
-        if len(keyframes) < self._config.keyframes:
+        if len(keyframes) < LEAST_KEYFRAMES:
             return None
-        patches = surface_patches(voxel_map, self._config.max_votes)
-        patches = _worth_a_look(patches, keyframes, self._config.keyframes, self._looked_at)
+        patches = surface_patches(voxel_map)
+        patches = _worth_a_look(patches, keyframes, self._looked_at)
         if patches.need.sum() < LEAST_GAIN:
             return None
         rng = np.random.default_rng([self._seed, self._choices])
@@ -124,7 +173,7 @@ def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> NDArray[np.
 
 
 def _worth_a_look(
-    patches: SurfacePatches, keyframes: Sequence[Keyframe], least: int, looked_at: NDArray[np.int64]
+    patches: SurfacePatches, keyframes: Sequence[Keyframe], looked_at: NDArray[np.int64]
 ) -> SurfacePatches:
     """The neediest patches that enough keyframes see and that were not looked at; need times fraction of views."""
     fresh = np.flatnonzero((patches.need > 0) & ~np.isin(patches.packed, looked_at))
@@ -133,7 +182,8 @@ def _worth_a_look(
     for k in keyframes:
         near = ((points - k.T_world_camera[:3, 3]) ** 2).sum(1) < FARTHEST_M**2
         count += near & visible_points(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=True)
-    need = np.where(count >= least, np.minimum(count, ENOUGH_KEYFRAMES) / ENOUGH_KEYFRAMES * patches.need[fresh], 0)
+    seen = np.minimum(count, ENOUGH_KEYFRAMES) / ENOUGH_KEYFRAMES
+    need = np.where(count >= LEAST_KEYFRAMES, seen * patches.need[fresh], 0)
     some = np.sort(np.argsort(-need, kind="stable")[:PATCHES])
     some = some[need[some] > 0]
     return SurfacePatches(patches.packed[fresh[some]], points[some], need[some])
@@ -202,3 +252,74 @@ def _worth(z: Float64, patches: SurfacePatches) -> Float64:
     """What patches (N,) at depth ``z`` (N,) count: as far as votes from there do."""
     nearness = np.minimum(1, (FULL_TRUST_RANGE_M / np.maximum(z, NEAREST_M)) ** 2)
     return np.where(z <= FARTHEST_M, nearness * patches.need, 0)
+
+
+def add_votes(
+    voxel_map: VoxelMap,
+    T_world_camera: Float64,
+    intrinsics: CameraIntrinsics,
+    depth_m: Float32,
+    table: ProbabilityTable,
+) -> int:
+    """Give the map's surface the class votes of one view, one a voxel; nothing else of the map changes.
+
+    A vote weighs ``VOTE_WEIGHT`` times what that of a frame would (``fuse.make_votes``), and only voxels take it that
+    have fewer than ``MAX_VOTES``. ``frames`` does not count the view, ``version`` does.
+
+    Args:
+        voxel_map: Whose surface it is.
+        T_world_camera: (4, 4) of the view.
+        intrinsics: Of ``depth_m``.
+        depth_m: (H, W) float32, z of the map's surface in the view; 0 = none.
+        table: Probabilities (K, L) float32, and the row (H, W) int32 that each pixel takes, -1 = unknown.
+
+    Returns:
+        Blocks that were given votes to, or would have been had they had voxels near the surface.
+
+    Raises:
+        PoseError, ShapeError, FrameError: the view cannot be used; the map is as it was.
+        MapError: the disk fails.
+    """
+    where = "votes without a frame"
+    check_pose(T_world_camera, where)
+    depth = check_depth(depth_m, intrinsics, where)
+    limits, classes = make_limits(voxel_map.config), len(voxel_map.label_set)
+    checked = probability_table(depth, table[0], None, table[1], classes, where)
+    camera = make_camera(intrinsics, T_world_camera)
+    with voxel_map.locked() as grid:
+        votes = frame_votes(depth, checked, camera, limits.depth_max, classes, where)
+        votes = votes._replace(weights=votes.weights * np.float32(VOTE_WEIGHT))
+        budget = voxel_map.config.max_blocks  # no block is added
+        packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max, budget)
+        packed = packed[np.isin(packed, grid.all_packed())]
+        for blocks in voxel_map.changing(packed) if len(packed) else ():
+            vote_into_blocks(len(blocks), blocks, grid.buffers(), camera, limits, depth, votes, MAX_VOTES)
+    return len(packed)
+
+
+@parallel_kernel()
+def _sum_surface_patches(
+    blocks_count: int,
+    keys: Int32,
+    blocks: Int32,
+    buffers: GridBuffers,
+    near: float,
+    vote_discount: float,
+    max_votes: float,
+    total: Float64,
+    need: Float64,
+    count: Int64,
+) -> None:
+    """Sums over the surface voxels of blocks: keys (B, 3), buffer indices (B,).
+
+    Args:
+        blocks_count: B.
+        keys, blocks, buffers: Of the grid.
+        near: TSDF of voxels of the surface, at most.
+        vote_discount: rho.
+        max_votes: See ``surface_patches``.
+        total: (B, 3) zeros: sum of positions, in voxels.
+        need: (B,) zeros: see ``SurfacePatches``.
+        count: (B,) zeros: number of surface voxels.
+    """
+    ...

@@ -50,27 +50,6 @@ def test_open3d_sees_the_map_with_its_labels(sphere: VoxelMap) -> None:
         small_map().to_open3d()
 
 
-def test_mesh_does_not_depend_on_the_tiles(sphere: VoxelMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = sphere.mesh()
-    monkeypatch.setattr(extract, "MESH_TILE_BLOCKS", 17)
-    tiled = sphere.mesh()
-    assert (whole.vertices == tiled.vertices).all() and (whole.faces == tiled.faces).all()
-
-
-def test_points_are_among_the_mesh_vertices(sphere: VoxelMap) -> None:
-    """Both are zero crossings on voxel edges; the mesh has some more where the depth has edges."""
-    points, mesh = sphere.points(), sphere.mesh()
-    vertices = {tuple(v) for v in np.round(mesh.vertices / 1e-5).astype(int).tolist()}
-    shared = sum(tuple(p) in vertices for p in np.round(points.xyz / 1e-5).astype(int).tolist())
-    assert shared > 0.8 * len(points.xyz)
-
-
-def test_points_with_too_little_weight_are_left_out(sphere: VoxelMap) -> None:
-    counts = [len(sphere.points(w).xyz) for w in (1.0, 3.0, 1000.0)]
-    assert counts[0] > counts[1] > counts[2] == 0
-    assert len(sphere.mesh(1000.0).faces) == 0
-
-
 def test_depth_edge_is_not_bridged_by_a_false_surface() -> None:
     depth = plane_depth(np.eye(4), (0, 0, 1), 1.5)
     depth[:, :80] = 1.0  # a wall in front of a wall
@@ -109,9 +88,3 @@ def test_crossings_are_those_of_a_dense_grid(min_weight: float, rng: np.random.G
     assert len(found) == len(points) > 100
     in_order = [p[np.lexsort(np.round(p, 6).T)] for p in (found, points)]
     np.testing.assert_allclose(*in_order, atol=1e-9)
-
-
-def test_no_blocks_have_no_crossings(rng: np.random.Generator) -> None:
-    index, buffers = random_grid(rng)
-    grid = cast("Any", SimpleNamespace(index=index, buffers=lambda: buffers))
-    assert extract.surface_voxels(buffers.keys[:0], np.empty(0, np.int32), grid, 1.0).shape == (0, 3)

@@ -11,8 +11,7 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.files import atomic_write
-from semantic_mapper.mapping.files.map_file import describe_map, open_map
-from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS
+from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, describe_map, open_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.rendered_views import LABELS, around, frame, small_map, sphere_depth, sure
 from tests.mapping.test_voxel_map import CENTER, fuse_sphere, same
@@ -45,24 +44,6 @@ def test_loaded_map_is_the_saved_one_bit_for_bit_and_goes_on(saved: tuple[VoxelM
     assert (voxel_map.points().label == loaded.points().label).all()
 
 
-def test_an_empty_map_survives(tmp_path: Path) -> None:
-    small_map().save(tmp_path / "empty.npz")
-    loaded = VoxelMap.load(tmp_path / "empty.npz")
-    assert loaded.block_count == 0
-    one_more(loaded)
-    assert loaded.block_count > 0
-
-
-def test_numpy_opens_the_file_and_nothing_else_stays(saved: tuple[VoxelMap, Path]) -> None:
-    voxel_map, path = saved
-    state = voxel_map.block_state()
-    with np.load(path) as arrays:
-        assert (arrays["000000/keys"] == state["keys"]).all()
-        assert (arrays["000000/tsdf"] == state["tsdf"][state["weight"] > 0]).all()
-        assert (arrays["000000/evidence"] == state["evidence"][state["votes"] > 0]).all()
-    assert [p.name for p in path.parent.iterdir()] == ["map.npz"]
-
-
 def test_the_same_map_gives_the_same_bytes(saved: tuple[VoxelMap, Path], tmp_path: Path) -> None:
     voxel_map, path = saved
     again = tmp_path / "again.npz"
@@ -91,7 +72,7 @@ def test_a_map_is_described_without_its_blocks(saved: tuple[VoxelMap, Path]) -> 
     found = describe_map(path)
     state = voxel_map.block_state()
     corners = np.stack((state["keys"].min(axis=0), state["keys"].max(axis=0) + 1)) * (8 * 0.03)
-    assert (found.version, found.frames, found.last_stamp_ns, found.blocks) == (2, 3, 1002, voxel_map.block_count)
+    assert (found.version, found.frames, found.last_stamp_ns, found.blocks) == (3, 3, 1002, voxel_map.block_count)
     assert (found.config, found.label_set) == (voxel_map.config, LABELS)
     np.testing.assert_allclose(np.array(found.bounds_m), corners, rtol=0, atol=1e-9)
     assert sum(chunk.measured for chunk in found.chunks) == (state["weight"] > 0).sum()
@@ -132,14 +113,6 @@ def test_truncated_file_is_refused(saved: tuple[VoxelMap, Path], fraction: float
         path.write_bytes(content[:-lost])
         with pytest.raises(MapError, match="damaged"):
             VoxelMap.load(path)
-
-
-@pytest.mark.parametrize("tail", [b"\0", b"x" * 5000, b"PK\5\6" + bytes(18)], ids=["byte", "long", "another end"])
-def test_a_file_with_something_behind_its_end_is_refused(saved: tuple[VoxelMap, Path], tail: bytes) -> None:
-    path = saved[1]
-    path.write_bytes(path.read_bytes() + tail)
-    with pytest.raises(MapError, match=r"damaged|not a map file"):
-        VoxelMap.load(path)
 
 
 def rewrite(path: Path, change_manifest: dict[str, object], **members: bytes | None) -> None:
@@ -203,19 +176,6 @@ def test_what_claims_to_be_huge_is_refused_before_memory_is_taken(saved: tuple[V
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 20e6
-
-
-def test_a_chunk_that_is_not_what_it_says_is_refused(saved: tuple[VoxelMap, Path]) -> None:
-    path = saved[1]
-    good = path.read_bytes()
-    with zipfile.ZipFile(path) as archive:
-        keys = archive.read("000000/keys.npy")
-    swapped = keys[:128] + keys[140:152] + keys[128:140] + keys[152:]
-    for change, message in ((swapped, "SHA-256"), (keys[:-1], "keys is damaged"), (b"x" + keys[1:], "not an array")):
-        path.write_bytes(good)
-        rewrite(path, {}, keys=change)
-        with pytest.raises(MapError, match=message):
-            VoxelMap.load(path)
 
 
 def test_files_that_are_no_maps_are_refused(tmp_path: Path) -> None:

@@ -8,12 +8,10 @@ from semantic_mapper.geometry import look_at, unproject
 from semantic_mapper.mapping.fusion.allocation import (
     blocks_in_band,
     blocks_in_view,
-    frame_budget,
     make_camera,
     view_bounds,
 )
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
-from semantic_mapper.types import CameraIntrinsics
 from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, small_map
 
 POSE = look_at(np.array([0.4, -0.3, -1.1]), np.array([0.1, 0.1, 0.4]), np.array([0.1, -1.0, 0.0]))
@@ -47,50 +45,6 @@ def test_every_block_that_a_ray_crosses_in_the_band_is_found(scene: str, rng: np
     assert len(found) < 1.1 * len(expected)
 
 
-def tile_rays(depth: np.ndarray, voxel: float, u0: int, v0: int, side: int) -> list[tuple[float, float, float, float]]:
-    """Pixel, least and greatest depth of the rays that stand for a tile: one where it is smooth, else its quarters'."""
-    tile = depth[v0 : v0 + side, u0 : u0 + side]
-    height, width = depth.shape
-    whole = tile.shape == (side, side) and (tile > 0).all()
-    widest = 2 * voxel * min(INTRINSICS.fx, INTRINSICS.fy) / side if side > 1 else np.inf
-    if whole and tile.max() - tile.min() <= np.float32(2 * voxel) and tile.max() <= widest:
-        across = side - 1
-        inside = 0 < u0 < width - 4 and 0 < v0 < height - 4
-        if inside or side == 1:
-            at = [(u0 + across / 2, v0 + across / 2)]
-        else:
-            at = [(u0 + i * across, v0 + j * across) for i in (0, 1) for j in (0, 1)]
-        return [(u, v, float(tile.min()), float(tile.max())) for u, v in at]
-    half = side // 2
-    parts = [(u, v) for v in (v0, v0 + half) for u in (u0, u0 + half) if u < width and v < height] if half else []
-    return [ray for u, v in parts for ray in tile_rays(depth, voxel, u, v, half)]
-
-
-@pytest.mark.parametrize("scene", ["plane", "noise"])
-def test_blocks_are_those_of_the_rays_of_smooth_tiles(scene: str, rng: np.random.Generator) -> None:
-    depth = plane_depth(POSE, (0.2, 0.1, 1.0), 0.45)[:, :157]
-    depth[rng.random(depth.shape) < 0.03] = np.nan
-    if scene == "noise":
-        depth[::2, 40:90] += rng.uniform(0, 0.5, (60, 50)).astype(np.float32)
-    measured, keys = np.nan_to_num(depth), []
-    for v0, u0 in np.ndindex(30, 40):
-        for u, v, least, most in tile_rays(measured, 0.02, 4 * u0, 4 * v0, 4):
-            direction = POSE[:3, :3] @ [(u - INTRINSICS.cx) / INTRINSICS.fx, (v - INTRINSICS.cy) / INTRINSICS.fy, 1]
-            near, far = max(least - 0.08, 0), most + 0.08
-            ends = [(POSE[:3, 3] + z * direction) / 0.16 for z in (near, far)]
-            # Where the way between both ends crosses a face of a block; between two such places it is in one block.
-            planes = [
-                (axis, n) for axis in range(3) for n in range(*np.ceil(np.sort([e[axis] for e in ends])).astype(int))
-            ]
-            cuts = [(n - ends[0][axis]) / (ends[1] - ends[0])[axis] for axis, n in planes]
-            places = np.sort([0.0, *cuts, 1.0])
-            middles = (places[:-1] + places[1:]) / 2
-            keys.append(np.floor(ends[0] + middles[:, None] * (ends[1] - ends[0])).astype(np.int32))
-    expected = np.unique(pack_keys(np.concatenate(keys)))
-    found = blocks_in_band(depth, make_camera(INTRINSICS, POSE), 0.02, 0.08, 5.0)
-    np.testing.assert_array_equal(found, expected)
-
-
 @pytest.mark.parametrize("column", [80, 81, 82, 83])
 def test_a_pole_one_pixel_wide_is_not_missed(column: int) -> None:
     depth = np.zeros((120, 160), np.float32)
@@ -100,16 +54,6 @@ def test_a_pole_one_pixel_wide_is_not_missed(column: int) -> None:
     xyz = voxel_map.points().xyz
     assert xyz[:, 1].max() - xyz[:, 1].min() > 0.85
     assert np.abs(xyz[:, 2] - 1.0).max() < 0.001
-
-
-def test_no_measurement_no_blocks() -> None:
-    assert len(blocks_in_band(np.zeros((120, 160), np.float32), make_camera(INTRINSICS, POSE), 0.02, 0.08, 5.0)) == 0
-
-
-def test_more_blocks_than_the_first_guess_has_room_for(rng: np.random.Generator) -> None:
-    depth = rng.uniform(0.5, 5.0, (120, 160)).astype(np.float32)
-    found = blocks_in_band(depth, make_camera(INTRINSICS, POSE), 0.004, 0.3, 5.0, 1 << 20)
-    assert len(found) > 8 * (1 << 13)
 
 
 def test_a_frame_that_needs_more_blocks_than_its_budget_is_refused(rng: np.random.Generator) -> None:
@@ -126,15 +70,6 @@ def test_a_camera_whose_rays_are_endless_is_refused_before_they_are_followed(cha
     camera = make_camera(INTRINSICS, POSE)._replace(**change)
     with pytest.raises(FrameError, match="check the intrinsics"):
         blocks_in_band(np.ones((120, 160), np.float32), camera, 0.02, 0.08, 5.0)
-
-
-def test_the_budget_is_a_fraction_of_the_map() -> None:
-    assert frame_budget(200_000) == 25_000 and frame_budget(1000) == 1 << 14
-
-
-def test_an_image_of_one_pixel_is_enough() -> None:
-    camera = make_camera(CameraIntrinsics(100, 100, 0, 0, 1, 1), np.eye(4))
-    assert len(blocks_in_band(np.full((1, 1), 1.0, np.float32), camera, 0.02, 0.08, 5.0)) == 2
 
 
 def test_blocks_in_view_are_all_that_a_camera_sees_the_nearest_first() -> None:

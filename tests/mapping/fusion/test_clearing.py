@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.mapping.fusion import clearing
-from semantic_mapper.mapping.fusion.depth_bounds import depth_bounds
+from semantic_mapper.mapping.fusion.clearing import depth_bounds
 from semantic_mapper.mapping.storage.changes import UNOBSERVED
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
@@ -96,25 +96,6 @@ def test_a_thing_that_left_is_cleared_within_three_frames(looks: int) -> None:
     assert not blocks["evidence"][free].any()  # or it would come back from disk otherwise
 
 
-def test_without_clearing_it_stays() -> None:
-    voxel_map = small_map(clear_free_space=False)
-    see(voxel_map, wall(thing=True), times=10)
-    before = thing_points(voxel_map)
-    see(voxel_map, wall(), times=10)
-    assert thing_points(voxel_map) > 0.7 * before and voxel_map.cleared == 0
-
-
-def test_one_odd_frame_clears_nothing_that_was_seen_often() -> None:
-    """As of a mirror, which shows now itself and now what is in it."""
-    voxel_map = small_map()
-    see(voxel_map, wall(thing=True), times=10)
-    before = thing_points(voxel_map)
-    for _ in range(20):
-        see(voxel_map, wall())
-        see(voxel_map, wall(thing=True))
-    assert thing_points(voxel_map) == before and voxel_map.cleared == 0
-
-
 @pytest.mark.parametrize("hole", [0.0, np.nan, np.inf, 65.0])
 def test_holes_and_what_is_too_far_clear_nothing(hole: float) -> None:
     voxel_map = small_map()
@@ -145,17 +126,6 @@ def test_no_return_clears_up_to_the_range_of_a_sensor_that_is_trusted_so(hole: f
         assert thing_points(voxel_map) == 0 < before and not behind.any()
     else:
         assert thing_points(voxel_map) == before and voxel_map.cleared == 0
-
-
-def test_depth_that_is_not_trusted_is_no_missing_return() -> None:
-    voxel_map, trust = small_map(no_return_range_m=4.0), np.ones((240, 320), np.float32)
-    see(voxel_map, wall(thing=True), times=10)
-    before = thing_points(voxel_map)
-    trust[60:180, 80:240] = 0
-    for _ in range(5):
-        given = frame(pose(), seq=voxel_map.frames, intrinsics=CAMERA)
-        voxel_map.integrate(given, wall(), None, trust=trust)
-    assert thing_points(voxel_map) == before and voxel_map.cleared == 0
 
 
 def test_computed_depth_clears_nothing_and_measured_depth_clears_what_was_computed() -> None:
@@ -190,22 +160,6 @@ def test_a_thin_pole_stays_where_poses_are_off() -> None:
     assert kept[True] > 0.97 * kept[False] > 100
 
 
-def test_a_floor_seen_at_grazing_angles_stays() -> None:
-    kept = {}
-    v = np.arange(240)
-    for clears in (False, True):
-        noise, voxel_map = np.random.default_rng(6), small_map(clear_free_space=clears)
-        for n in range(40):
-            below = (v - CAMERA.cy) / CAMERA.fy
-            z = np.where(below > 0.05, 0.4 / np.maximum(below, 1e-3), 0)  # 0.4 m above it: 5 degrees at 4.5 m
-            depth = np.repeat(z.astype(np.float32)[:, None], 320, axis=1)
-            T = pose(0.02 * n)
-            T[1, 3] += noise.normal(0, 0.004)
-            voxel_map.integrate(frame(T, seq=n, intrinsics=CAMERA), depth, None)
-        kept[clears] = len(voxel_map.points().xyz)
-    assert kept[True] > 0.995 * kept[False] > 1000
-
-
 def test_clearing_is_deterministic_and_blocks_on_disk_are_cleared_as_well() -> None:
     """Beside the thing, the map has more blocks than memory has room for."""
     maps = [small_map(), small_map(), small_map(memory_mb=9)]
@@ -220,17 +174,6 @@ def test_clearing_is_deterministic_and_blocks_on_disk_are_cleared_as_well() -> N
     assert maps[2].stored_blocks > 0
     assert state(maps[0]) == state(maps[1]) == state(maps[2])
     assert maps[0].cleared == maps[2].cleared
-
-
-def test_a_saved_map_clears_as_it_would_have(tmp_path: Path) -> None:
-    voxel_map = small_map()
-    see(voxel_map, wall(thing=True), times=10)
-    see(voxel_map, wall())
-    voxel_map.save(tmp_path / "map.npz")
-    loaded = VoxelMap.load(tmp_path / "map.npz")
-    for each in (voxel_map, loaded):
-        see(each, wall(), times=2)
-    assert state(voxel_map) == state(loaded) and thing_points(loaded) == 0
 
 
 def test_a_mirror_is_told_of_what_vanished_and_of_nothing_else() -> None:

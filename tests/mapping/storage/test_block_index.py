@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from semantic_mapper.mapping.storage.block_index import (
     KEY_LIMIT,
     find_blocks,
-    has_room,
     insert_blocks,
     make_block_index,
     pack_keys,
@@ -35,10 +34,3 @@ def test_what_was_put_in_is_found_and_nothing_else(keys: list[tuple[int, int, in
     assert (find_blocks(index, pack_keys(array))[half:] == -1).all()
     insert_blocks(index, pack_keys(array[half:]), values[half:])
     assert (find_blocks(index, pack_keys(array)) == values).all()
-
-
-def test_a_dense_cube_of_keys_fits_its_table() -> None:
-    keys = np.stack(np.meshgrid(*(np.arange(-12, 12),) * 3), -1).reshape(-1, 3).astype(np.int32)
-    index = make_block_index(keys, np.arange(len(keys), dtype=np.int32))
-    assert has_room(index, len(keys))
-    assert (find_blocks(index, pack_keys(keys)) == np.arange(len(keys))).all()

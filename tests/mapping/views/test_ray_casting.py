@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from semantic_mapper.geometry import look_at, scale_intrinsics
-from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
-from semantic_mapper.types import CameraIntrinsics
-from tests.mapping.grids import corners
+from semantic_mapper.labels import make_label_set
+from semantic_mapper.mapping.fusion.fuse import MEASURED
+from semantic_mapper.mapping.storage.block_grid import GridBuffers
+from semantic_mapper.mapping.views.ray_casting import read_points
+from tests.mapping.grids import corners, random_grid
 from tests.mapping.rendered_views import (
     INTRINSICS,
     around,
@@ -40,19 +42,6 @@ def test_wall_depth_is_unbiased_whichever_way_the_camera_looks(turn_deg: int) ->
     assert view.confidence[inner].min() > 0.3
 
 
-def test_sphere_is_seen_from_a_pose_it_was_not_fused_from() -> None:
-    center = np.array([0.3, -0.2, 0.5])
-    voxel_map = small_map()
-    for seq, pose in enumerate(around(center, 1.2, 12)):
-        voxel_map.integrate(frame(pose, seq=seq), sphere_depth(pose, center, 0.4), None, None)
-    pose = look_at(center + np.array([0.9, 0.8, 0.3]), center, np.array([0.0, 0.0, 1.0]))
-    truth, view = sphere_depth(pose, center, 0.4), voxel_map.ray_cast(pose, INTRINSICS)
-    both = (truth > 0) & (view.depth_m > 0)
-    assert both.sum() > 0.97 * (truth > 0).sum()
-    error = np.abs(view.depth_m - truth)[both]
-    assert np.median(error) < 0.003 and np.quantile(error, 0.95) < 0.01
-
-
 def test_misses_are_explicit() -> None:
     voxel_map = small_map()
     voxel_map.integrate(frame(), plane_depth(np.eye(4), *WALL), sure(1), None)
@@ -66,16 +55,6 @@ def test_a_surface_is_not_seen_from_behind() -> None:
     voxel_map.integrate(frame(), plane_depth(np.eye(4), *WALL), None, None)
     behind = look_at(np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
     assert (voxel_map.ray_cast(behind, INTRINSICS).depth_m[10:-10, 10:-10] > 0).mean() < 0.01
-
-
-def test_views_of_another_size_agree_with_the_full_one() -> None:
-    voxel_map = small_map()
-    voxel_map.integrate(frame(), plane_depth(np.eye(4), *WALL), None, None)
-    small: CameraIntrinsics = scale_intrinsics(INTRINSICS, 40, 30)
-    view = voxel_map.ray_cast(np.eye(4), small)
-    truth = plane_depth(np.eye(4), *WALL, intrinsics=small)
-    assert view.depth_m.shape == (30, 40)
-    assert np.abs(view.depth_m - truth)[2:-2, 2:-2].max() < 0.005
 
 
 def test_hits_lie_on_the_first_zero_of_the_interpolated_field() -> None:
@@ -101,3 +80,46 @@ def test_hits_lie_on_the_first_zero_of_the_interpolated_field() -> None:
         assert abs(field(depth[v, u], directions[v, u])) < 5e-3
         before = np.array([field(z, directions[v, u]) for z in depth[v, u] - np.arange(0.01, 0.2, 0.01)])
         assert (before > 0).any() and not (before < -0.05).any()
+
+
+def test_points_are_read_as_plain_numpy_reads_them(rng: np.random.Generator) -> None:
+    index, buffers = random_grid(rng)
+    labels, rho, sums = (
+        make_label_set("four", ("a", "b", "c", "d"), ids=(7, 1, 4, 2), ignore_id=0),
+        0.4,
+        buffers.evidence.astype(np.float64),
+    )
+    points = rng.uniform(-12, 18, (400, 3))
+    points[::5] = np.round(points[::5])  # at voxels: the others count nothing
+    rgb, label, confidence, measured = read_points(points, index, buffers, labels, rho, 0.0)
+    assert 20 < measured.sum() < len(points) - 20
+    for n, p in enumerate(points):
+        around = [(f, at) for f, at in corners(buffers, p) if f >= 1e-3]
+        seen = [(f, at) for f, at in around if buffers.weight[at] > 0]
+        assert measured[n] == (bool(seen) and min(buffers.weight[at] for _, at in seen) >= MEASURED)
+        color = sum((f * buffers.color[at].astype(float) for f, at in seen), np.zeros(3)) / (
+            sum(f for f, _ in seen) or 1
+        )
+        np.testing.assert_allclose(rgb[n], color, atol=0.501)
+        voted = [(f, at) for f, at in around if buffers.votes[at] > 0]
+        fraction = sum(f for f, _ in voted)
+        if not voted:
+            assert (label[n], confidence[n]) == (0, 0.0)
+            continue
+        total, votes = (
+            sum(f * sums[at] for f, at in voted) / fraction,
+            sum(f * buffers.votes[at] for f, at in voted) / fraction,
+        )
+        worth = 1 / (1 + rho * (votes - 1)) if votes > 1 else 1 / votes
+        p_class = np.exp((total - total.max()) * worth)
+        assert label[n] == labels.ids[int(total.argmax())]
+        assert confidence[n] == pytest.approx(p_class.max() / p_class.sum(), rel=1e-5)
+
+
+def test_points_beyond_all_numbers_do_no_harm_and_unknown_ones_are_unknown(rng: np.random.Generator) -> None:
+    index, buffers = random_grid(rng)
+    labels = make_label_set("four", ("a", "b", "c", "d"), ignore_id=0)
+    wild = np.array([[np.nan] * 3, [np.inf, 0, 0], [1e300, -1e300, 0], [-1e19] * 3, [1e9] * 3])
+    assert np.isin(read_points(wild, index, buffers, labels, 0.5, 0.0)[1], (0, *labels.ids)).all()
+    for points in (np.full((2, 3), 300.0), wild[:0]):
+        assert not any(values.any() for values in read_points(points, index, buffers, labels, 0.5, 0.0))

@@ -35,14 +35,6 @@ def test_lifted_classes_follow_a_depth_edge_between_equal_colours():
     assert (channels(probabilities, rows) == (depth > 2.5)).all()
 
 
-def test_where_all_round_are_of_one_class_the_middle_one_speaks():
-    p = np.full((6, 8, 2), (0.9, 0.1), np.float32)
-    rgb = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
-    depth = np.ones((24, 32), np.float32)
-    rows = upsample(p, np.ones((6, 8), bool), rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy(), rgb, depth)
-    np.testing.assert_array_equal(rows, np.arange(24)[:, None] // 4 * 8 + np.arange(32)[None] // 4)
-
-
 def spoken_by(v, u, p, known, rgb_low, depth_low, rgb, depth):
     """The rule of ``upsample`` in plain words, for one pixel where the classes differ."""
     height, width = known.shape
@@ -86,16 +78,6 @@ def test_a_pixel_takes_the_most_alike_of_the_class_that_all_give_together(holes:
     assert (rows == np.array(expected)).mean() > 0.995  # float32 may decide a tie the other way
 
 
-def test_pixels_without_a_known_neighbour_stay_unknown():
-    known = np.zeros((8, 8), bool)
-    known[0, 0] = True
-    p = np.full((8, 8, 2), 0.5, np.float32)
-    rgb, depth = np.zeros((32, 32, 3), np.uint8), np.ones((32, 32), np.float32)
-    rows = upsample(p, known, rgb[::4, ::4].copy(), depth[::4, ::4].copy(), rgb, depth)
-    assert rows[0, 0] == 0
-    assert (rows[20:, 20:] == -1).all()
-
-
 @pytest.mark.parametrize(("size", "full"), [((1, 1), (5, 3)), ((1, 7), (2, 20)), ((5, 3), (17, 14)), ((9, 8), (4, 5))])
 def test_images_of_any_size_follow_the_rule_up_to_their_borders(size: tuple[int, int], full: tuple[int, int]):
     rng = np.random.default_rng(sum(size))
@@ -119,26 +101,6 @@ def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours
     v, u = np.mgrid[0:24, 0:32] // 4
     near = (np.abs(row - v) <= 1) & (np.abs(column - u) <= 1)
     assert ((rows == -1) | near).all() and near.mean() > 0.5
-
-
-def test_nothing_to_upsample_and_nothing_to_upsample_to():
-    none, some = np.zeros((0, 8, 2), np.float32), np.zeros((6, 8, 2), np.float32)
-    rgb, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
-    rows = upsample(
-        none, np.zeros((0, 8), bool), np.zeros((0, 8, 3), np.uint8), np.zeros((0, 8), np.float32), rgb, depth
-    )
-    assert (rows == -1).all() and rows.shape == (24, 32)
-    known, low = np.ones((6, 8), bool), (np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32))
-    assert upsample(some, known, *low, rgb[:0], depth[:0]).shape == (0, 32)
-
-
-def test_images_need_not_be_contiguous():
-    rng = np.random.default_rng(5)
-    p, known = rng.random((8, 6, 3), np.float32).transpose(1, 0, 2), rng.random((8, 6)).T > 0.1
-    rgb, depth = rng.integers(0, 99, (24, 64, 3), dtype=np.uint8)[:, ::2], rng.random((32, 24), np.float32).T + 1
-    low = rng.integers(0, 99, (6, 16, 3), dtype=np.uint8)[:, ::2], rng.random((8, 6), np.float32).T + 1
-    copies = (a.copy("C") for a in (p, known, *low, rgb, depth))
-    np.testing.assert_array_equal(upsample(p, known, *low, rgb, depth), upsample(*copies))
 
 
 def test_images_that_do_not_fit_together_are_refused():

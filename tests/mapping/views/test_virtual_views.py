@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from semantic_mapper.config import VirtualViewConfig
-from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.storage.block_index import unpack_keys
-from semantic_mapper.mapping.views.readout import decide
-from semantic_mapper.mapping.views.surface_patches import SURFACE_VOXELS, surface_patches
-from semantic_mapper.mapping.views.virtual_views import MARGIN_M, ViewpointChooser, in_free_space
+from semantic_mapper.mapping.views.virtual_views import (
+    MARGIN_M,
+    VOTE_WEIGHT,
+    ViewpointChooser,
+    add_votes,
+    surface_patches,
+)
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, small_map
@@ -23,7 +23,6 @@ from tests.mapping.test_keyframes import WALL, keyframe, pose
 from tests.small import tiny_config, tiny_field, tiny_frames
 
 WALL_Z = 2.0
-CONFIG = VirtualViewConfig()
 GEOMETRY = ("keys", "tsdf", "weight", "color")
 KEYFRAMES = [keyframe(i, pose(x)) for i, x in enumerate((-0.2, 0.0, 0.2))]
 SURE = np.array([0.9, 0.05, 0.05], np.float32)
@@ -43,9 +42,9 @@ def wall_depth(T_world_camera: Float64, intrinsics: CameraIntrinsics = INTRINSIC
     return plane_depth(T_world_camera, (0.0, 0.0, 1.0), WALL_Z, intrinsics)
 
 
-def vote(voxel_map: VoxelMap, depth: Float32, config: VirtualViewConfig = CONFIG) -> int:
+def vote(voxel_map: VoxelMap, depth: Float32) -> int:
     rows = np.zeros(depth.shape, np.int32)
-    return add_votes(voxel_map, np.eye(4), INTRINSICS, depth, (SURE[None], rows), config)
+    return add_votes(voxel_map, np.eye(4), INTRINSICS, depth, (SURE[None], rows))
 
 
 def geometry(voxel_map: VoxelMap) -> dict[str, bytes]:
@@ -53,45 +52,15 @@ def geometry(voxel_map: VoxelMap) -> dict[str, bytes]:
     return {name: state[name].tobytes() for name in GEOMETRY}
 
 
-def test_need_is_one_a_voxel_without_votes_and_nothing_where_there_are_enough():
-    patches = surface_patches(wall_map(80), max_votes=0.3)
-    assert np.abs(patches.xyz[:, 2] - WALL_Z).max() < 0.02
-    left, right = patches.xyz[:, 0] < -0.1, patches.xyz[:, 0] > 0.1
-    inner = np.abs(patches.xyz[:, :2]).max(axis=1) < 0.7
-    assert (patches.need[left & inner] == 0).all()
-    # A block of 16 cm has 8 x 8 voxels of the wall, in one or two layers.
-    assert np.isin(patches.need[right & inner], (64, 128)).all() and (right & inner).sum() > 20
-
-
-def test_patches_are_sums_over_their_voxels():
-    made = wall_map(80)
-    near, rho = SURFACE_VOXELS / made.config.truncation_voxels, made.config.vote_discount
-    patches, state = surface_patches(made, max_votes=0.2), made.block_state()
-    keys, count = state["keys"], len(state["keys"])
-    tsdf, weight, votes = (state[name].reshape(count, 512) for name in ("tsdf", "weight", "votes"))
-    said = state["evidence"].reshape(count, 512, 3)
-    surface = (weight > 0) & (np.abs(tsdf) <= near)
-    has = surface.any(axis=1)
-    np.testing.assert_array_equal(unpack_keys(patches.packed), keys[has])
-    z, y, x = np.unravel_index(np.arange(512), (8, 8, 8))
-    for n, block in enumerate(np.flatnonzero(has)):
-        chosen = np.flatnonzero(surface[block])
-        at = keys[block] * 8 + np.stack((x, y, z), 1)[chosen]
-        np.testing.assert_allclose(patches.xyz[n], at.mean(axis=0) * made.config.voxel_size_m)
-        few = chosen[votes[block, chosen] < 0.2]
-        need = [(1 - decide(said[block, i], float(votes[block, i]), rho)[1]) / (1 + votes[block, i]) for i in few]
-        assert patches.need[n] == pytest.approx(sum(need))
-
-
 def test_the_view_looks_at_the_part_without_votes_from_free_space():
     made = wall_map(80)
-    view = ViewpointChooser(CONFIG, seed=0).choose(made, KEYFRAMES, INTRINSICS)
+    view = ViewpointChooser(seed=0).choose(made, KEYFRAMES, INTRINSICS)
     assert view is not None
     eye, forward = view.T_world_camera[:3, 3], view.T_world_camera[:3, 2]
     target = eye + forward * (WALL_Z - eye[2]) / forward[2]
     assert target[0] > 0.1
     assert eye[2] < WALL_Z - MARGIN_M and np.linalg.norm(eye) < 1.5
-    patches = surface_patches(made, CONFIG.max_votes)
+    patches = surface_patches(made)
     assert (patches.need[np.isin(patches.packed, view.packed)] > 0).all()
     p = transform(invert_pose(view.T_world_camera), patches.xyz[np.isin(patches.packed, view.packed)])
     assert (np.abs(p[:, 0] / p[:, 2]) < 0.7).all(), "all of it is in the image"
@@ -100,7 +69,7 @@ def test_the_view_looks_at_the_part_without_votes_from_free_space():
 
 def test_nothing_is_chosen_without_need_keyframes_or_a_clear_sight():
     def choose(columns: int, keyframes: list) -> object:
-        return ViewpointChooser(CONFIG, seed=0).choose(wall_map(columns), keyframes, INTRINSICS)
+        return ViewpointChooser(seed=0).choose(wall_map(columns), keyframes, INTRINSICS)
 
     assert choose(160, KEYFRAMES) is None, "all has votes"
     assert choose(80, []) is None and choose(80, KEYFRAMES[:1]) is None
@@ -110,7 +79,7 @@ def test_nothing_is_chosen_without_need_keyframes_or_a_clear_sight():
 
 
 def test_what_was_looked_at_is_not_looked_at_again_until_the_map_is_replaced():
-    made, chooser = wall_map(0), ViewpointChooser(CONFIG, seed=0)
+    made, chooser = wall_map(0), ViewpointChooser(seed=0)
     seen: list[int] = []
     while (view := chooser.choose(made, KEYFRAMES, INTRINSICS)) is not None:
         assert not np.isin(view.packed, seen).any()
@@ -118,20 +87,6 @@ def test_what_was_looked_at_is_not_looked_at_again_until_the_map_is_replaced():
     assert (unpack_keys(np.array(seen))[:, 2] == np.floor(WALL_Z / 0.16)).mean() > 0.4
     made.take_over(wall_map(0))
     assert chooser.choose(made, KEYFRAMES, INTRINSICS) is not None
-
-
-def test_choices_are_the_same_for_the_same_seed_and_differ_for_another():
-    first = [ViewpointChooser(CONFIG, seed=s).choose(wall_map(60), KEYFRAMES, INTRINSICS) for s in (0, 0, 1, 2)]
-    poses = [v.T_world_camera for v in first if v is not None]
-    assert len(poses) == 4 and poses[0].tobytes() == poses[1].tobytes()
-    assert any(p.tobytes() != poses[0].tobytes() for p in poses[2:])
-
-
-def test_free_space_is_before_what_a_keyframe_saw():
-    points = np.array([[0, 0, 1.0], [0, 0, WALL_Z - 0.1], [0, 0, 2.5], [0, 0, -1.0], [5.0, 0, 1.0]])
-    np.testing.assert_array_equal(in_free_space(points, KEYFRAMES), [True, False, False, False, False])
-    unmeasured = [keyframe(0, pose(), depth=np.zeros_like(WALL))]
-    assert not in_free_space(points, unmeasured).any(), "a hole in the depth tells nothing"
 
 
 def test_a_vote_weighs_its_share_of_that_of_a_frame_and_nothing_else_changes():
@@ -142,18 +97,8 @@ def test_a_vote_weighs_its_share_of_that_of_a_frame_and_nothing_else_changes():
     assert silent.version == version + 1 and len(silent.changed_since(version)) == touched > 0
     ours, frames_votes = silent.block_state(), voted.block_state()
     assert frames_votes["votes"].max() > 0.9
-    np.testing.assert_allclose(ours["votes"], CONFIG.weight * frames_votes["votes"], rtol=1e-5)
-    np.testing.assert_allclose(ours["evidence"], CONFIG.weight * frames_votes["evidence"], rtol=1e-5, atol=1e-6)
-
-
-def test_voxels_with_enough_votes_take_none():
-    made = wall_map(80)
-    before = made.block_state()["votes"]
-    vote(made, wall_depth(np.eye(4)))
-    after = made.block_state()["votes"]
-    enough = before >= CONFIG.max_votes
-    assert enough.any() and np.array_equal(after[enough], before[enough])
-    assert (after[before == 0] > 0).any() and after[before == 0].max() <= CONFIG.weight
+    np.testing.assert_allclose(ours["votes"], VOTE_WEIGHT * frames_votes["votes"], rtol=1e-5)
+    np.testing.assert_allclose(ours["evidence"], VOTE_WEIGHT * frames_votes["evidence"], rtol=1e-5, atol=1e-6)
 
 
 def test_no_block_is_made_where_the_map_has_none():
@@ -162,11 +107,6 @@ def test_no_block_is_made_where_the_map_has_none():
     assert vote(made, np.full((INTRINSICS.height, INTRINSICS.width), 1.0, np.float32)) == 0
     after = made.block_state()
     assert all(np.array_equal(after[k], before[k]) for k in before) and made.version == 1
-
-
-def test_a_depth_image_of_another_size_is_refused():
-    with pytest.raises(ShapeError, match="votes without a frame"):
-        vote(wall_map(0), np.ones((4, 4), np.float32))
 
 
 def make_pipeline(**changes: object) -> MappingPipeline:
@@ -189,29 +129,21 @@ def half_mapped(**changes: object) -> MappingPipeline:
 def test_looking_around_gives_votes_to_surface_without_any_and_repeats_to_the_bit():
     a, b = half_mapped(), half_mapped()
     before, state = geometry(a.voxel_map), a.voxel_map.block_state()
-    looks = a.look_around(3)
+    looks = a.render_virtual_views(3)
     assert looks and all(look.blocks > 0 and len(look.source_seqs) >= 2 for look in looks)
     assert set(looks[0].source_seqs) <= {0, 4, 8}
     assert geometry(a.voxel_map) == before and a.voxel_map.frames == 12
     votes = a.voxel_map.block_state()["votes"]
     assert ((votes > 0) & (state["votes"] == 0)).sum() > 100
     for _ in range(3):
-        b.look_around()
+        b.render_virtual_views()
     x, y = a.voxel_map.block_state(), b.voxel_map.block_state()
     assert all(x[k].tobytes() == y[k].tobytes() for k in x)
 
 
-def test_there_is_nothing_to_look_at_before_the_first_frame_and_after_all_was_looked_at():
-    assert make_pipeline().look_around(5) == ()
-    pipeline = half_mapped()
-    looks = pipeline.look_around(100)
-    version = pipeline.voxel_map.version
-    assert 0 < len(looks) < 100 and pipeline.look_around(5) == () and pipeline.voxel_map.version == version
-
-
-def test_steps_look_around_only_where_they_are_told_to():
+def test_steps_render_virtual_views_only_where_they_are_told_to():
     frames = tiny_frames(6)
-    off, on = make_pipeline(), make_pipeline(virtual={"every_n_frames": 3, "views": 2})
+    off, on = make_pipeline(), make_pipeline(virtual={"every_n_frames": 3})
     assert all("virtual" not in off.step(f).stage_ms for f in frames)
     assert ["virtual" in on.step(f).stage_ms for f in frames] == [False, False, True] * 2
     assert geometry(off.voxel_map) == geometry(on.voxel_map)
@@ -223,7 +155,7 @@ def test_a_correction_rebuilds_the_map_without_virtual_votes():
     stepped = tiny_frames(12)[::4]
     for f in stepped:
         silent.step(f)
-    assert pipeline.look_around(2)
+    assert pipeline.render_virtual_views(2)
     pipeline.correct_poses({stepped[0].stamp_ns: stepped[0].T_world_camera})
     while pipeline.advance_correction(3):
         pass

@@ -20,9 +20,9 @@ from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.registry import build_field
+from semantic_mapper.imaging import is_measured
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.pipeline import is_measured
 from semantic_mapper.nodes.cli.info import autolabel_rows
 from semantic_mapper.nodes.cli.labelling import choose_keyframes
 from semantic_mapper.nodes.console import frame_progress

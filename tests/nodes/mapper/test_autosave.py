@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.mapping.files import map_file
-from semantic_mapper.mapping.files.map_file import describe_map
-from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS
+from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.autosave import Autosave
 from tests.mapping.rendered_views import small_map

@@ -21,7 +21,7 @@ from semantic_mapper.drivers.base import CorrectedWorld
 from semantic_mapper.errors import CodecError, MapError, PoseError, ShapeError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+from semantic_mapper.mapping.correction import ALWAYS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.corrections import CorrectionSender
@@ -39,7 +39,7 @@ from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.query_messages import encode_request
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import Float64, MapUpdate, PosedFrame
-from tests.mapping.correction.test_corrected_map import drift, drifted, true_poses
+from tests.mapping.test_correction import drift, drifted, true_poses
 from tests.nodes.mapper.test_query_service import RawClient, a_folder
 from tests.nodes.support import CONFIG, eventually, run
 from tests.replay.test_corrected_poses import write as write_tum

@@ -12,7 +12,7 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.resume import resume_map
-from tests.mapping.correction.test_corrected_map import true_poses
+from tests.mapping.test_correction import true_poses
 from tests.nodes.mapper.test_live_correction import running_robot
 from tests.nodes.mapper.test_resume import context
 from tests.nodes.support import eventually

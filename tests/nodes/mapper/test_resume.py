@@ -36,7 +36,7 @@ from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import Publisher
 from tests.small import INTRINSICS, tiny_frames
 
-CONFIG = VoxelMapConfig(voxel_size_m=0.05, initial_blocks=200)
+CONFIG = VoxelMapConfig(voxel_size_m=0.05)
 
 
 def context(folder: Path, restarts: int) -> NodeContext:
@@ -140,7 +140,7 @@ def test_map_that_cannot_be_gone_on_with_is_put_aside(tmp_path: Path, case: str)
         data[len(data) // 2] ^= 0xFF
         path.write_bytes(data)
     else:
-        config, why = VoxelMapConfig(voxel_size_m=0.1, initial_blocks=200), "same config"
+        config, why = VoxelMapConfig(voxel_size_m=0.1), "same config"
     saved = path.read_bytes()
     fresh = VoxelMap(config, ROOMS)
     said = resume_map(context(folder, 1), path, fresh)

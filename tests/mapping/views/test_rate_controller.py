@@ -1,7 +1,7 @@
 import pytest
 
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.mapping.rate_controller import LEAST_SHARE, RateController
+from semantic_mapper.mapping.views.view_renderer import LEAST_SHARE, RateController
 
 PIXELS = 19_200
 SAMPLING = SamplingConfig(guided=8, free_space=1)
@@ -19,11 +19,6 @@ def held(
     return fraction, sampling, round(fraction * PIXELS) * sampling.guided * sample_ms + other_ms
 
 
-def test_a_machine_that_is_fast_enough_renders_all_that_is_set():
-    fraction, sampling, _ = held(RateController(5, 0.5, SAMPLING), 0.0005, 40)
-    assert (fraction, sampling) == (0.5, SAMPLING)
-
-
 def test_a_slower_one_gives_up_rays_first_and_holds_the_rate():
     fraction, sampling, ms = held(RateController(5, 0.5, SAMPLING), 0.002, 60)
     assert LEAST_SHARE < fraction < 0.5
@@ -37,21 +32,3 @@ def test_then_samples():
     assert sampling.guided - sampling.free_space >= 2
     assert fraction >= LEAST_SHARE
     assert ms == pytest.approx(180, abs=1)
-
-
-def test_without_any_time_left_it_asks_for_the_least():
-    fraction, sampling, _ = held(RateController(5, 0.5, SAMPLING), 0.01, 500)
-    assert fraction == 0
-    assert sampling.guided == 2
-
-
-def test_it_recovers_when_the_machine_does():
-    pace = RateController(5, 0.5, SAMPLING)
-    held(pace, 0.01, 500)
-    assert held(pace, 0.0005, 40)[:2] == (0.5, SAMPLING)
-
-
-def test_a_view_without_rays_tells_nothing_of_their_cost():
-    pace = RateController(5, 0.5, SAMPLING)
-    pace.note(50.0, 40.0, 0, 32)
-    assert pace.choose(PIXELS) == (0.5, SAMPLING)

@@ -1,4 +1,4 @@
-"""What a snapshot reads is the grid of the moment it was taken, whatever happens to the grid meanwhile."""
+"""A map is saved as it was at one moment, whatever happens to it meanwhile."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.files import map_saving
 from semantic_mapper.mapping.files.map_file import describe_map
-from semantic_mapper.mapping.storage import block_store, grid_snapshots
+from semantic_mapper.mapping.files.map_saving import GridSnapshot
+from semantic_mapper.mapping.storage import scratch
 from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT, BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.storage.block_store import BlockValues
-from semantic_mapper.mapping.storage.grid_snapshots import GridSnapshots
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.rendered_views import small_map
 from tests.mapping.storage.test_block_store import CLASSES, some_blocks
@@ -34,38 +35,26 @@ def filled_grid(memory_bytes: int) -> BlockGrid:
     return grid
 
 
-def read_all(snapshots: GridSnapshots, between: list[np.ndarray], grid: BlockGrid) -> BlockValues:
-    """Read it 100 blocks at a time; before each part, some blocks change."""
-    parts = []
-    for n, keys in enumerate(between):
-        grid.fill(keys, some_blocks(len(keys), 9999))
-        part = snapshots.keys[100 * n : 100 * (n + 1)]
-        parts.append(snapshots.read(part))
-        snapshots.release(part)
-    return BlockValues(*(np.concatenate([getattr(part, name) for part in parts]) for name in BlockValues._fields))
-
-
-@pytest.mark.parametrize(
-    "most_in_memory", [grid_snapshots.MOST_IN_MEMORY, 30], ids=["copies in memory", "copies on disk"]
-)
+@pytest.mark.parametrize("most_in_memory", [map_saving.MOST_IN_MEMORY, 30], ids=["copies in memory", "on disk"])
 @pytest.mark.parametrize("memory_bytes", [0, 1], ids=["in memory", "most blocks on disk"])
 def test_a_snapshot_does_not_change_with_the_grid(
     memory_bytes: int, most_in_memory: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(grid_snapshots, "MOST_IN_MEMORY", most_in_memory)
+    monkeypatch.setattr(map_saving, "MOST_IN_MEMORY", most_in_memory)
     grid = filled_grid(memory_bytes)
     assert grid.stored_count >= BLOCKS - LEAST_RESIDENT if memory_bytes else grid.stored_count == 0
     before = grid.read(KEYS)
     new = pack_keys(np.array([[-5, 0, 0], [3, 3, 90], [50, 0, 0]], np.int32))
-    between = [np.sort(np.append(rng.choice(KEYS, 120, replace=False), new)) for _ in range(7)]
-    snapshots = GridSnapshots(grid)
-    then = read_all(snapshots, between, grid)
-    assert snapshots.in_memory == 0
-    snapshots.close()
+    snapshot = GridSnapshot(grid)
+    parts: list[BlockValues] = []
+    for start in range(0, BLOCKS, 100):
+        changing = np.sort(np.append(rng.choice(KEYS, 120, replace=False), new))
+        grid.fill(changing, some_blocks(len(changing), 9999))
+        parts.append(snapshot.take(snapshot.keys[start : start + 100]))
+    snapshot.close()
     now = grid.read(KEYS)
-    for name in BlockValues._fields:
-        assert getattr(then, name).tobytes() == getattr(before, name).tobytes(), name
-        assert getattr(now, name).tobytes() != getattr(before, name).tobytes(), name
+    for n, name in enumerate(BlockValues._fields):
+        assert b"".join(part[n].tobytes() for part in parts) == before[n].tobytes() != now[n].tobytes(), name
     assert not grid.watchers and grid.block_count == BLOCKS + 3
 
 
@@ -78,15 +67,15 @@ def test_a_full_disk_fails_the_snapshot_and_not_the_frame(monkeypatch: pytest.Mo
         return database
 
     connect = sqlite3.connect
-    monkeypatch.setattr(grid_snapshots, "MOST_IN_MEMORY", 20)
-    monkeypatch.setattr(block_store.sqlite3, "connect", tiny)
-    snapshots = GridSnapshots(grid)
+    monkeypatch.setattr(map_saving, "MOST_IN_MEMORY", 20)
+    monkeypatch.setattr(scratch.sqlite3, "connect", tiny)
+    snapshot = GridSnapshot(grid)
     changed = some_blocks(100, 5)
     grid.fill(KEYS[300:400], changed)
     assert grid.read(KEYS[300:400]).tsdf.tobytes() == changed.tsdf.tobytes()
     with pytest.raises(MapError, match="full"):
-        snapshots.read(KEYS[:100])
-    snapshots.close()
+        snapshot.take(KEYS[:100])
+    snapshot.close()
 
 
 def test_a_map_that_is_saved_while_it_grows_is_that_of_one_frame(tmp_path: Path) -> None:

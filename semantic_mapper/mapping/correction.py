@@ -1,0 +1,459 @@
+"""Corrected poses of frames, as a loop closure gives them, and the map that follows them.
+
+A pose graph gives new poses for its keyframes alone. A frame between two of them in time moves with both: with C_a and
+C_b the motions ``T_new @ T_old^-1`` of its neighbours and s the part of the time between them, its rotation is turned
+by the rotation s of the way from R_a to R_b (slerp), and its position p goes to ``(1 - s) C_a p + s C_b p``. Blending
+where the two motions take the camera, not their translations, makes the result the same wherever the world's origin is:
+blended translations would be off by (turn)^2 / 8 times the distance to the origin. A frame before the first given one
+moves with the first. A frame after the last moves with it only where the caller says so (``until_ns``).
+
+The map is built again from the frames that were fused into it, which are kept on disk, lossless: with the same poses it
+is the same map, bit for bit. The rebuild goes on in batches, between steps or from another thread, next to the map in
+use, which it replaces once it has caught up. Class probabilities are not rendered again: they came from source views
+near the frame in time, and a correction changes where these are relative to each other far less than where all of them
+are in the world.
+
+Frames are kept in a ring. Those that leave it are fused into a second map, the base, and stay where they are: every
+rebuild starts from a copy of it. So once the ring is full a frame is fused twice, and memory holds two maps, during a
+rebuild three.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from semantic_mapper.config import HistoryConfig
+from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.geometry import check_pose, interpolate_pose, invert_pose, move, transform
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.keyframes import KeyframeStore
+from semantic_mapper.mapping.map_types import ALWAYS, CorrectedPoses, CorrectionStatus
+from semantic_mapper.mapping.storage.scratch import ScratchFile
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
+
+FRAMES_A_STEP = 4  # of a rebuild, that a step itself fuses where the ring is full
+
+_log = get_logger(__name__)
+
+
+class PosePair(NamedTuple):
+    """The pose of one frame before and after, both T_world_camera (4, 4) float64 in the map's world.
+
+    ``world`` is the one that the frame came in; see ``PosedFrame``.
+    """
+
+    camera_id: str
+    stamp_ns: int
+    old: Float64
+    new: Float64
+    world: int = 0
+
+
+class PoseCorrection:
+    """How a correction moves frames. All cameras are taken to sit on one body: they follow the same motion in time.
+
+    A frame moves with given poses of its own world alone: a camera that came back in another world was found in the map
+    by itself.
+
+    Args:
+        pairs: At least one. Where several cameras have the same stamp, the first by name speaks for the others.
+        until_ns: Frames later than the last pair, up to this stamp, move with the last pair; the frames after it were
+            posed in the corrected world already. ``ALWAYS``: all of them, those to come as well.
+    """
+
+    def __init__(self, pairs: Sequence[PosePair], until_ns: int) -> None:
+        self.until_ns = until_ns
+        self._given: Mapping[tuple[str, int], Float64] = {(p.camera_id, p.stamp_ns): p.new for p in pairs}
+        motions: dict[int, dict[int, Float64]] = {}
+        for pair in sorted(pairs, key=lambda p: (p.stamp_ns, p.camera_id)):
+            motions.setdefault(pair.world, {}).setdefault(pair.stamp_ns, _motion(pair))
+        self._motions = {
+            world: (np.array(list(of_world), np.int64), list(of_world.values())) for world, of_world in motions.items()
+        }
+
+    def __len__(self) -> int:
+        """Poses given."""
+        return len(self._given)
+
+    @property
+    def last_motions(self) -> dict[int, Float64]:
+        """(4, 4) ``T_new @ T_old^-1`` of the last given pose of each world."""
+        return {world: motions[-1] for world, (_, motions) in self._motions.items()}
+
+    def place(self, camera_id: str, stamp_ns: int, T_world_camera: Float64, world: int = 0) -> Float64:
+        """The corrected pose (4, 4) of a frame; the very one that was given, where it was."""
+        given = self._given.get((camera_id, stamp_ns))
+        if given is not None:
+            return given
+        if world not in self._motions:
+            return T_world_camera
+        stamps, motions = self._motions[world]
+        after = int(np.searchsorted(stamps, stamp_ns))
+        if after == len(stamps):
+            return T_world_camera if stamp_ns > self.until_ns else move(motions[-1], T_world_camera)
+        if after == 0 or stamps[after] == stamp_ns:
+            return move(motions[after], T_world_camera)
+        fraction = (stamp_ns - int(stamps[after - 1])) / int(stamps[after] - stamps[after - 1])
+        return _between(motions[after - 1], motions[after], fraction, T_world_camera)
+
+
+def _motion(pair: PosePair) -> Float64:
+    """T_new @ T_old^-1, its rotation made orthonormal, so that rounding errors of poses do not add up."""
+    if np.array_equal(pair.new, pair.old):
+        return np.eye(4)
+    motion = pair.new @ invert_pose(pair.old)
+    u, _, vt = np.linalg.svd(motion[:3, :3])
+    motion[:3, :3] = u @ vt
+    motion[:3, 3] = pair.new[:3, 3] - motion[:3, :3] @ pair.old[:3, 3]
+    return motion
+
+
+def _between(a: Float64, b: Float64, fraction: float, T_world_camera: Float64) -> Float64:
+    if np.array_equal(a, b):
+        return move(a, T_world_camera)
+    out = np.eye(4)
+    out[:3, :3] = interpolate_pose(a, b, fraction)[:3, :3] @ T_world_camera[:3, :3]
+    position = T_world_camera[:3, 3]
+    out[:3, 3] = (1 - fraction) * transform(a, position) + fraction * transform(b, position)
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusedFrame:
+    """What fusing a frame once more needs.
+
+    Args:
+        frame: With the pose that it was fused at, without the depth that was left out; its label image is not kept.
+        probabilities: (h, w, L) float32 rendered class probabilities, before they are upsampled.
+        known: (h, w) bool.
+        rendered_depth_m: (h, w) float32; looked at only where the frame has no depth.
+    """
+
+    frame: PosedFrame
+    probabilities: Float32
+    known: Bool
+    rendered_depth_m: Float32
+
+
+class _Entry(NamedTuple):
+    """A frame of the history: without its images, at its pose in the map, and its bytes on disk."""
+
+    frame: PosedFrame
+    bytes: int
+
+    @property
+    def key(self) -> tuple[str, int]:
+        return self.frame.camera_id, self.frame.stamp_ns
+
+
+@dataclass(slots=True, eq=False)
+class _Rebuild:
+    """A map on its way; corrections are applied one after the other."""
+
+    voxel_map: VoxelMap
+    corrections: tuple[PoseCorrection, ...]
+    done: int = 0  # frames of the history that are in it
+
+    def place(self, frame: PosedFrame) -> Float64:
+        pose = frame.T_world_camera
+        for correction in self.corrections:
+            pose = correction.place(frame.camera_id, frame.stamp_ns, pose, frame.world)
+        return pose
+
+
+class MapCorrector:
+    """The history of a map, and the rebuild that is under way, if one is. Safe to call from several threads.
+
+    Args:
+        config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
+        voxel_map: In use; becomes the corrected one at the end of a rebuild.
+        keyframes: Move with their frames then.
+        fuse: Upsamples a frame of the history and integrates it into the map given.
+        on_exchange: Called when the map has moved.
+
+    Attributes:
+        lock: Held by a step, by a frame of a rebuild, and where the maps are exchanged: one at a time.
+
+    Raises:
+        MapError: no file can be made in the system's folder for temporary files.
+    """
+
+    def __init__(
+        self,
+        config: HistoryConfig,
+        voxel_map: VoxelMap,
+        keyframes: KeyframeStore,
+        fuse: Callable[[VoxelMap, FusedFrame], None],
+        on_exchange: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.lock = threading.RLock()
+        self._config = config
+        self._map = voxel_map
+        self._keyframes = keyframes
+        self._fuse = fuse
+        self._on_exchange = on_exchange
+        self._scratch = ScratchFile("frames", "lower history.max_frames or max_disk_mb") if config.max_frames else None
+        self._why_none = "no frames are kept; set history.max_frames in the mapper's config"
+        self._entries: list[_Entry] = []  # oldest first; the number of the first one is ``_left``
+        self._left = 0  # frames that have left the history
+        self._bytes = 0
+        self._base: VoxelMap | None = None  # what is in the map besides the history; from the first frame on
+        self._rebuild: _Rebuild | None = None
+        self._lost = self._completed = self._poses = 0
+        self._failure = ""
+        # Of frames to come, by world, where their odometry goes on in the world before correction:
+        self._motions: dict[int, Float64] = {}
+
+    @property
+    def records(self) -> bool:
+        """Whether frames are kept."""
+        return self._scratch is not None
+
+    @property
+    def status(self) -> CorrectionStatus:
+        """Where corrections stand."""
+        rebuild = self._rebuild
+        return CorrectionStatus(
+            running=rebuild is not None,
+            done=0 if rebuild is None else rebuild.done,
+            total=len(self._entries),
+            disk_bytes=self._bytes,
+            completed=self._completed,
+            poses=self._poses,
+            frozen=self._left,
+            lost=self._lost,
+            failure=self._failure,
+        )
+
+    def motion(self, world: int) -> Float64:
+        """By how much frames of a world that come are moved, (4, 4); see ``place``."""
+        return self._motions.get(world, np.eye(4))
+
+    def poses(self) -> dict[tuple[str, int], Float64]:
+        """(camera_id, stamp_ns) -> T_world_camera (4, 4) of the frames that can be corrected, as the map has them."""
+        return {entry.key: entry.frame.T_world_camera for entry in tuple(self._entries)}
+
+    def worlds(self) -> dict[tuple[str, int], int]:
+        """(camera_id, stamp_ns) -> world in which its pose came, of the frames that can be corrected."""
+        return {entry.key: entry.frame.world for entry in tuple(self._entries)}
+
+    def place(self, frame: PosedFrame) -> PosedFrame:
+        """A frame that comes, at its pose in the map's world; see ``until_ns`` of ``start``."""
+        pose = move(self.motion(frame.world), frame.T_world_camera)
+        return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
+
+    def record(self, fused: FusedFrame) -> None:
+        """Keep a frame that the map was just given. Where the disk fails, mapping goes on and correcting ends."""
+        if self._scratch is None:
+            return
+        frame = fused.frame
+        arrays = fused.probabilities, fused.known, fused.rendered_depth_m, frame.rgb, frame.depth_m, frame.depth_sigma_m
+        blob = _pack(arrays)
+        try:
+            self._scratch.put([self._left + len(self._entries)], [blob])
+        except MapError as error:
+            self._end_history(f"frame seq={frame.seq}: {error}")
+            return
+        nothing = np.broadcast_to(np.uint8(0), frame.rgb.shape)  # without memory of its own
+        pose = frame.T_world_camera.copy()
+        kept = replace(frame, rgb=nothing, depth_m=None, label=None, depth_sigma_m=None, T_world_camera=pose)
+        self._entries = [*self._entries, _Entry(kept, len(blob))]
+        self._bytes += len(blob)
+
+    def make_room(self) -> None:
+        """Let the oldest frames of a full ring leave, before a step.
+
+        During a rebuild, which may still need them, none leaves, but the step continues it, so that it ends.
+        """
+        if self._scratch is None:
+            return
+        try:
+            if self._base is None:
+                self._base = self._map.copy()  # now, as the map may have become a saved one
+            if self._rebuild is not None and self._is_full:
+                with suppress(MapError):  # is logged, and it is not this step that has failed
+                    self.advance(FRAMES_A_STEP)
+            while self._is_full and self._rebuild is None:
+                self._freeze_oldest(self._scratch, self._base)
+        except SemanticMapperError as error:
+            self._end_history(str(error))
+
+    @property
+    def _is_full(self) -> bool:
+        config, count = self._config, len(self._entries)
+        return count >= config.max_frames or (count > 1 and self._bytes >= config.max_disk_mb * 1_000_000)
+
+    def _freeze_oldest(self, scratch: ScratchFile, base: VoxelMap) -> None:
+        oldest = self._entries[0]
+        fused = self._read(0, oldest.frame.T_world_camera)
+        if fused is not None:
+            self._fuse(base, fused)
+        if not self._left:
+            _log.info("history_is_full", frames=len(self._entries), mb=round(self._bytes / 1e6))
+        scratch.drop([self._left])
+        self._entries = self._entries[1:]
+        self._left += 1
+        self._bytes -= oldest.bytes
+
+    def start(self, poses: CorrectedPoses, until_ns: int | None = None) -> CorrectionStatus:
+        """Begin to build the map again with corrected poses; see ``MappingPipeline.correct_poses``."""
+        with self.lock:
+            if self._scratch is None:
+                raise MapError(f"poses cannot be corrected: {self._why_none}")
+            before = () if self._rebuild is None else self._rebuild.corrections
+            pairs = self._pair_poses(poses)
+            correction = PoseCorrection(pairs, max(p.stamp_ns for p in pairs) if until_ns is None else until_ns)
+            assert self._base is not None
+            self._rebuild = _Rebuild(self._base.copy(), (*before, correction))
+            self._failure = ""
+            _log.info("correction_begins", given=len(pairs), frames=len(self._entries), again=bool(before))
+            return self.status
+
+    def advance(self, max_frames: int = 1) -> bool:
+        """Continue a rebuild by this many frames, and exchange the maps where it has caught up; whether it still runs.
+
+        May be called from any thread.
+
+        Raises:
+            MapError: the corrected map cannot be built (too large, or a frame out of reach of any voxel, say); the
+                correction is given up, the map in use stays as it is.
+        """
+        for _ in range(max_frames):
+            with self.lock:  # let go after every frame: a step may wait for it
+                rebuild = self._rebuild
+                if rebuild is None:
+                    return False
+                try:
+                    if rebuild.done < len(self._entries):
+                        fused = self._read(rebuild.done, rebuild.place(self._entries[rebuild.done].frame))
+                        if fused is not None:
+                            self._fuse(rebuild.voxel_map, fused)
+                        rebuild.done += 1
+                    if rebuild.done == len(self._entries):
+                        self._exchange(rebuild)
+                except SemanticMapperError as error:  # a frame's too: at its new pose it may be out of reach, say
+                    self._rebuild, self._failure = None, str(error)
+                    _log.error("correction_fails", reason=self._failure)
+                    raise MapError(f"the correction is given up, the map stays as it is: {error}") from error
+        return self._rebuild is not None
+
+    def _read(self, row: int, T_world_camera: Float64) -> FusedFrame | None:
+        """A frame of the history; None, counted, where the disk has lost it."""
+        entry = self._entries[row].frame
+        assert self._scratch is not None
+        try:
+            (blob,) = self._scratch.get([self._left + row])
+        except MapError as error:
+            self._lost += 1
+            _log.error("history_frame_lost", seq=entry.seq, camera=entry.camera_id, reason=str(error))
+            return None
+        probabilities, known, rendered, rgb, depth, sigma = _unpack(blob)
+        assert probabilities is not None and known is not None and rendered is not None and rgb is not None
+        frame = replace(entry, rgb=rgb, depth_m=depth, depth_sigma_m=sigma, T_world_camera=T_world_camera)
+        return FusedFrame(frame, probabilities, known, rendered)
+
+    def _exchange(self, rebuild: _Rebuild) -> None:
+        moved = [e._replace(frame=replace(e.frame, T_world_camera=rebuild.place(e.frame))) for e in self._entries]
+        poses = {entry.key: entry.frame.T_world_camera for entry in moved}
+        rebuild.voxel_map.places = self._map.places
+        self._map.take_over(rebuild.voxel_map)
+        self._map.places.move(poses)
+        keyframes = self._keyframes.move(poses)
+        self._entries = moved
+        for correction in rebuild.corrections:
+            if correction.until_ns == ALWAYS:
+                for world, motion in correction.last_motions.items():
+                    self._motions[world] = move(motion, self.motion(world))
+        self._completed += len(rebuild.corrections)
+        self._poses += sum(len(correction) for correction in rebuild.corrections)
+        self._rebuild = None
+        self._on_exchange()
+        _log.info("correction_done", frames=len(moved), keyframes_moved=keyframes, blocks=self._map.block_count)
+
+    def _end_history(self, reason: str) -> None:
+        """Without every frame a rebuild would lose a part of the map; better none."""
+        self._why_none = f"the history has ended: {reason}"
+        if self._rebuild is not None:
+            self._failure = self._why_none
+        if self._scratch is not None:
+            self._scratch.close()
+        self._scratch = self._base = self._rebuild = None
+        self._entries, self._bytes = [], 0
+        _log.error("history_ends", reason=reason)
+
+    def _pair_poses(self, poses: CorrectedPoses) -> list[PosePair]:
+        """Old and new poses of the given frames that are in the history; the log counts those that have left it.
+
+        Raises:
+            MapError: a stamp is of no frame that was ever mapped, or no given frame is in the history.
+            PoseError: a pose is not a rigid transform.
+        """
+        by_stamp: dict[int, list[PosedFrame]] = {}
+        for entry in self._entries:
+            by_stamp.setdefault(entry.frame.stamp_ns, []).append(entry.frame)
+        pairs: list[PosePair] = []
+        for key, new in poses.items():
+            camera_id, stamp_ns = key if isinstance(key, tuple) else (None, key)
+            where = f"corrected pose of stamp {stamp_ns}" + ("" if camera_id is None else f" of camera '{camera_id}'")
+            check_pose(new, where)
+            found = [f for f in by_stamp.get(stamp_ns, ()) if camera_id in (None, f.camera_id)]
+            if len({f.camera_id for f in found}) > 1:
+                names = ", ".join(sorted({f.camera_id for f in found}))
+                raise MapError(f"{where}: cameras {names} have this stamp; give (camera_id, stamp_ns)")
+            if found:
+                frame = found[-1]
+                old = frame.T_world_camera if self._rebuild is None else self._rebuild.place(frame)
+                pairs.append(PosePair(frame.camera_id, stamp_ns, old, new.copy(), frame.world))
+            elif not (self._left and stamp_ns < min(by_stamp, default=0)):
+                raise MapError(f"{where}: no frame with this stamp was mapped{_nearest(stamp_ns, list(by_stamp))}")
+        missing = len(poses) - len(pairs)
+        if not pairs:
+            reason = f"all {missing} frames given have left the history; raise history.max_frames or max_disk_mb"
+            raise MapError(f"no pose to correct: {reason if missing else 'none was given'}")
+        if missing:
+            _log.warning("correction_is_partial", given=len(poses), frozen=missing, reason="frames left the history")
+        return pairs
+
+
+def _nearest(stamp_ns: int, stamps: list[int]) -> str:
+    if not stamps:
+        return "; the history is empty"
+    nearest = min(stamps, key=lambda s: abs(s - stamp_ns))
+    return f"; of those in the history the nearest is {nearest}, {abs(nearest - stamp_ns) / 1e6:g} ms away"
+
+
+def _pack(arrays: Sequence[NDArray[np.generic] | None]) -> bytes:
+    """Arrays as bytes, lossless: one plane for each byte of their values, as neighbouring ones are alike, and zstd."""
+    packer = zstandard.ZstdCompressor(level=1)  # higher levels take several times as long for a few per cent
+    packed: list[tuple[str, tuple[int, ...], bytes] | None] = []
+    for array in arrays:
+        if array is None:
+            packed.append(None)
+            continue
+        planes = np.ascontiguousarray(array).view(np.uint8).reshape(-1, array.itemsize).T
+        packed.append((array.dtype.str, array.shape, packer.compress(planes.tobytes())))
+    return msgspec.msgpack.encode(packed)
+
+
+def _unpack(blob: bytes) -> list[NDArray[Any] | None]:
+    """The reverse of ``_pack``."""
+    arrays: list[NDArray[Any] | None] = []
+    for packed in msgspec.msgpack.decode(blob, type=list[tuple[str, tuple[int, ...], bytes] | None]):
+        if packed is None:
+            arrays.append(None)
+            continue
+        dtype, shape, content = packed
+        planes = np.frombuffer(zstandard.ZstdDecompressor().decompress(content), np.uint8)
+        values = np.ascontiguousarray(planes.reshape(np.dtype(dtype).itemsize, -1).T)
+        arrays.append(values.view(dtype).reshape(shape))
+    return arrays

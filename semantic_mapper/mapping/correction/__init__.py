@@ -1,1 +1,0 @@
-"""Maps that follow corrected poses."""
