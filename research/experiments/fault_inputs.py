@@ -102,7 +102,7 @@ class FloodedMapper:
     def close(self) -> None:
         """End the node."""
         self.answers.close()
-        self.child.ask_to_stop()
+        self.child.request_stop()
         self.child.wait(ANSWER_S)
         self.child.close()
         self.publisher.close()
