@@ -62,7 +62,7 @@ def info(
     Of a log (topics, frames, cameras, duration, gaps, damage) it reads every message, so that damage anywhere is found;
     exit code 1 where there is any. Of a map (frames, size, blocks, classes) it reads what the file says of itself,
     which is quick however large the map is. Of a running mapper it lists the weights that it was offered, with what
-    became of them. Boxes are for `finetune --kind panoptic`; any editor changes their file (docs/boxes.md).
+    became of them. Boxes are for `finetune --kind panoptic`; any editor changes their file (docs/scenes.md).
 
     Example: semantic-mapper info kitchen.mcap
     Example: semantic-mapper info runs/demo
