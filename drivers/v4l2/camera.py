@@ -167,8 +167,8 @@ def _examine(path: Path) -> tuple[ioctls.Capability, tuple[str, ...]]:
         ) from error
     if not who.captures:
         raise CameraError(
-            f"{path}: gives no images (it is the metadata of {who.card}, or an output); `semantic-mapper doctor --cameras` "
-            "lists those that do"
+            f"{path}: gives no images (it is the metadata of {who.card}, or an output); "
+            "`semantic-mapper doctor --cameras` lists those that do"
         )
     return who, formats
 

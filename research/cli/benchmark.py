@@ -1,4 +1,4 @@
-"""``semantic-mapper-research suite``: score weights on rooms, or arms on KLEVR or AERIAL, that nothing was trained on."""
+"""``semantic-mapper-research suite``: score weights on rooms, or methods on other scenes, never trained on."""
 
 from __future__ import annotations
 
