@@ -361,7 +361,7 @@ def load_nesf(path: Path) -> NesfWeights:
     path = find_checkpoint(path)
     if not path.exists():
         raise WeightsError(
-            f"{path}: no such weights file; check the path, or make one: `semantic-mapper-research train --kind {MAP_KIND}`"
+            f"{path}: no such weights file; train them by `semantic-mapper-research train --kind {MAP_KIND}`"
         )
     tensors, metadata = open_weights(path)
     kind = metadata.get("field", "sray")
