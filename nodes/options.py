@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from semantic_mapper.config import Config, Positive
+from semantic_mapper.config import Config, Positive, read_toml
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
 # Of drivers/registry.py and drivers/poses/config.py, for the same reason.
@@ -61,6 +61,13 @@ class LiveCamera(Config, frozen=True):
                 f'poses = "{self.poses}" names a file of settings, and there is none; for poses of that kind write '
                 f'poses = {{ kind = "{self.poses}" }}'
             )
+
+
+def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:
+    """A table of the launch file, or of the file that it names, and what to call it in messages."""
+    if isinstance(named, dict):
+        return named, where
+    return (read_toml(Path(named)), named) if named else ({}, where)
 
 
 class CameraOptions(Config, frozen=True):
