@@ -9,8 +9,16 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.backoff import backoff_s
+from semantic_mapper.config import load_config
 from semantic_mapper.errors import CodecError, FrameError, LabelError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes
+from semantic_mapper.fields.checkpoint import (
+    Checkpoint,
+    checkpoint_bytes,
+    default_checkpoint_path,
+    find_checkpoint,
+    load_checkpoint,
+)
+from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
 from semantic_mapper.nodes.finetuner.keyframe_store import FOLDER, LearningStore, Progress
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDER
@@ -32,6 +40,7 @@ from semantic_mapper.transport.messages import (
 )
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
+MAX_WAITING = 8  # keyframes, of about half a megabyte each, and of 64 MiB at the most
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
 MAX_RETRY_S = 3600.0
@@ -40,6 +49,31 @@ MAX_NICENESS = 19  # with it, learning gets only what is left over of the proces
 _COUNTERS = ("keyframes", "unusable", "set_aside", "rounds", "failed", "offered", "taken", "refused")
 
 _log = structlog.get_logger(__name__)
+
+
+def learn(context: NodeContext, options: FinetunerOptions) -> None:
+    """Open the sockets, load the weights to start from, and learn until a stop request.
+
+    Raises:
+        ConfigError, WeightsError: it cannot start.
+        TransportError: an endpoint is taken.
+    """
+    keep_freed_memory()
+    config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
+    path = find_checkpoint(Path(options.weights)) if options.weights else default_checkpoint_path()
+    start, digest = load_checkpoint(path), digest_of(path.read_bytes())
+    endpoint = options.labels if "://" in options.labels else context.endpoint(options.labels)
+    with (
+        Publisher(context.endpoint(context.name), hwm=2) as publisher,
+        LosslessSubscriber(endpoint, ("keyframe",), hwm=MAX_WAITING) as labels,
+        LosslessSubscriber(context.endpoint(options.mapper), ("in_use",)) as mapper,
+    ):
+        _log.info("ready", weights=path.name, labels=endpoint, fraction=options.cpu_fraction)
+        finetuner = Finetuner(context, options, config, publisher, labels, mapper, start, digest)
+        context.heartbeat.ready()
+        finetuner.run()
+        context.heartbeat.ending()
+        finetuner.close()
 
 
 @dataclass
