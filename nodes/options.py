@@ -201,13 +201,9 @@ class FinetunerOptions(Config, frozen=True):
     # How much others go before it, 0 to 19. With 19 (on Linux) it learns only while nobody else wants the core; where
     # others want all of every core all the time, that is a third of a per cent, and 18 some two per cent.
     niceness: Annotated[int, msgspec.Meta(ge=0, le=19)] = 19
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 2.0  # no keyframe for so long, and those that came are learned
     # The mapper's `out`: restarted, it finds the weights that the mapper keeps there, and in the folder `learning`
     # the labelled keyframes that it has kept itself; empty = begin with neither.
     out: str = ""
-    # After a round that failed for want of memory, say: pause before the next with the same keyframes, twice as long
-    # with each further one in a row, but no more than an hour.
-    retry_s: Positive = 20.0
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
