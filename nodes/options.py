@@ -245,7 +245,7 @@ OPTIONS: dict[str, type[NodeOptions]] = {
 }
 
 
-class NodeJob(Config, frozen=True):
+class NodeJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the launcher tells a node, as JSON, in its one argument or in the open file that this names (``fd:N``).
 
     A node that is started by hand needs ``{"name": ..., "options": {...}}`` only; endpoints default to those of this
