@@ -27,6 +27,7 @@ from semantic_mapper.nodes.process import (
     StopRequest,
     prepare_process,
 )
+from semantic_mapper.transport.endpoints import default_endpoint
 
 _log = structlog.get_logger(__name__)
 
@@ -61,8 +62,6 @@ class NodeContext:
         """Where a node publishes."""
         if name in self.endpoints:
             return self.endpoints[name]
-        from semantic_mapper.transport.endpoints import default_endpoint
-
         return default_endpoint(name)
 
     def leave_note(self, what: str, text: str) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from semantic_mapper.config import Config, Positive
+from semantic_mapper.config import Config, Positive, read_toml
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
 # Of drivers/registry.py and drivers/poses/config.py, for the same reason.
@@ -61,6 +61,13 @@ class LiveCamera(Config, frozen=True):
                 f'poses = "{self.poses}" names a file of settings, and there is none; for poses of that kind write '
                 f'poses = {{ kind = "{self.poses}" }}'
             )
+
+
+def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:
+    """A table of the launch file, or of the file that it names, and what to call it in messages."""
+    if isinstance(named, dict):
+        return named, where
+    return (read_toml(Path(named)), named) if named else ({}, where)
 
 
 class CameraOptions(Config, frozen=True):
@@ -194,13 +201,9 @@ class FinetunerOptions(Config, frozen=True):
     # How much others go before it, 0 to 19. With 19 (on Linux) it learns only while nobody else wants the core; where
     # others want all of every core all the time, that is a third of a per cent, and 18 some two per cent.
     niceness: Annotated[int, msgspec.Meta(ge=0, le=19)] = 19
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 2.0  # no keyframe for so long, and those that came are learned
     # The mapper's `out`: restarted, it finds the weights that the mapper keeps there, and in the folder `learning`
     # the labelled keyframes that it has kept itself; empty = begin with neither.
     out: str = ""
-    # After a round that failed for want of memory, say: pause before the next with the same keyframes, twice as long
-    # with each further one in a row, but no more than an hour.
-    retry_s: Positive = 20.0
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
@@ -242,7 +245,7 @@ OPTIONS: dict[str, type[NodeOptions]] = {
 }
 
 
-class NodeJob(Config, frozen=True):
+class NodeJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the launcher tells a node, as JSON, in its one argument or in the open file that this names (``fd:N``).
 
     A node that is started by hand needs ``{"name": ..., "options": {...}}`` only; endpoints default to those of this

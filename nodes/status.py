@@ -7,6 +7,7 @@ from typing import NamedTuple
 import structlog
 
 from semantic_mapper.errors import CodecError
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import Publisher
 
@@ -31,8 +32,6 @@ def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0
     Raises:
         TransportError: as of ``Publisher.publish``.
     """
-    from semantic_mapper.transport.codec import encode
-
     try:
         parts = encode(status)
     except CodecError as error:

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from semantic_mapper.config import Config, convert_config
+from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, PoseError
 from semantic_mapper.fields.scene.primitives import Primitive, ShapeName, centred
 from semantic_mapper.files import read_regular, write_bytes
@@ -81,12 +81,12 @@ class BoxFile:
     is_xml: bool = False
 
 
-class _File(Config, frozen=True):
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     boxes: list[Any]
     merge: dict[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
 
 
-class _Box(Config, frozen=True, rename={"class_name": "class"}):
+class _Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"class_name": "class"}):
     id: Annotated[int, Meta(ge=1, le=MAX_ID)]
     class_name: Annotated[str, Meta(pattern=r"\S")]
     T_world_box: Pose
@@ -100,7 +100,7 @@ class _Box(Config, frozen=True, rename={"class_name": "class"}):
     frames: list[tuple[WholeNumber, Pose]] | None = None
 
 
-class _QueryBox(Config, frozen=True):
+class _QueryBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     center: Place
     size: Place
     R_world_box: tuple[Place, Place, Place]

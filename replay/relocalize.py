@@ -17,7 +17,7 @@ from semantic_mapper.types import PosedFrame
 def relocalize_frames(
     voxel_map: VoxelMap, log: Log, every: int, count: int, on_frame: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Look for every n-th frame, ``count`` of them; plain data, as of ``relocalize --json``."""
+    """Look for every n-th frame, ``count`` of them; plain data, as of ``query MAP relocalize LOG --json``."""
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     rows: list[dict[str, Any]] = []
     unreadable: list[dict[str, Any]] = []

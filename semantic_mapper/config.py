@@ -191,7 +191,8 @@ class KeyframeConfig(Config, frozen=True):
     # those of the rendered view.
     own_image_weight: Fraction = 0.2
     # Whether the map keeps features of views that its sensor measured (45 kB each, 300 at most), by which it is found
-    # again: `relocalize`, `up --set map=...`, `merge`. Images can be guessed from such features; False keeps none.
+    # again: `query MAP relocalize LOG`, `up --set map=...`, `merge`. Images can be guessed from such features; False
+    # keeps none.
     save_places: bool = True
 
 

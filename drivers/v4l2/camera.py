@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+import semantic_mapper.drivers.v4l2.ioctls as ioctls
 from semantic_mapper.drivers.calibration import require_calibration
 from semantic_mapper.drivers.live import LiveCamera, RawImage, nominal_hz
-from semantic_mapper.drivers.v4l2 import ioctls
 from semantic_mapper.drivers.v4l2.config import Config
 from semantic_mapper.drivers.v4l2.devices import SHOWN_FORMATS, stable_path
 from semantic_mapper.drivers.v4l2.ioctls import Control

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import semantic_mapper.drivers.v4l2.ioctls as ioctls
 from semantic_mapper.drivers.registry import FoundCamera
-from semantic_mapper.drivers.v4l2 import ioctls
 
 SHOWN_FORMATS = 8
 WIDER = 2.4  # width over height, of two images side by side; the widest single ones are 21:9

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import threading
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import msgspec
 import structlog
 
+from semantic_mapper.client import MapClient
+from semantic_mapper.drivers.base import CorrectedWorld
 from semantic_mapper.errors import SemanticMapperError, TransportError
-from semantic_mapper.nodes.camera.live import table_of
-from semantic_mapper.nodes.options import LiveCamera
-
-if TYPE_CHECKING:
-    from semantic_mapper.drivers.base import CorrectedWorld
+from semantic_mapper.nodes.options import LiveCamera, table_of
 
 RETRY_S = 2.0
 LAST_S = 10.0  # how long the last correction may take to reach the mapper, once the stream has ended
@@ -107,8 +105,6 @@ class CorrectionSender:
                 self._tell(str(error))
 
     def _send(self, corrected: CorrectedWorld) -> None:
-        from semantic_mapper.client import MapClient
-
         poses = {(self._camera_id, stamp_ns): pose for stamp_ns, pose in corrected.poses.items()}
         with MapClient(self._endpoint) as client:
             client.correct_poses(poses, until_ns=corrected.until_ns, within_ns=_SAME_FRAME_NS)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from semantic_mapper.errors import ConfigError, LogError
 from semantic_mapper.nodes.options import CameraOptions
+from semantic_mapper.replay.log.sequence import open_log
 
 
 def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions], where: str) -> None:
@@ -44,8 +45,6 @@ def _camera_ids(options: CameraOptions) -> tuple[str, ...]:
     """Of a camera, or of those in a log; none where the log cannot be read, which its node will say."""
     if options.camera is not None:
         return (options.camera.id,)
-    from semantic_mapper.replay.log.sequence import open_log
-
     try:
         with open_log(Path(str(options.log))) as log:
             return tuple(log.info.cameras)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.node import NodeContext
-
-if TYPE_CHECKING:
-    from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
+from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 DRAIN_S = 600.0  # how long subscribers may take to work off what waits for them after the last frame
 WAIT_SLICE_S = 0.2

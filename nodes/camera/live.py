@@ -9,57 +9,29 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import Any, Protocol, Self
 
 import structlog
 
 from semantic_mapper.backoff import backoff_s
+from semantic_mapper.config import convert_config
+from semantic_mapper.drivers.base import Camera, CorrectedWorld, FrameSource
+from semantic_mapper.drivers.mounts import Mount, mount_of
+from semantic_mapper.drivers.poses.config import OdometryPoses, PoseChecks, begins_world, can_be_found, gives_metres
+from semantic_mapper.drivers.poses.posed_camera import PosedCamera
+from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
+from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
+from semantic_mapper.nodes.camera.corrections import CorrectionSender, without_loops
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.node import NodeContext
-from semantic_mapper.nodes.options import CameraOptions, LiveCamera
-
-if TYPE_CHECKING:
-    from semantic_mapper.drivers.base import Camera, CorrectedWorld, FrameSource
-    from semantic_mapper.drivers.mounts import Mount
-    from semantic_mapper.nodes.camera.corrections import CorrectionSender
-    from semantic_mapper.transport.messages import EndReason, NodeState, Parts
-    from semantic_mapper.transport.sockets import Publisher
-    from semantic_mapper.types import PosedFrame
-
-    class LiveSource(FrameSource, Protocol):
-        """A camera with poses, such as ``semantic_mapper.drivers.poses.PosedCamera``."""
-
-        @property
-        def warnings(self) -> tuple[str, ...]:
-            """As of ``Camera``."""
-            ...
-
-        @property
-        def can_wait(self) -> bool:
-            """As of ``Camera``."""
-            ...
-
-        @property
-        def last_poll_time(self) -> float:
-            """As of ``Camera``."""
-            ...
-
-        @property
-        def counters(self) -> Mapping[str, int]:
-            """Images that got no pose, by reason, and what else it counts."""
-            ...
-
-        def stop(self) -> None:
-            """As of ``Camera``."""
-            ...
-
-        def correction(self, final: bool = False) -> CorrectedWorld | None:
-            """As of ``PosedCamera``."""
-            ...
-
+from semantic_mapper.nodes.options import CameraOptions, LiveCamera, table_of
+from semantic_mapper.nodes.status import publish_status
+from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.messages import EndOfStream, EndReason, NodeState, Parts, Status
+from semantic_mapper.transport.sockets import Publisher
+from semantic_mapper.types import PosedFrame
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05  # how soon a stop request is passed on
@@ -68,6 +40,38 @@ FIRST_PAUSE_S = 0.2  # before a camera that could not be opened is tried again; 
 MAX_PAUSE_S = 2.0
 
 _log = structlog.get_logger(__name__)
+
+
+class LiveSource(FrameSource, Protocol):
+    """A camera with poses, such as ``semantic_mapper.drivers.poses.PosedCamera``."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """As of ``Camera``."""
+        ...
+
+    @property
+    def can_wait(self) -> bool:
+        """As of ``Camera``."""
+        ...
+
+    @property
+    def last_poll_time(self) -> float:
+        """As of ``Camera``."""
+        ...
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Images that got no pose, by reason, and what else it counts."""
+        ...
+
+    def stop(self) -> None:
+        """As of ``Camera``."""
+        ...
+
+    def correction(self, final: bool = False) -> CorrectedWorld | None:
+        """As of ``PosedCamera``."""
+        ...
 
 
 def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCamera) -> None:
@@ -80,9 +84,6 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
         DependencyError: the kind needs something that is not installed.
         TransportError: the endpoint is taken.
     """
-    from semantic_mapper.nodes.camera.corrections import without_loops
-    from semantic_mapper.transport.sockets import Publisher
-
     policy = "block" if make_source(live).can_wait else "drop"  # mistakes in the config are found here, before any wait
     if context.restartable:
         check_world(context.name, live)
@@ -111,9 +112,6 @@ def check_world(name: str, live: LiveCamera) -> None:
     Raises:
         ConfigError: it is to be restarted.
     """
-    from semantic_mapper.drivers.poses.config import begins_world, can_be_found
-    from semantic_mapper.drivers.poses.sources import read_pose_config
-
     config, where = table_of(live.poses, "camera.poses")
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
     if begins_world(poses) and not can_be_found(poses):
@@ -131,9 +129,6 @@ def make_source(live: LiveCamera) -> LiveSource:
     Raises:
         ConfigError, CameraError, DependencyError: see ``run_live_camera``.
     """
-    from semantic_mapper.drivers.mounts import mount_of
-    from semantic_mapper.drivers.registry import open_camera
-
     config, where = table_of(live.config, "camera.config")
     camera = open_camera(live.kind, config, live.id, where)
     mount = mount_of(live.T_rig_camera, live.kind, config, f"camera '{live.id}'")
@@ -146,11 +141,6 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
     Raises:
         ConfigError, CameraError: see ``run_live_camera``.
     """
-    from semantic_mapper.config import convert_config
-    from semantic_mapper.drivers.poses.config import OdometryPoses, PoseChecks, can_be_found, gives_metres
-    from semantic_mapper.drivers.poses.posed_camera import PosedCamera
-    from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
-
     config = dict(config)
     checks = convert_config(config.pop("checks", {}), PoseChecks, "poses: checks")
     poses = read_pose_config(config)
@@ -162,15 +152,6 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
         scale_known=gives_metres(poses),
         begins_world=isinstance(poses, OdometryPoses) and can_be_found(poses),  # a device tells it itself
     )
-
-
-def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:
-    """A table of the launch file, or of the file that it names, and what to call it in messages."""
-    from semantic_mapper.config import read_toml
-
-    if isinstance(named, dict):
-        return named, where
-    return (read_toml(Path(named)), named) if named else ({}, where)
 
 
 def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, stack: ExitStack) -> LiveSource | None:
@@ -217,8 +198,6 @@ def _correction_sender(
     context: NodeContext, options: CameraOptions, live: LiveCamera, stack: ExitStack
 ) -> CorrectionSender | None:
     """Takes closed loops to the mapper, where the options name one; ``stack`` ends it."""
-    from semantic_mapper.nodes.camera.corrections import CorrectionSender
-
     named = options.corrections
     if not named:
         return None
@@ -233,9 +212,6 @@ def _publish(
     source: LiveSource,
     sender: CorrectionSender | None,
 ) -> None:
-    from semantic_mapper.transport.codec import encode, encode_frame
-    from semantic_mapper.transport.messages import EndOfStream
-
     publisher.publish(encode(source.info, sender=context.name))
     _log.info("publishing", source=source.info.source)
     reason: EndReason = "error"
@@ -378,9 +354,6 @@ class _StatusReporter:
         return "degraded" if self._source.warnings or sender or self._notes else "running"
 
     def _tell(self, state: NodeState) -> None:
-        from semantic_mapper.nodes.status import publish_status
-        from semantic_mapper.transport.messages import Status
-
         counters = {"published": self.published}
         if self._first_seq >= 0:
             counters["missing"] = self._last_seq - self._first_seq + 1 - self.published

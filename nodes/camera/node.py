@@ -6,7 +6,7 @@ import dataclasses
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 import structlog
 
@@ -15,9 +15,10 @@ from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import CameraOptions, NodeJob
-
-if TYPE_CHECKING:
-    from semantic_mapper.transport.codec import Envelope
+from semantic_mapper.replay.log.player import ACK_TOPICS, PlayOptions, play
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.transport.codec import Envelope
+from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 _BEGAN = "began"  # note: when the first frame was published, and its stamp
 
@@ -32,7 +33,7 @@ def run_camera(context: NodeContext, options: CameraOptions) -> None:
         CameraError, ConfigError: see ``run_live_camera``.
     """
     if options.camera is not None:
-        from semantic_mapper.nodes.camera.live import run_live_camera
+        from semantic_mapper.nodes.camera.live import run_live_camera  # loads GTSAM, which a log has no need of
 
         run_live_camera(context, options, options.camera)
     elif options.log is not None:
@@ -47,9 +48,6 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
         NodeError: lockstep, and the mapper has gone.
         TransportError: nobody subscribes.
     """
-    from semantic_mapper.replay.log.player import ACK_TOPICS, PlayOptions, play
-    from semantic_mapper.replay.log.sequence import open_log
-    from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
     def on_error(error: LogError) -> None:
         _log.error("log_damaged", error=str(error))

@@ -15,6 +15,7 @@ from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.summary import percent
+from semantic_mapper.training.config import FinetuneConfig
 
 if TYPE_CHECKING:
     from semantic_mapper.replay.jobs import FinetuneRequest, FinetuneResult
@@ -170,7 +171,6 @@ def finetune(
     must_be_there(log)
     output = Output.guarded()
     from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
-    from semantic_mapper.training.config import FinetuneConfig
     from semantic_mapper.training.fitters import FITTERS
 
     if kind is not None and kind not in FITTERS:

@@ -17,6 +17,11 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, Settings, show_error, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.fleet.cluster import connected
+from semantic_mapper.nodes.fleet.inputs import find_inputs
+from semantic_mapper.nodes.fleet.store import Store
+from semantic_mapper.nodes.fleet.table import Tables
+from semantic_mapper.nodes.fleet.urls import shown
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.run_folder import prepare_file
@@ -89,11 +94,7 @@ def run(
     """
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.nodes.fleet.inputs import find_inputs
-    from semantic_mapper.nodes.fleet.urls import shown
-
     inputs = find_inputs(logs, ".npz" if operation == "refine" else ".mcap")  # before what is heavy
-    from semantic_mapper.nodes.fleet.cluster import connected
     from semantic_mapper.nodes.fleet.operations import OPERATIONS
     from semantic_mapper.nodes.fleet.run import Resources, make_template, run_fleet
 
@@ -146,9 +147,6 @@ def table(
     """
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.nodes.fleet.store import Store
-    from semantic_mapper.nodes.fleet.table import Tables
-
     tables = Tables(Store(store))
     rows = tables.overview() if query is None else tables.query(query)
     if csv is not None:
@@ -204,7 +202,6 @@ def compare(
     output = Output.guarded()
     output.quiet = json
     from semantic_mapper.nodes.fleet.compare import GateOptions, compare_stores
-    from semantic_mapper.nodes.fleet.store import Store
 
     try:
         options = GateOptions(operation, metric, threshold, log_threshold, lower_is_better)

@@ -30,7 +30,6 @@ VERBS: Mapping[str, tuple[str, str]] = {
     "export": ("export:export", "Write a saved map, or a log, in a format of other programs."),
     "merge": ("export:merge", "Make one map of two: what both have measured adds up."),
     "query": ("query:query", "Ask a saved map, or that of a running mapper, what is where."),
-    "relocalize": ("relocalize:relocalize", "Find the frames of a log in a map, each by itself."),
     "refine": ("refine:refine", "Relabel a saved map by its shape, colour and votes."),
     "finetune": ("finetune:finetune", "Fit the field to a few labelled keyframes of a log."),
     "autolabel": ("autolabel:autolabel", "Label every frame of a log with weights, into a new log."),

@@ -16,6 +16,7 @@ from semantic_mapper.files import write_json
 from semantic_mapper.mapping.map_types import ALWAYS
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.options import Remote
+from semantic_mapper.nodes.cli.relocalize import all_worlds_found, find_frames, print_frames
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.running import map_endpoint
@@ -33,7 +34,7 @@ POLL_S = 0.2
 
 
 class Question(StrEnum):
-    """What can be request."""
+    """What can be asked."""
 
     INFO = "info"
     AT = "at"
@@ -41,9 +42,15 @@ class Question(StrEnum):
     INSTANCES = "instances"
     GRAPH = "graph"
     CORRECT = "correct"
+    RELOCALIZE = "relocalize"
 
 
-ARGUMENTS = {Question.AT: "X Y Z", Question.NEAREST: "CLASS X Y Z", Question.CORRECT: "FILE"}
+ARGUMENTS = {
+    Question.AT: "X Y Z",
+    Question.NEAREST: "CLASS X Y Z",
+    Question.CORRECT: "FILE",
+    Question.RELOCALIZE: "LOG",
+}
 
 
 class Request(NamedTuple):
@@ -69,12 +76,13 @@ def query(
         ),
     ],
     question: Annotated[
-        Question, typer.Argument(metavar="QUESTION", help="info, at, nearest, instances, graph or correct.")
+        Question,
+        typer.Argument(metavar="QUESTION", help="info, at, nearest, instances, graph, correct or relocalize."),
     ],
     remote: Remote,
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[CLASS] [X Y Z] [FILE]", help="Class, and world coordinates in metres."),
+        typer.Argument(metavar="[CLASS] [X Y Z] [FILE]", help="Class, and world coordinates in metres; or a file."),
     ] = None,
     up: Annotated[
         tuple[float, float, float] | None,
@@ -112,6 +120,10 @@ def query(
     wait: Annotated[
         bool, typer.Option("--wait/--no-wait", hidden=True, help="correct: until the map has moved.")
     ] = True,
+    every: Annotated[int, typer.Option(min=1, hidden=True, help="relocalize: look for every n-th frame.")] = 1,
+    max_frames: Annotated[
+        int, typer.Option("--max-frames", min=0, hidden=True, help="relocalize: of those; 0 = all.")
+    ] = 0,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the answer here, as JSON.")] = None,
     json: JsonOption = False,
 ) -> int:
@@ -127,15 +139,23 @@ def query(
     loop closure. The mapper has to keep its frames (`history.max_frames` in its config). It goes on mapping, and
     exchanges the map when the corrected one is ready. A pose goes to the frame nearest in time, within 5 ms.
 
+    relocalize finds the frames of a log with measured depth in a saved map, each by itself, where features, depth and
+    brightness agree with the map; their poses are used only to see whether they agree. Exit code 1 where it is not
+    known where a world of the log lies: three frames, and most of those that are found, have to agree on it.
+
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     Example: semantic-mapper query live correct optimised.tum
+    Example: semantic-mapper query runs/yesterday relocalize today.mcap
     """
     if question is Question.CORRECT:
         (file,) = _arguments_of(question, arguments or [])
         return _correct(source, Path(file), camera, apply_until, remote, wait=wait, json=json)
+    if question is Question.RELOCALIZE:
+        (file,) = _arguments_of(question, arguments or [])
+        return _relocalize(source, Path(file), every, max_frames, out, json=json)
     class_name, point = _read_arguments(question, arguments or [])
     endpoint = map_endpoint(source)
     if gone and not (endpoint and question is Question.INSTANCES):
@@ -280,6 +300,32 @@ def _correct(
         left_out = f"; {begun.left_out} have no frame in the history and were left out" if begun.left_out else ""
         output.print(f"{begun.used} corrected poses {_correction_text(state)}{left_out}")
     return EXIT_FAILED if state.failure else 0
+
+
+def _relocalize(source: str, log: Path, every: int, max_frames: int, out: Path | None, *, json: bool) -> int:
+    """Find the frames of a log in a saved map.
+
+    Raises:
+        ConfigError: it is a running mapper.
+        LogError, MapError: see ``find_frames``.
+    """
+    output = Output.guarded()
+    out, output.quiet = results_file(out), json
+    if map_endpoint(source):
+        raise ConfigError(
+            f"{source}: is a running mapper, and frames are found in a saved map; `up --set map=FILE` goes on in one"
+        )
+    if out is not None:
+        prepare_file(out)
+    found = find_frames(Path(source), log, every, max_frames)
+    if out is not None:
+        write_json(out, found)
+    if output.quiet:
+        output.json(found)
+    print_frames(found, output)
+    if out is not None:
+        output.print(f"written to {out}")
+    return 0 if all_worlds_found(found) else EXIT_FAILED
 
 
 def _follow(client: MapClient) -> Correction:

@@ -1,15 +1,13 @@
-"""``semantic-mapper relocalize``: where the frames of a log are in a saved map."""
+"""``semantic-mapper query MAP relocalize LOG``: where the frames of a log are in a saved map."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, must_be_there, verb
+from semantic_mapper.nodes.cli.verb import must_be_there
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
@@ -18,28 +16,21 @@ from semantic_mapper.replay.run_folder import map_path
 _NAMED = 10  # frames that cannot be read
 
 
-@verb
-def relocalize(
-    saved: Annotated[Path, typer.Argument(metavar="MAP", help="Saved map, or a folder of results with one.")],
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Frames with measured depth.")],
-    every: Annotated[int, typer.Option(min=1, help="Look for every n-th frame.")] = 1,
-    max_frames: Annotated[int, typer.Option("--max-frames", min=0, help="Of those; 0 = all.")] = 0,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print every frame as JSON, and nothing else, on stdout.")
-    ] = False,
-) -> int:
-    """Find the frames of a log in a map, each by itself; their poses are used only to see whether they agree.
+def find_frames(saved: Path, log: Path, every: int, max_frames: int) -> dict[str, Any]:
+    """Look for the frames of a log in a saved map; plain data, as ``replay.relocalize`` gives it.
 
-    A frame is found where features, depth and brightness agree with the map. Exit code 1 where it is not known
-    where a world of the log lies: three frames, and most of those that are found, have to agree on it.
+    Args:
+        saved: The map, or a folder of results with one.
+        log: Its frames have measured depth.
+        every: Look for every n-th frame.
+        max_frames: Of those; 0 = all.
 
-    Example: semantic-mapper relocalize runs/yesterday today.mcap
+    Raises:
+        ConfigError, LogError: no map or no log there.
+        MapError: the map has nothing to be found by.
     """
-    output = Output.guarded()
-
     map_file = map_path(saved)
     must_be_there(log)
-
     voxel_map = VoxelMap.load(map_file)
     if not len(voxel_map.places):
         raise MapError(
@@ -51,15 +42,16 @@ def relocalize(
         count = min(count, max_frames or count)
         with frame_progress("relocalize", None) as bar:
             bar.start(count)
-            found = relocalize_frames(voxel_map, frames, every, count, bar.set)
-    if json:
-        output.json(found)
-    else:
-        _print(found, output)
-    return 0 if all(world["T_map_world"] is not None for world in found["worlds"]) and found["worlds"] else EXIT_FAILED
+            return relocalize_frames(voxel_map, frames, every, count, bar.set)
 
 
-def _print(found: dict[str, Any], output: Output) -> None:
+def all_worlds_found(found: dict[str, Any]) -> bool:
+    """Whether it is known where each world of the log lies."""
+    return bool(found["worlds"]) and all(world["T_map_world"] is not None for world in found["worlds"])
+
+
+def print_frames(found: dict[str, Any], output: Output) -> None:
+    """The answer, for people."""
     output.print(f"{found['found']} of {found['frames']} frames found")
     for reason, times in found["refused"].items():
         output.print(f"  {times} not: {reason}")

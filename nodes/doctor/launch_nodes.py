@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
+from semantic_mapper.config import load_config, load_mapper_config
+from semantic_mapper.drivers.registry import find_cameras
 from semantic_mapper.errors import CameraError, ConfigError, SemanticMapperError
 from semantic_mapper.nodes.doctor.check import Check, failed
 from semantic_mapper.nodes.launcher.launch_file import Launch, NodeEntry
@@ -15,7 +17,9 @@ from semantic_mapper.nodes.options import (
     FoxgloveOptions,
     LiveCamera,
     MapperOptions,
+    table_of,
 )
+from semantic_mapper.training.config import OnlineConfig
 
 
 def node_settings(launch: Launch) -> Iterator[Check]:
@@ -42,22 +46,17 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
                 raise ConfigError(f"{log}: no such log")
             return log
         case CameraOptions(camera=live) if live is not None:
-            from semantic_mapper.nodes.camera.live import check_world, make_source
+            from semantic_mapper.nodes.camera.live import check_world, make_source  # loads GTSAM
 
             make_source(live)
             if entry.restart != "never":
                 check_world(entry.name, live)
             return f"{_connected(live)}; its settings and poses"
         case MapperOptions() as options:
-            from semantic_mapper.config import load_mapper_config
-
             path = Path(options.config) if options.config else None
             load_mapper_config(path, {"voxel_map.voxel_size_m": options.voxel_size_m or None})
             return _weights(options.weights)
         case FinetunerOptions() as options:
-            from semantic_mapper.config import load_config
-            from semantic_mapper.training.config import OnlineConfig
-
             if options.config:
                 load_config(Path(options.config), OnlineConfig)
             return _weights(options.weights)
@@ -74,9 +73,6 @@ def _connected(live: LiveCamera) -> str:
     Raises:
         CameraError: it is not there.
     """
-    from semantic_mapper.drivers.registry import find_cameras
-    from semantic_mapper.nodes.camera.live import table_of
-
     device = str(table_of(live.config, "camera.config")[0].get("device", ""))
     # Files and streams are named, not found; a device file has several names; an IP address may lie behind a router.
     named = live.kind == "opencv" or (live.kind == "stereo" and device and not device.startswith("/dev/"))

@@ -21,6 +21,10 @@ from semantic_mapper.memory import is_out_of_memory
 from semantic_mapper.nodes.doctor import launch_file as doctor_launch
 from semantic_mapper.nodes.doctor.check import Check
 from semantic_mapper.nodes.process import usable_cores
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.endpoints import default_endpoint
+from semantic_mapper.transport.messages import Status
+from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 PROBE_TIMEOUT_S = 180.0  # a cold disk takes long to give Open3D's 400 MB
 DISK_GB = 2.0
@@ -142,11 +146,6 @@ def _weights() -> Iterator[Check]:
 
 def _sockets() -> Iterator[Check]:
     """Really send something, the way the nodes do."""
-    from semantic_mapper.transport.codec import encode
-    from semantic_mapper.transport.endpoints import default_endpoint
-    from semantic_mapper.transport.messages import Status
-    from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
-
     try:
         endpoint = default_endpoint(f"doctor-{os.getpid()}")
         with Publisher(endpoint) as publisher, LosslessSubscriber(endpoint, ("status",)) as subscriber:

@@ -9,8 +9,16 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.backoff import backoff_s
+from semantic_mapper.config import load_config
 from semantic_mapper.errors import CodecError, FrameError, LabelError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes
+from semantic_mapper.fields.checkpoint import (
+    Checkpoint,
+    checkpoint_bytes,
+    default_checkpoint_path,
+    find_checkpoint,
+    load_checkpoint,
+)
+from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
 from semantic_mapper.nodes.finetuner.keyframe_store import FOLDER, LearningStore, Progress
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDER
@@ -32,14 +40,47 @@ from semantic_mapper.transport.messages import (
 )
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
+MAX_WAITING = 8  # keyframes, of about half a megabyte each, and of 64 MiB at the most
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
+SETTLE_S = 2.0  # no keyframe for so long, and those that came are learned: people and tools send several at a time
+# After a round that failed for want of memory, say: pause before the next with the same keyframes, twice as long with
+# each further one in a row.
+RETRY_S = 20.0
 MAX_RETRY_S = 3600.0
+NEW_KEYFRAMES = 4  # this many must have come since the last round: fewer teach little for what a round costs
+HELD_OUT_EVERY = 4  # of this many keyframes, the last is never learned from: it judges
+MAX_KEYFRAMES = 32  # kept; past it the oldest goes, so that memory and a round's time are bounded
 GIVE_UP_S = 10.0  # that a round may take to end with the node
 MAX_NICENESS = 19  # with it, learning gets only what is left over of the processors
 _COUNTERS = ("keyframes", "unusable", "set_aside", "rounds", "failed", "offered", "taken", "refused")
 
 _log = structlog.get_logger(__name__)
+
+
+def learn(context: NodeContext, options: FinetunerOptions) -> None:
+    """Open the sockets, load the weights to start from, and learn until a stop request.
+
+    Raises:
+        ConfigError, WeightsError: it cannot start.
+        TransportError: an endpoint is taken.
+    """
+    keep_freed_memory()
+    config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
+    path = find_checkpoint(Path(options.weights)) if options.weights else default_checkpoint_path()
+    start, digest = load_checkpoint(path), digest_of(path.read_bytes())
+    endpoint = options.labels if "://" in options.labels else context.endpoint(options.labels)
+    with (
+        Publisher(context.endpoint(context.name), hwm=2) as publisher,
+        LosslessSubscriber(endpoint, ("keyframe",), hwm=MAX_WAITING) as labels,
+        LosslessSubscriber(context.endpoint(options.mapper), ("in_use",)) as mapper,
+    ):
+        _log.info("ready", weights=path.name, labels=endpoint, fraction=options.cpu_fraction)
+        finetuner = Finetuner(context, options, config, publisher, labels, mapper, start, digest)
+        context.heartbeat.ready()
+        finetuner.run()
+        context.heartbeat.ending()
+        finetuner.close()
 
 
 @dataclass
@@ -67,8 +108,7 @@ class Finetuner:
     start_digest: str
 
     def __post_init__(self) -> None:
-        every, capacity = self.config.held_out_every, self.config.max_keyframes
-        self._pool = KeyframePool(self.start.label_set, held_out_every=every, capacity=capacity)
+        self._pool = KeyframePool(self.start.label_set, held_out_every=HELD_OUT_EVERY, capacity=MAX_KEYFRAMES)
         self._last_keyframe_s = 0.0
         self._in_use: WeightsInUse | None = None
         self._current: Checkpoint | None = None  # the weights in use; None = unknown
@@ -198,10 +238,10 @@ class Finetuner:
         if self._round is not None or self._offer is not None or self._in_use is None or self._current is None:
             return
         now_s = time.monotonic()
-        if now_s < self._retry_at_s or now_s - self._last_keyframe_s < self.options.settle_s:
+        if now_s < self._retry_at_s or now_s - self._last_keyframe_s < SETTLE_S:
             return
         keyframes = self._pool.split()
-        if self._pool.new < self.config.new_keyframes or len(keyframes.train) < 2 or not keyframes.held_out:
+        if self._pool.new < NEW_KEYFRAMES or len(keyframes.train) < 2 or not keyframes.held_out:
             return
         _log.info("round_begins", keyframes=len(keyframes.train), held_out=len(keyframes.held_out))
         self._round = FinetuneRound(
@@ -261,7 +301,7 @@ class Finetuner:
     def _fail(self, reason: str) -> None:
         """A round failed through no fault of the labels: they are kept, and tried again after a pause."""
         self._failures += 1
-        pause_s = backoff_s(self._failures, self.options.retry_s, MAX_RETRY_S)
+        pause_s = backoff_s(self._failures, RETRY_S, MAX_RETRY_S)
         self._retry_at_s = time.monotonic() + pause_s
         self._counts["failed"] += 1
         self._failure = reason

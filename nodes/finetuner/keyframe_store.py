@@ -14,7 +14,7 @@ from typing import Annotated
 import msgspec
 import structlog
 
-from semantic_mapper.config import Config, convert_config
+from semantic_mapper.config import convert_config
 from semantic_mapper.errors import CodecError, ConfigError, SemanticMapperError
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.labels import LabelSet
@@ -35,7 +35,7 @@ _SUFFIX = ".keyframe"
 _log = structlog.get_logger(__name__)
 
 
-class _KeptFile(Config, frozen=True):
+class _KeptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A keyframe on disk, see ``Kept``."""
 
     digest: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]  # SHA-256 of the file
@@ -44,7 +44,7 @@ class _KeptFile(Config, frozen=True):
     trials: Count = 0
 
 
-class Progress(Config, frozen=True):
+class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of a finetuner apart from its keyframes."""
 
     rolled_back: Count = 0  # as the mapper reported last
@@ -52,7 +52,7 @@ class Progress(Config, frozen=True):
     learning: bool = False  # in the middle of a round
 
 
-class _Record(Config, frozen=True):
+class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     progress: Progress = Progress()
     keyframes: Annotated[tuple[_KeptFile, ...], msgspec.Meta(max_length=4096)] = ()
 

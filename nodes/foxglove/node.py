@@ -6,6 +6,7 @@ from typing import NoReturn
 
 import structlog
 
+from semantic_mapper.nodes.bridge.feed import lower_priority, run_bridge
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import FoxgloveOptions, NodeJob
 
@@ -19,8 +20,7 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
         DependencyError: the extra is not installed.
         TransportError: the port is taken, or a socket of the launch cannot be used.
     """
-    from semantic_mapper.nodes.bridge.feed import run_bridge
-    from semantic_mapper.nodes.foxglove.server import FoxgloveServer
+    from semantic_mapper.nodes.foxglove.server import FoxgloveServer  # an extra, which may be missing
 
     with FoxgloveServer(options.port) as server:
         _log.info("serving", foxglove_websocket=server.url)
@@ -29,7 +29,5 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
 
 def main(job: NodeJob | None = None) -> NoReturn:
     """Run the node of this process to its end, then exit."""
-    from semantic_mapper.nodes.bridge.feed import lower_priority
-
     lower_priority()
     run_node(FoxgloveOptions, run_foxglove, job)

@@ -8,23 +8,28 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
+import msgspec
 import structlog
 
-from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.errors import CodecError, LogError, TransportError
 from semantic_mapper.nodes.frame_gaps import Gaps
+from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import NodeJob, RecorderOptions
+from semantic_mapper.nodes.status import publish_status
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.plain_text import counted
-
-if TYPE_CHECKING:
-    from semantic_mapper.replay.log.reader import LogAttachment
-    from semantic_mapper.replay.log.recording import Recording
-    from semantic_mapper.transport.messages import NodeState, StreamInfo
-    from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
-    from semantic_mapper.types import CameraIntrinsics
+from semantic_mapper.replay.log.mcap_scan import read_payloads, scan_end
+from semantic_mapper.replay.log.reader import LogAttachment
+from semantic_mapper.replay.log.recording import Recording, RecordingRules, make_way
+from semantic_mapper.replay.log.sequence import parts_on_disk
+from semantic_mapper.transport.codec import decode_as, read_envelope, repack_rgb, unpack_parts
+from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.messages import EndOfStream, NodeState, Status, StreamInfo, parse_topic, read_topic
+from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
+from semantic_mapper.types import CameraIntrinsics
 
 POLL_S = 0.05
 WAIT_SLICE_S = 0.2
@@ -52,8 +57,6 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> str:
             recording, not the node.
         TransportError: a source cannot be subscribed to, or the endpoint is taken.
     """
-    from semantic_mapper.transport.sockets import Publisher
-
     with ExitStack() as stack:
         reporter = StatusReporter(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
         recorder = record(context, options, reporter.follow)
@@ -73,9 +76,6 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
         LogError: the log cannot be begun, or somebody has removed it meanwhile.
         TransportError: a source cannot be subscribed to.
     """
-    from semantic_mapper.errors import LogError
-    from semantic_mapper.transport.sockets import LosslessSubscriber
-
     topics = tuple(dict.fromkeys(("info", *options.topics, "end")))
     cameras = [context.endpoint(name) for name in options.cameras]
     others = [context.endpoint(name) for name in options.sources[options.streams :]]
@@ -111,8 +111,6 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
 
 def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessSubscriber]) -> None:
     """Write what had come before somebody asked to stop; what there is no time for is counted."""
-    from semantic_mapper.transport.messages import read_topic
-
     deadline = time.monotonic() + DRAIN_S
     for source in sources:
         while (parts := source.receive_parts(DRAINED_S)) is not None:
@@ -164,9 +162,6 @@ class Recorder:
     """
 
     def __init__(self, context: NodeContext, options: RecorderOptions) -> None:
-        from semantic_mapper.replay.log.recording import RecordingRules, make_way
-        from semantic_mapper.transport.images import CodecOptions
-
         self._context = context
         self._options = options
         self._path = Path(options.out)
@@ -198,8 +193,6 @@ class Recorder:
     @property
     def log_bytes(self) -> int:
         """Of all parts that are on the disk by now."""
-        from semantic_mapper.replay.log.sequence import parts_on_disk
-
         size = 0
         for file in parts_on_disk(self._path).values():
             with suppress(FileNotFoundError):  # somebody has just deleted it
@@ -229,9 +222,6 @@ class Recorder:
 
     def take(self, parts: list[bytes]) -> bool:
         """Keep one message; True where all streams have ended."""
-        from semantic_mapper.transport.codec import decode_as
-        from semantic_mapper.transport.messages import EndOfStream, StreamInfo, parse_topic
-
         topic, _ = parse_topic(parts[0])
         self.received += topic.name == "frame"
         if topic.name == "info":
@@ -268,8 +258,6 @@ class Recorder:
             _log.error("recording_incomplete", reason=self.losses)
 
     def _begin(self, info: StreamInfo) -> None:
-        from semantic_mapper.replay.log.recording import Recording
-
         self._path.parent.mkdir(parents=True, exist_ok=True)
         before = self._context.note(NOTE) if self._goes_on else ""
         name = before or uuid.uuid4().hex
@@ -289,17 +277,10 @@ class Recorder:
         self._early.clear()
 
     def _calibration(self) -> LogAttachment:
-        import msgspec
-
-        from semantic_mapper.replay.log.reader import LogAttachment
-
         cameras = msgspec.json.format(msgspec.json.encode({"cameras": self._cameras}), indent=1)
         return LogAttachment("calibration.json", "application/json", cameras)
 
     def _attachments(self) -> list[LogAttachment]:
-        from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
-        from semantic_mapper.replay.log.reader import LogAttachment
-
         kept = [self._calibration()]
         folder = self._context.folder
         if folder is not None and (folder / LAUNCH).exists():
@@ -307,8 +288,6 @@ class Recorder:
         return kept
 
     def _packed(self, parts: list[bytes], topic: str) -> list[bytes]:
-        from semantic_mapper.transport.codec import read_envelope, repack_rgb
-
         if topic != "frame":
             return parts
         envelope = read_envelope(parts)
@@ -339,11 +318,6 @@ def _last_frames(path: Path) -> dict[str, int]:
     Args:
         path: Of its first part.
     """
-    from semantic_mapper.errors import LogError
-    from semantic_mapper.replay.log.mcap_scan import read_payloads, scan_end
-    from semantic_mapper.replay.log.sequence import parts_on_disk
-    from semantic_mapper.transport.codec import read_envelope, unpack_parts
-
     found: dict[str, int] = {}
     for part in reversed(parts_on_disk(path).values()):
         with part.open("rb") as file:
@@ -377,9 +351,6 @@ class StatusReporter:
 
     def tell(self, recorder: Recorder, state: NodeState) -> None:
         """Tell now."""
-        from semantic_mapper.nodes.status import publish_status
-        from semantic_mapper.transport.messages import Status
-
         self._last_sent = time.monotonic()
         counters = {"missed": recorder.gaps.missed, "rejected": recorder.rejected, "unpacked": recorder.unpacked}
         degraded: tuple[str, ...] = ()

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import semantic_mapper.replay.importers.ros_images as ros_images
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import CodecError, ConfigError, DependencyError, ImportSourceError, SemanticMapperError
 from semantic_mapper.geometry import invert_pose, scale_intrinsics, transform, unproject
 from semantic_mapper.plain_text import counted, visible
-from semantic_mapper.replay.importers import ros_images
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,

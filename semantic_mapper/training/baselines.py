@@ -23,19 +23,18 @@ from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_
 from semantic_mapper.types import PosedFrame, SourceViews, UInt8
 
 WARP_TOLERANCE = 0.04  # fraction of z by which a keyframe's depth may disagree and still show the same surface
+LEARNING_RATE, FINAL_LEARNING_RATE = 1e-3, 5e-5  # along half a cosine
+COLOUR_JITTER = 0.2  # as in the fields' own training
 _GAMMA = 2.2  # of the camera's pictures
 
 
 class UNetConfig(Config, frozen=True):
-    """Budget and optimiser of the per-image U-Net."""
+    """Budget of the per-image U-Net."""
 
     seconds: float = 300.0
     steps: int = 0  # this many instead of ``seconds``; 0 = seconds
     width: int = 320
     batch: int = 4
-    learning_rate: float = 1e-3
-    final_learning_rate: float = 5e-5
-    colour_jitter: float = 0.2
     darkest: float = 1.0  # images of a step are scaled by a number from this to 1, in linear light; 1 = they are not
     seed: int = 0
 
@@ -60,16 +59,16 @@ class UNetBaseline:
             raise FrameError("the U-Net baseline needs labelled frames, got none")
         views = [view_from_frame(f, self.label_set, self.config.width) for f in frames]
         generator = torch.Generator().manual_seed(self.config.seed)
-        optimiser = torch.optim.AdamW(self.net.parameters(), self.config.learning_rate, weight_decay=1e-4)
+        optimiser = torch.optim.AdamW(self.net.parameters(), LEARNING_RATE, weight_decay=1e-4)
 
         def learn(fraction: float) -> float:
             for group in optimiser.param_groups:
-                group["lr"] = cosine_rate(fraction, self.config.learning_rate, self.config.final_learning_rate)
+                group["lr"] = cosine_rate(fraction, LEARNING_RATE, FINAL_LEARNING_RATE)
             order = torch.randperm(len(views), generator=generator).tolist()[: self.config.batch]
             batch = [views[i] for i in order]
             if float(torch.rand(1, generator=generator)) < 0.5:
                 batch = [mirrored_view(v) for v in batch]
-            sources = jitter_colours(stack_sources(batch), self.config.colour_jitter, generator)
+            sources = jitter_colours(stack_sources(batch), COLOUR_JITTER, generator)
             if self.config.darkest < 1:
                 sources = _dimmed(sources, self.config.darkest, generator)
             channel = torch.stack([v.channel for v in batch])

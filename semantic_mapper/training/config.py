@@ -113,11 +113,8 @@ class RoundConfig(FinetuneConfig, frozen=True):
 
 
 class OnlineConfig(Config, frozen=True):
-    """When a learner learns, and when it finds new weights better."""
+    """How a learner learns, and when it finds new weights better."""
 
-    new_keyframes: AtLeastOne = 4  # this many must have come since the last round
-    held_out_every: AtLeastTwo = 4  # of this many keyframes, the last is never learned from: it judges
-    max_keyframes: AtLeastTwo = 32  # kept; past it the oldest goes
     least_gain: Fraction = 0.01  # mIoU that new weights must gain on the held-out keyframes
     least_score: Fraction = 0.2  # mIoU that they must reach there: labels without any sense are learned worse
     # Accuracy that they may lose on those held-out keyframes with which the weights in use were found better.

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.config import Config, NotNegative, VoxelMapConfig, convert_config
+from semantic_mapper.config import NotNegative, VoxelMapConfig, convert_config
 from semantic_mapper.errors import ConfigError, MapError, PoseError
 from semantic_mapper.files import atomic_write, open_regular
 from semantic_mapper.geometry import check_pose
@@ -75,7 +75,7 @@ _PLACES = {  # of ``Place``; only where there are any
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
 
 
-class MapChunk(Config, frozen=True):
+class MapChunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Blocks that are stored together.
 
     Args:
@@ -90,7 +90,7 @@ class MapChunk(Config, frozen=True):
     sha256: Digest
 
 
-class InstanceTable(Config, frozen=True):
+class InstanceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The voxels that belong to things (``instance_layer``).
 
     Args:
@@ -102,7 +102,7 @@ class InstanceTable(Config, frozen=True):
     sha256: Digest
 
 
-class PlaceTable(Config, frozen=True):
+class PlaceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The places that the map is found again by (``localization.places``).
 
     Args:
@@ -118,7 +118,7 @@ class PlaceTable(Config, frozen=True):
     sha256: Digest
 
 
-class MapManifest(Config, frozen=True, kw_only=True):
+class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is known of a saved map without reading its blocks.
 
     Args:

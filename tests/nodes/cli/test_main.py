@@ -100,7 +100,7 @@ def test_completion_of_bash_knows_verbs_and_options(tmp_path: Path) -> None:
         done = subprocess.run([str(COMMAND)], env=environment, capture_output=True, text=True, check=False)
         return done.stdout.split()
 
-    assert complete("semantic-mapper re") == ["replay", "record", "relocalize", "refine"]
+    assert complete("semantic-mapper re") == ["replay", "record", "refine"]
     assert "--voxel-size" in complete("semantic-mapper replay --vo")
     script = complete("", _SEMANTIC_MAPPER_COMPLETE="source_bash")
     assert "complete" in script and "semantic-mapper" in script

@@ -1,4 +1,4 @@
-"""``relocalize``, as a command."""
+"""``query MAP relocalize LOG``, as a command."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.nodes.support import error_line, run
 def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:
     small_map().save(tmp_path / "map.npz")
     (tmp_path / "bad.mcap").touch()
-    done = run("relocalize", tmp_path / "map.npz", tmp_path / "bad.mcap")
+    done = run("query", tmp_path / "map.npz", "relocalize", tmp_path / "bad.mcap")
     assert done.returncode == 1 and "has nothing to find oneself by" in error_line(done.stderr)
 
 
@@ -35,7 +35,7 @@ def test_the_frames_of_a_log_are_found_in_a_map_each_world_by_itself(tmp_path: P
     whole = bytearray(log_path.read_bytes())
     whole[data + 5000] ^= 0xFF
     log_path.write_bytes(bytes(whole))
-    found = run("relocalize", tmp_path / "map.npz", log_path, "--json")
+    found = run("query", tmp_path / "map.npz", "relocalize", log_path, "--json")
     assert found.returncode == 1, found.stderr
     told = json.loads(found.stdout)
     assert (told["frames"], told["found"], told["refused"]) == (5, 5, {})

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.nodes.doctor import launch_file as doctor_launch
+from semantic_mapper.nodes.doctor import launch_nodes
 from semantic_mapper.nodes.doctor.check import Check
 from semantic_mapper.transport.keys import allow, make_keys
 from tests.nodes.support import REPLAY_LAUNCH
@@ -101,7 +101,7 @@ def test_packages_of_bridges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_camera_that_is_not_connected_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     connected: list[FoundCamera] = []
-    monkeypatch.setattr(registry, "find_cameras", lambda kinds: (connected, {}))
+    monkeypatch.setattr(launch_nodes, "find_cameras", lambda kinds: (connected, {}))
     found = "camera 'camera': no oak camera is connected"
     assert of(ROBOT)["camera"][0] == Check("camera", "bad", found, "plug it in (`up` waits for it)")
     connected.append(FoundCamera("oak", "OAK-D", "1844"))

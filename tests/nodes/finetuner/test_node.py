@@ -12,6 +12,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import msgspec
 import pytest
@@ -86,13 +87,16 @@ class Heard:
 
 
 @contextmanager
-def finetuning(start: Path, endpoints: dict[str, str], restarts: int = 0, **more: Any) -> Iterator[Heard]:
-    settings = {"config": str(start.with_name("learning.toml")), "niceness": 0, "settle_s": 0.3, **more}
+def finetuning(
+    start: Path, endpoints: dict[str, str], restarts: int = 0, retry_s: float = 20.0, **more: Any
+) -> Iterator[Heard]:
+    settings = {"config": str(start.with_name("learning.toml")), "niceness": 0, **more}
     options = FinetunerOptions(weights=str(start), cpu_fraction=1.0, **settings)
     stop = StopRequest(patient=True)
     context = NodeContext("finetuner", endpoints, 1, stop, HeartbeatWriter(-1, 1), restarts)
     node = threading.Thread(target=run_finetuner, args=(context, options), daemon=True)
     with (
+        patch.multiple(finetuner, SETTLE_S=0.3, RETRY_S=retry_s),
         LosslessSubscriber(endpoints["finetuner"], ("weights",)) as weights,
         NewestSubscriber(endpoints["finetuner"], ("status",)) as status,
     ):
