@@ -120,7 +120,7 @@ def query(
     info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
     things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
-    that `refine` has told things apart in, those. graph: floors, their rooms, which part at doors, the doors between
+    in which `refine` has separated things, those. graph: floors, their rooms, which part at doors, the doors between
     them, and the same things with their rooms.
 
     correct moves the map of a running mapper to corrected poses (TUM: stamp tx ty tz qx qy qz qw), such as after a

@@ -74,10 +74,10 @@ def test_queries_say_how_things_were_told_apart(files: Path, tmp_path: Path) -> 
         done = run("refine", files, "--up", "z", "--out", tmp_path / f"{name}.npz", *options)
         assert done.returncode == 0, done.stderr
         assert said[name] in done.stdout
-        assert ("told apart" in done.stdout) == (name == "learned"), "connected pieces are better than what ships"
+        assert ("separated pieces" in done.stdout) == (name == "learned"), "connected pieces are better than what ships"
     assert VoxelMap.load(tmp_path / "shipped.npz").refined == load_nesf(SHIPPED).digest
     told = [
-        json.loads(run("query", tmp_path / f"{name}.npz", "instances", "--json").stdout)["told_apart_by"]
+        json.loads(run("query", tmp_path / f"{name}.npz", "instances", "--json").stdout)["separated_by"]
         for name in ways
     ]
     assert told == ["what `refine` has learned", *["connected pieces of one class"] * 2]
