@@ -67,9 +67,9 @@ def test_maps_of_other_classes_than_the_weights_that_ship_are_smoothed(tmp_path:
     assert borders(after.label) < 0.8 * borders(before.label), "chance votes become patches"
 
 
-def test_queries_say_how_things_were_told_apart(files: Path, tmp_path: Path) -> None:
+def test_queries_say_how_things_were_separated(files: Path, tmp_path: Path) -> None:
     ways = {"learned": ("--weights", files / "nesf.safetensors"), "shipped": (), "smooth": ("--weights", "smoothed")}
-    said = {"learned": "told apart", "shipped": "by the weights nesf-rooms", "smooth": "the votes were smoothed"}
+    said = {"learned": "separated pieces", "shipped": "by the weights nesf-rooms", "smooth": "the votes were smoothed"}
     for name, options in ways.items():
         done = run("refine", files, "--up", "z", "--out", tmp_path / f"{name}.npz", *options)
         assert done.returncode == 0, done.stderr
