@@ -81,7 +81,7 @@ CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned
 def answer_instances(up: Sequence[float], instances: Sequence[Instance], separated_by: str = "") -> dict[str, Any]:
     """The things in a map, the surest first, and by which means they were separated; empty = not known.
 
-    Those that have gone are ``gone``, the latest first; the key is left out where all are there.
+    Those that have gone are ``gone``, the latest first; the key is left out while nothing has gone.
     """
     there = sorted((t for t in instances if t.gone_ns is None), key=lambda thing: -thing.rank)
     gone = sorted((t for t in instances if t.gone_ns is not None), key=lambda thing: thing.gone_ns or 0, reverse=True)

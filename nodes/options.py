@@ -58,7 +58,7 @@ class LiveCamera(Config, frozen=True):
     def __post_init__(self) -> None:
         if self.poses in POSE_KINDS and not Path(str(self.poses)).exists():
             raise ValueError(
-                f'poses = "{self.poses}" names a file of settings, which is missing; for poses of that kind write '
+                f'poses = "{self.poses}" names a file of settings that does not exist; for poses of that kind write '
                 f'poses = {{ kind = "{self.poses}" }}'
             )
 

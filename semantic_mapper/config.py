@@ -648,7 +648,7 @@ def _members(part: Any) -> list[Any]:
 
 
 def _keys_at(path: str, kind: type[msgspec.Struct]) -> set[str]:
-    """Keys of the section at a place; of all sections where the place is missing."""
+    """Keys of the section at a place; of all sections where no section is there."""
     sections = [part for part in _types_at(path, kind) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
     return {item.name for part in sections for item in msgspec.structs.fields(part)} or _all_keys(kind)
 

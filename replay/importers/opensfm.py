@@ -2,8 +2,8 @@
 
 The layout is that of https://opensfm.org/docs/dataset.html. Pixels count from the picture's middle, divided by its
 longer side. Poses are world to camera, rotations as axis times angle, camera axes are OpenCV's. With a
-``reference_lla`` that is not zero OpenSfM has registered the model by GPS: then x is east, y north, z up, and
-lengths are metres. Without, the model is registered as one of COLMAP.
+``reference_lla`` that is not zero OpenSfM has aligned the model by GPS: then x is east, y north, z up, and
+lengths are metres. Without, the model is oriented like one of COLMAP.
 """
 
 from __future__ import annotations
