@@ -15,7 +15,7 @@ from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction import ALWAYS
+from semantic_mapper.mapping.map_types import ALWAYS
 from semantic_mapper.replay.importers.tum import match_nearest, read_trajectory
 from semantic_mapper.types import Float64
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import structlog
 
 from semantic_mapper.config import DepthConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
@@ -30,6 +29,7 @@ from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_classes, with_times
@@ -50,7 +50,7 @@ from semantic_mapper.types import PosedFrame
 LEAST_KEYFRAMES = 2
 MAX_SCENE_FRAMES = 300  # that a field of one scene is fitted to
 OWN = "the log's own label images"
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

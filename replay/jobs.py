@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import structlog
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import LabelError, LogError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import find_nesf
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.refine import RefineReport, refine
@@ -66,7 +66,7 @@ __all__ = [
 # computed waits for later ones.
 OFFLINE = {"depth.from_motion.delay_frames": 6}
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

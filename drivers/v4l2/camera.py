@@ -155,16 +155,20 @@ def _examine(path: Path) -> tuple[ioctls.Capability, tuple[str, ...]]:
             who = ioctls.query_capability(fd)
             formats = ioctls.list_formats(fd)
     except FileNotFoundError as error:
-        raise CameraError(f"{path}: no such camera; is it plugged in? `semantic-mapper cameras` lists them") from error
+        raise CameraError(
+            f"{path}: no such camera; is it plugged in? `semantic-mapper doctor --cameras` lists them"
+        ) from error
     except PermissionError as error:
         raise CameraError(f"{path}: no permission; add yourself to the group `video` and log in again") from error
     except OSError as error:
         kind = "is no video device" if error.errno in (errno.ENOTTY, errno.EINVAL) else "does not answer"
-        raise CameraError(f"{path}: {kind} ({error.strerror}); `semantic-mapper cameras` lists them") from error
+        raise CameraError(
+            f"{path}: {kind} ({error.strerror}); `semantic-mapper doctor --cameras` lists them"
+        ) from error
     if not who.captures:
         raise CameraError(
-            f"{path}: gives no images (it is the metadata of {who.card}, or an output); `semantic-mapper cameras` "
-            "lists those that do"
+            f"{path}: gives no images (it is the metadata of {who.card}, or an output); "
+            "`semantic-mapper doctor --cameras` lists those that do"
         )
     return who, formats
 

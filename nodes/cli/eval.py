@@ -72,7 +72,7 @@ def evaluate(
     A DIR gives the figures of its replay. A LOG is mapped and scored: with --weights that were finetuned on it, the
     keyframes they were fitted to never count, and --baselines adds a per-image U-Net and labels carried over by depth,
     both made from those same keyframes. --mesh takes an .npz with vertices, faces and (if there are any) labels.
-    `semantic-mapper benchmark` scores weights on rooms that nothing was trained on.
+    `semantic-mapper-research suite` scores weights on rooms that nothing was trained on.
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines

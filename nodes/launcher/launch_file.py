@@ -61,8 +61,8 @@ class Limits(Config, frozen=True):
     # A node that gives no sign of life for so long, and neither has had nor wants processor time meanwhile, is killed.
     # One that starts or ends, or is busy, or waits for a processor or a disk, may be silent for half a minute.
     heartbeat_s: Annotated[float, msgspec.Meta(ge=0.5)] = 30.0
-    # A fixed endpoint at which the status of all nodes can be subscribed to (`semantic-mapper top`), next to the one in
-    # the folder of sockets: ipc://PATH, tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
+    # A fixed endpoint at which the status of all nodes can be subscribed to (`view --status`), next to the one in the
+    # folder of sockets: ipc://PATH, tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
     publish: Annotated[str, msgspec.Meta(pattern=r"^([a-z]+://.+|)\Z")] = ""
     keys: str = ""  # folder of keys (`semantic-mapper keys`), also for nodes that name none; empty = none
 

@@ -356,7 +356,7 @@ def _nothing_left(path: Path, error: OSError) -> LogError:
 
 @dataclass(frozen=True, slots=True)
 class RecoverReport:
-    """What ``recover`` saved and what it could not.
+    """What `recover_log` saved and what it could not.
 
     Args:
         frames, messages: In the new log.

@@ -1,4 +1,4 @@
-"""``semantic-mapper benchmark``: score weights on rooms, or arms on KLEVR or AERIAL, that nothing was trained on."""
+"""``semantic-mapper-research suite``: score weights on rooms, or methods on other scenes, never trained on."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def benchmark(
     streets: arms label every image of a drive from annotated boxes and noisy predicted labels. The same options go
     with it.
 
-    Example: semantic-mapper benchmark rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
-    Example: semantic-mapper benchmark rooms --sources wide --depth off --rooms 5 --json
-    Example: semantic-mapper benchmark rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
-    Example: semantic-mapper benchmark klevr --claims --out runs/klevr.json
-    Example: semantic-mapper benchmark aerial --claims --out runs/aerial.json
-    Example: semantic-mapper benchmark streets --claims --out runs/streets.json
+    Example: semantic-mapper-research suite rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
+    Example: semantic-mapper-research suite rooms --sources wide --depth off --rooms 5 --json
+    Example: semantic-mapper-research suite rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
+    Example: semantic-mapper-research suite klevr --claims --out runs/klevr.json
+    Example: semantic-mapper-research suite aerial --claims --out runs/aerial.json
+    Example: semantic-mapper-research suite streets --claims --out runs/streets.json
     """
     given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "depth": depth}
     given |= {"sources": sources, "own_image": own_image, "current": current}

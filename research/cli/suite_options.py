@@ -1,4 +1,4 @@
-"""Options of ``semantic-mapper benchmark``, and the settings that come of them."""
+"""Options of ``semantic-mapper-research suite``, and the settings that come of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``semantic-mapper train``: train a field on procedural rooms."""
+"""``semantic-mapper-research train``: train a field on procedural rooms."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def train(
     With --kind nesf, or a TOML file that says so, the network of `refine` is trained, on maps of procedural rooms or
     of the labelled logs that the file names.
 
-    Example: semantic-mapper train --config research/recipes/cpu-2h.toml --out runs/rooms --half
-    Example: semantic-mapper train --config research/recipes/nesf-rooms.toml --out runs/nesf
+    Example: semantic-mapper-research train --config research/recipes/cpu-2h.toml --out runs/rooms --half
+    Example: semantic-mapper-research train --config research/recipes/nesf-rooms.toml --out runs/nesf
     """
     must_be_there(*(path for path in (config,) if path is not None))
     output = Output.guarded()

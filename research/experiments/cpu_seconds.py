@@ -1,6 +1,6 @@
 """Run a verb, or a module, whose budgets of seconds are its own processor time: for a machine that is shared.
 
-python -m research.experiments.cpu_seconds semantic-mapper benchmark rooms --protocol finetune --seconds 60
+python -m research.experiments.cpu_seconds semantic-mapper-research suite rooms --protocol finetune --seconds 60
 python -m research.experiments.cpu_seconds research.experiments.taught_rooms --out runs/taught.jsonl
 """
 

@@ -3,8 +3,8 @@
 Convert, measure what was converted with depth and without, ship it; shipping also renews the table of the model card:
 
     python -m research.train.ship_weights W --half-only HALF
-    semantic-mapper benchmark rooms --weights HALF --out on.json
-    semantic-mapper benchmark rooms --weights HALF --out off.json --depth off
+    semantic-mapper-research suite rooms --weights HALF --out on.json
+    semantic-mapper-research suite rooms --weights HALF --out off.json --depth off
     python -m research.train.ship_weights HALF --figures on.json --figures off.json
 
 Renew that table alone, from what the weights in the package say of themselves:

@@ -41,7 +41,7 @@ def check_field(field: LearnedField, config: TrainConfig) -> None:
         # What it renders does not depend on the source views: it would learn the mean of all rooms.
         raise ConfigError(
             f"a field of kind '{field.kind}' holds a single scene in its weights, so it has nothing to learn for other "
-            f"rooms; `semantic-mapper benchmark rooms --protocol scratch --kind {field.kind}` fits it room by room"
+            f"rooms; `semantic-mapper-research suite rooms --protocol scratch --kind {field.kind}` fits it room by room"
         )
     if config.images.fraction > 0 or config.images.later > 0:
         encoder_for_images(field)

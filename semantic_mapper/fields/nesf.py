@@ -361,14 +361,14 @@ def load_nesf(path: Path) -> NesfWeights:
     path = find_checkpoint(path)
     if not path.exists():
         raise WeightsError(
-            f"{path}: no such weights file; make one with `semantic-mapper train --kind {MAP_KIND}`, or check the path"
+            f"{path}: no such weights file; train them by `semantic-mapper-research train --kind {MAP_KIND}`"
         )
     tensors, metadata = open_weights(path)
     kind = metadata.get("field", "sray")
     if kind != MAP_KIND:
         raise WeightsError(
             f"{path}: weights of kind '{kind}', which label frames (`replay --weights`); to refine maps takes weights "
-            f"of kind '{MAP_KIND}', from `train --kind {MAP_KIND}`"
+            f"of kind '{MAP_KIND}', from `semantic-mapper-research train --kind {MAP_KIND}`"
         )
     try:
         label_set = label_set_from_plain(json.loads(metadata["label_set"]))

@@ -113,7 +113,7 @@ def test_another_size_than_was_calibrated_is_refused(machine: Machine, tmp_path:
     ("settings", "says"),
     [
         ({"calibration": ""}, "semantic-mapper calibrate"),
-        ({"device": ""}, "`semantic-mapper cameras` lists"),
+        ({"device": ""}, "`doctor --cameras` lists"),
         ({"uncalibrated": True}, "leave one of the two out"),
         ({"width": 80, "height": 60}, "another size than the 80x60"),
         ({"calibration": "missing.toml"}, "missing.toml: no such file"),

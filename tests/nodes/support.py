@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from unittest.mock import patch
 
+import typer
 from typer.testing import CliRunner
 
 from semantic_mapper.config import GridFieldConfig
@@ -91,11 +92,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str | Path, app: typer.Typer = cli.app) -> subprocess.CompletedProcess[str]:
     """The command in this process, which is quicker, to its end."""
     words, stdout = [str(a) for a in arguments], io.StringIO()
     with patch.object(Output, "guarded", lambda: Output(stdout)):
-        done = CliRunner().invoke(cli.app, words)
+        done = CliRunner().invoke(app, words)
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     return subprocess.CompletedProcess(words, done.exit_code, stdout.getvalue() + done.stdout, done.stderr)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tests.nodes.support import error_line, run
+from research.tests.cli.support import run
+from tests.nodes.support import error_line
 
 SMALL = ("--rooms", "2", "--loops", "1", "--minutes", "0.2", "--hz", "1", "--width", "96")
 

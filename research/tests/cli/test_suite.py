@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from research.tests.cli.support import run
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.nesf import Nesf, NesfConfig, NesfWeights, save_nesf
 from semantic_mapper.labels import ROOMS
-from tests.nodes.support import error_line, run
+from tests.nodes.support import error_line
 from tests.small import tiny_field
 
 CONFIG = """
@@ -54,7 +55,7 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     suite: Path, two: tuple[Path, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "runs" / "ab.json"
-    common = ("benchmark", "rooms", "--config", suite, "--out", out)
+    common = ("suite", "rooms", "--config", suite, "--out", out)
     first = run(*common, "--weights", two[0], "--rooms", "1", "--map")
     assert first.returncode == 0, first.stderr
     records = out.with_suffix(".jsonl").read_text().splitlines()
@@ -104,7 +105,7 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
 def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "fit.json"
     options = ("--protocol", "scratch", "--steps", "2", "--rooms", "1", "--depth", "off")
-    done = run("benchmark", "rooms", "--config", suite, "--weights", two[0], *options, "--out", out)
+    done = run("suite", "rooms", "--config", suite, "--weights", two[0], *options, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "mIoU before fitting" in done.stdout and "2 steps" in done.stdout
     assert out.with_suffix(".curves.png").stat().st_size > 1000
@@ -116,7 +117,7 @@ def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: 
 def test_a_file_that_cannot_be_written_is_refused_before_a_room_is_made(suite: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     out = tmp_path / "file" / "a.json"
-    refused = run("benchmark", "rooms", "--config", suite, "--rooms", "1", "--out", out)
+    refused = run("suite", "rooms", "--config", suite, "--rooms", "1", "--out", out)
     assert refused.returncode == 1 and str(tmp_path / "file") in error_line(refused.stderr)
     assert "rooms" not in refused.stdout, "no room was begun"
 
@@ -124,11 +125,11 @@ def test_a_file_that_cannot_be_written_is_refused_before_a_room_is_made(suite: P
 def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Path) -> None:
     out = tmp_path / "kind.json"
     options = ("--config", suite, "--kind", "semantic_nerf", "--out", out)
-    done = run("benchmark", "rooms", *options, "--protocol", "scratch", "--steps", "2", "--rooms", "1")
+    done = run("suite", "rooms", *options, "--protocol", "scratch", "--steps", "2", "--rooms", "1")
     assert done.returncode == 0, done.stderr
     (column,) = json.loads(out.read_text())["weights"].items()
     assert column[0] == "semantic_nerf" and column[1]["file"] is None
-    refused = run("benchmark", "rooms", *options, "--protocol", "generalize")
+    refused = run("suite", "rooms", *options, "--protocol", "generalize")
     assert refused.returncode == 1 and "--protocol scratch" in refused.stderr
 
 
@@ -138,24 +139,24 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("eval", "log.mcap", "--suite", "rooms"),
         ("eval", "log.mcap", "--kind", "unet"),
         ("eval", "log.mcap", "--rooms", "2"),
-        ("benchmark", "rooms", "--protocol", "finetune", "--sources", "wide"),
-        ("benchmark", "rooms", "--protocol", "finetune", "--no-own-image"),
-        ("benchmark", "rooms", "--seconds", "3"),
-        ("benchmark", "rooms", "--keyframes", "3"),
-        ("benchmark", "klevr", "--rooms", "3"),
-        ("benchmark", "klevr", "--map"),
-        ("benchmark", "klevr", "--arm", "nerf"),
-        ("benchmark", "klevr", "--tier", "gpu"),
-        ("benchmark", "aerial", "--rooms", "3"),
-        ("benchmark", "aerial", "--arm", "nerf"),
-        ("benchmark", "aerial", "--tier", "gpu"),
-        ("benchmark", "streets", "--arm", "nerf"),
-        ("benchmark", "rooms", "--claims"),
-        ("benchmark", "rooms", "--tier", "record"),
-        ("benchmark", "rooms", "--protocol", "finetune", "--map"),
-        ("benchmark", "rooms", "--views", "17"),
-        ("benchmark", "rooms", "--depth", "computed", "--current", "hard"),
-        ("benchmark", "rooms", "--rooms", "1", "--out", __file__),
+        ("suite", "rooms", "--protocol", "finetune", "--sources", "wide"),
+        ("suite", "rooms", "--protocol", "finetune", "--no-own-image"),
+        ("suite", "rooms", "--seconds", "3"),
+        ("suite", "rooms", "--keyframes", "3"),
+        ("suite", "klevr", "--rooms", "3"),
+        ("suite", "klevr", "--map"),
+        ("suite", "klevr", "--arm", "nerf"),
+        ("suite", "klevr", "--tier", "gpu"),
+        ("suite", "aerial", "--rooms", "3"),
+        ("suite", "aerial", "--arm", "nerf"),
+        ("suite", "aerial", "--tier", "gpu"),
+        ("suite", "streets", "--arm", "nerf"),
+        ("suite", "rooms", "--claims"),
+        ("suite", "rooms", "--tier", "record"),
+        ("suite", "rooms", "--protocol", "finetune", "--map"),
+        ("suite", "rooms", "--views", "17"),
+        ("suite", "rooms", "--depth", "computed", "--current", "hard"),
+        ("suite", "rooms", "--rooms", "1", "--out", __file__),
     ],
 )
 def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, ...]) -> None:
@@ -165,14 +166,14 @@ def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, .
 
 
 def test_more_rooms_than_there_are_is_refused() -> None:
-    done = run("benchmark", "rooms", "--rooms", "21")
+    done = run("suite", "rooms", "--rooms", "21")
     assert done.returncode == 1 and "has 20 rooms" in error_line(done.stderr)
 
 
 def test_an_unknown_setting_names_the_nearest_one(tmp_path: Path) -> None:
     path = tmp_path / "suite.toml"
     path.write_text("veiws = 3\n", encoding="utf-8")
-    done = run("benchmark", "rooms", "--config", path)
+    done = run("suite", "rooms", "--config", path)
     assert done.returncode == 1
     assert "did you mean `views`" in error_line(done.stderr)
 
@@ -193,7 +194,7 @@ unet_steps = 2
 def test_klevr_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
     config, out = tmp_path / "klevr.toml", tmp_path / "klevr.json"
     config.write_text(KLEVR_CONFIG, encoding="utf-8")
-    common = ("benchmark", "klevr", "--config", config, "--claims", "--out", out)
+    common = ("suite", "klevr", "--config", config, "--claims", "--out", out)
     first = run(*common, "--arm", "color")
     assert first.returncode == 0, first.stderr
     records = out.with_suffix(".jsonl").read_text().splitlines()
@@ -223,7 +224,7 @@ mlp_steps = 5
 def test_aerial_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
     config, out = tmp_path / "aerial.toml", tmp_path / "aerial.json"
     config.write_text(AERIAL_CONFIG, encoding="utf-8")
-    command = ("benchmark", "aerial", "--config", config, "--claims", "--out", out, "--arm", "color")
+    command = ("suite", "aerial", "--config", config, "--claims", "--out", out, "--arm", "color")
     first = run(*command)
     assert first.returncode == 0, first.stderr
     records = out.with_suffix(".jsonl").read_bytes()
@@ -239,7 +240,7 @@ def test_streets_shows_arms_and_claims(tmp_path: Path) -> None:
     config, out = tmp_path / "streets.toml", tmp_path / "streets.json"
     config.write_text("streets = 1\nwidth = 48\npairs = 3\nscored_every = 2\n", encoding="utf-8")
     arms = ("--arm", "nearest", "--arm", "map")
-    done = run("benchmark", "streets", "--config", config, "--claims", "--out", out, *arms)
+    done = run("suite", "streets", "--config", config, "--claims", "--out", out, *arms)
     assert done.returncode == 0, done.stderr
     assert "claims of Panoptic NeRF" in done.stdout and "not run" in done.stdout
     found = json.loads(out.read_text())

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import os
 import signal
 from pathlib import Path
 
 import pytest
 
-from semantic_mapper.fields.checkpoint import load_checkpoint
-from tests.nodes.support import Running, eventually, run
+from research.tests.cli.support import run
+from research.train.map_grids import made_of_room, training_map
+from semantic_mapper.fields.checkpoint import find_checkpoint, load_checkpoint
+from semantic_mapper.fields.nesf import load_nesf
+from semantic_mapper.labels import ROOMS
+from tests.mapping.test_refine import UP, make_map
+from tests.nodes.support import Running, error_line, eventually
+from tests.small import tiny_frames
 
 ROOT = Path(__file__).resolve().parents[3]
 CONFIG = """
@@ -110,3 +118,31 @@ def test_ranks_without_ray_and_ray_under_torchrun_are_refused(
     done = run("train", "--config", recipe, "--out", tmp_path / "run", "--ray", "local")
     assert done.returncode == 1 and "run it without torchrun" in done.stderr
     assert not (tmp_path / "run").exists()
+
+
+def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    frames = tiny_frames()
+    field = hashlib.sha256(find_checkpoint(Path("rooms-people")).read_bytes()).hexdigest()
+    for name, seed, rendered in (("100000", 100_000, 1), ("50000", 50_000, 1), ("50000-every-4", 50_000, 4)):
+        found = training_map(make_map(), frames, ROOMS, UP)
+        made_of = made_of_room(seed, field, rendered=rendered)
+        dataclasses.replace(found, made_of=made_of).save(tmp_path / "maps" / f"room-{name}.npz")
+    recipe = tmp_path / "tiny.toml"
+    recipe.write_text(
+        f'kind = "nesf"\nrooms = 1\nvalidation_rooms = 1\nsteps = 4\nmaps = "{tmp_path / "maps"}"\n'
+        'weights = "rooms-people"\n'
+        "labelled_voxels = 500\nvalidate_every = 2\n[field]\nwidth = 2\n",
+        encoding="utf-8",
+    )
+    out = tmp_path / "run"
+    done = run("train", "--config", recipe, "--out", out, "--steps", "2")
+    assert done.returncode == 0, done.stderr
+    assert "weights.safetensors: 2 steps on 2 maps" in done.stdout
+    done = run("train", "--config", recipe, "--out", out, "--resume")
+    assert done.returncode == 0, done.stderr
+    recipe_of = load_nesf(out / "weights.safetensors").recipe
+    assert recipe_of["steps"] == 4 and [line["step"] for line in recipe_of["history"]] == [0, 2, 4]
+    again = run("train", "--config", recipe, "--out", out)
+    assert again.returncode == 1 and "a run has finished here" in error_line(again.stderr)
+    done = run("train", "--config", recipe, "--out", tmp_path / "other", "--workers", "2")
+    assert done.returncode == 1 and "--workers" in error_line(done.stderr)

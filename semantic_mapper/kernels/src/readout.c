@@ -21,14 +21,3 @@ KERNEL(read_map_points, ReadPointsArguments) {
     }
     return 0;
 }
-
-typedef struct {
-    F32 evidence; /* (L,) */
-    double votes, vote_discount, unknown_below;
-    F64 confidence; /* (1,) */
-} DecideArguments;
-
-KERNEL(decide_voxel, DecideArguments) {
-    return decide_stored(a->evidence.data, a->evidence.shape[0], a->votes, a->vote_discount,
-                  a->unknown_below, a->confidence.data);
-}

@@ -126,7 +126,7 @@ def test_a_file_of_a_pair_reads_back_to_the_same_numbers(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("settings", "error", "complaint"),
     [
-        ({"device": ""}, CameraError, "no device is named; `semantic-mapper cameras --kind stereo`"),
+        ({"device": ""}, CameraError, "no device is named; `doctor --cameras --kind stereo`"),
         ({"calibration": ""}, CameraError, "has no calibration; make one with `semantic-mapper calibrate --stereo`"),
         ({"calibration": "lens.toml"}, ConfigError, "lens.toml: .*calibrate --stereo` makes the file of a pair"),
         ({"min_depth_m": 0.05}, ConfigError, r"min_depth_m = 0.05 is too near for this pair: .* 0\.\d\d m is possible"),

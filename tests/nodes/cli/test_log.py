@@ -115,7 +115,7 @@ def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
     state = voxel_map.block_state()
     low, high = state["keys"].min(axis=0) * 0.24, (state["keys"].max(axis=0) + 1) * 0.24
     extent = " x ".join(f"{x:.2f}" for x in high - low)
-    for text in ("version 2", "3, the last one at", "3 cm", extent, "72", "three: table, cup, wall"):
+    for text in ("version 3", "3, the last one at", "3 cm", extent, "72", "three: table, cup, wall"):
         assert text in done.stdout
     found = json.loads(run("info", path, "--json").stdout)
     assert (found["frames"], found["last_stamp_ns"], found["blocks"]) == (3, 1002, voxel_map.block_count)

@@ -1,4 +1,4 @@
-"""What ``top`` makes of the statuses of a launch: rates and losses of every kind of node."""
+"""What `view --status` makes of the statuses of a launch: rates and losses of every kind of node."""
 
 from __future__ import annotations
 

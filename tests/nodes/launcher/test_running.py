@@ -34,7 +34,7 @@ def test_a_mapper_without_a_socket_is_not_asked(
     def ask(*_: object) -> None:
         raise AssertionError("asked all the same")
 
-    monkeypatch.setattr(MapClient, "_send", ask)
+    monkeypatch.setattr(MapClient, "_ask_about", ask)
     (tmp_path / "poses.tum").write_text("1.0 0 0 0 0 0 0 1\n")
     places = {"MAP": f"ipc://{tmp_path}/query", "poses.tum": str(tmp_path / "poses.tum")}
     code, said = run_here(*(places.get(word, word) for word in words))
