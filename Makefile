@@ -36,7 +36,7 @@ demo: $(READY)  ## map an embedded scene; results in runs/demo
 test: $(READY)  ## run the quick tests
 	$(PYTEST) -m "not slow"
 
-test-loaded: $(READY)  ## run the quick tests beside two busy processes, then on one thread with a limit on CPU time
+test-loaded: $(READY)  ## run the quick tests next to two busy processes, then on one thread with a limit on CPU time
 	env -u OMP_NUM_THREADS .venv/bin/python -m tools.beside_load 2 $(TESTS) -m "not slow"
 	$(PYTEST) -m "not slow" --cpu-limit 6
 
@@ -75,11 +75,11 @@ wheels: $(READY)  ## build wheels for x86_64 and aarch64 into dist/, and check t
 docs: $(READY)  ## build the reference of the Python interface into dist/docs/
 	.venv/bin/pdoc --docformat google --output-directory dist/docs $(API)
 
-format: $(READY)  ## format and mend what can be mended automatically
+format: $(READY)  ## format and fix what can be fixed automatically
 	.venv/bin/ruff format .
 	.venv/bin/ruff check --fix .
 
-lock: $(READY)  ## write uv.lock anew after a change of dependencies
+lock: $(READY)  ## write uv.lock again after a change of dependencies
 	.tools/bin/uv lock
 
 clean:  ## remove everything that the targets made, except runs/

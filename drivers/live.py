@@ -26,7 +26,7 @@ RETRY_S = 1.0  # between two attempts to find a polled device that has gone
 FUTURE_NS = 100_000_000  # a stamp further ahead of now is wrong
 MIN_HZ = 1e-3  # of a film or camera: one divided by it is still a time
 DRIFT = 2e-4  # how much faster or slower than ours the sender's clock may run
-LATE_NS = 1_000_000_000  # an image is never so much later than the quickest one: then its clock is none
+LATE_NS = 1_000_000_000  # an image is never so much later than the quickest one: then its clock is not usable
 CLOSE_S = 1.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
 
 _log = get_logger(__name__)
@@ -186,8 +186,10 @@ class LiveCamera:
                 self._changed.wait_for(lambda: self._newest is not None or self._stopping.is_set(), WAIT_SLICE_S)
                 newest, self._newest = self._newest, None
             if newest is not None and not self._stopping.is_set():
-                seq, shot = newest
-                yield CameraImage(shot.stamp_ns, seq, self._camera_id, rectify(shot.bgr), None, rectify.intrinsics)
+                seq, picture = newest
+                yield CameraImage(
+                    picture.stamp_ns, seq, self._camera_id, rectify(picture.bgr), None, rectify.intrinsics
+                )
             elif not thread.is_alive() and not self._stopping.is_set():
                 raise CameraError(f"camera '{self._camera_id}': its reading thread has failed; the log says why")
 
@@ -231,13 +233,13 @@ class LiveCamera:
         while not self._stopping.is_set():
             began = time.monotonic()
             try:
-                shot = device.read()
+                picture = device.read()
             except CameraError as error:
                 return str(error)
             now = self._read_at = time.monotonic()
             self._seq += 1
             self._device_warnings = device.warnings
-            if shot is None:
+            if picture is None:
                 failures += 1
                 if failures >= FAILURES or now - began >= self._stall_s:
                     return f"{device.description}: gives no images"
@@ -247,7 +249,7 @@ class LiveCamera:
                 _log.info("camera_back", camera=self._camera_id, device=device.description, seq=self._seq)
             self._failures, self._heard, self._lost = 0, now, ""
             with self._changed:
-                self._newest = (self._seq, shot)
+                self._newest = (self._seq, picture)
                 self._changed.notify()
         return ""
 

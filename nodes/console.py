@@ -40,7 +40,7 @@ LOG_PERIOD_S = 15.0  # how often progress is logged where there is no terminal t
 
 
 class PlainConsole(Console):
-    r"""A console on which every text is plain, wherever it stands: in a line, a cell, a title or beside a bar.
+    r"""A console on which every text is plain, wherever it stands: in a line, a cell, a title or next to a bar.
 
     Names of classes, cameras and files come from logs, maps and weights of others. Markup and emoji codes in them are
     text, and control characters are shown as escapes (``\x1b``), so that no name can end a verb, hide, forge a line or
@@ -129,7 +129,7 @@ class FrameProgress(JobMonitor):
         self._unit = unit
         self._stop = stop
         self._done = 0
-        self._began = self._told = time.monotonic()
+        self._began = self._reported = time.monotonic()
 
     @property
     def stopped_by(self) -> str:
@@ -139,7 +139,7 @@ class FrameProgress(JobMonitor):
     def start(self, total: int | None) -> None:
         """Now it is known how many there are, and work begins."""
         self._total = total
-        self._began = self._told = time.monotonic()
+        self._began = self._reported = time.monotonic()
         self._progress.reset(self._task, total=total, description=self._what)
 
     def advance(self, count: int = 1) -> None:
@@ -147,13 +147,13 @@ class FrameProgress(JobMonitor):
         self.set(self._done + count)
 
     def set(self, done: int, note: str = "") -> None:
-        """This many are done by now; ``note`` replaces the text beside the bar."""
+        """This many are done by now; ``note`` replaces the text next to the bar."""
         self._done = done
         changes: dict[str, Any] = {"note": note} if note else {}
         self._progress.update(self._task, completed=done, **changes)
         now = time.monotonic()
-        if not self._progress.console.is_terminal and now - self._told >= LOG_PERIOD_S:
-            self._told = now
+        if not self._progress.console.is_terminal and now - self._reported >= LOG_PERIOD_S:
+            self._reported = now
             rate = done / max(now - self._began, 1e-9)
             more = {"note": note} if note else {}
             _log.info(self._what, done=done, total=self._total, rate=f"{rate:.2f} {self._unit}/s", **more)

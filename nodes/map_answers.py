@@ -78,15 +78,15 @@ NO_FLOOR = "no floor was found: too little level surface, or another way is up (
 CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned"
 
 
-def answer_instances(up: Sequence[float], instances: Sequence[Instance], told_apart_by: str = "") -> dict[str, Any]:
-    """The things in a map, the surest first, and by which means they were told apart; empty = not known.
+def answer_instances(up: Sequence[float], instances: Sequence[Instance], separated_by: str = "") -> dict[str, Any]:
+    """The things in a map, the surest first, and by which means they were separated; empty = not known.
 
-    Those that have gone are ``gone``, the latest first; the key is left out where there are none.
+    Those that have gone are ``gone``, the latest first; the key is left out while nothing has gone.
     """
     there = sorted((t for t in instances if t.gone_ns is None), key=lambda thing: -thing.rank)
     gone = sorted((t for t in instances if t.gone_ns is not None), key=lambda thing: thing.gone_ns or 0, reverse=True)
     found: dict[str, Any] = {"question": "instances", "up": list(up)}
-    found |= {"told_apart_by": told_apart_by} if told_apart_by else {}
+    found |= {"separated_by": separated_by} if separated_by else {}
     found["instances"] = [_describe_thing(thing) for thing in there]
     found |= {"gone": [{**_describe_thing(t), "gone_ns": t.gone_ns} for t in gone]} if gone else {}
     return found
@@ -157,7 +157,7 @@ def answer_table(found: dict[str, Any], width: int) -> Table:
 
 
 def _instance_table(found: dict[str, Any], width: int) -> Table:
-    by = found.get("told_apart_by")
+    by = found.get("separated_by")
     table = Table(title=f"{found['map']}, things by {by}" if by else found["map"], title_justify="left")
     rows = [
         (

@@ -42,7 +42,7 @@ class NodeContext:
         name: Of the node.
         endpoints: By node name.
         subscribers: How many listen to its frames.
-        stop: True once somebody has asked it to end.
+        stop: True once somebody has requested its end.
         heartbeat: Tells the launcher how far the node is.
         restarts: How often its launcher has restarted it.
         folder: Of the launch's notes and sockets; None where it was started by hand.
@@ -92,7 +92,7 @@ class NodeContext:
         return True
 
     def note(self, what: str) -> str:
-        """What a process of this node has left before; empty where there is none."""
+        """What a process of this node has left before; empty where it is missing."""
         path = None if self.folder is None else self.folder / f"{self.name}.{what}.note"
         return path.read_text(encoding="utf-8") if path is not None and path.exists() else ""
 
@@ -100,7 +100,7 @@ class NodeContext:
 def run_node(
     kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], str | None], job: NodeJob | None = None
 ) -> NoReturn:
-    """Run a node to its end and exit: 0 done (also when asked to stop), 1 failed with one line that says why,
+    """Run a node to its end and exit: 0 done (also on a stop request), 1 failed with one line that says why,
     ``EXIT_LOSS`` done, but a part of what it was to keep is lost, with one line that says what.
 
     In a launch only the launcher's ``STOP_SIGNAL`` asks for an end that is one: after SIGTERM or SIGINT of anybody

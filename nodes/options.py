@@ -58,7 +58,7 @@ class LiveCamera(Config, frozen=True):
     def __post_init__(self) -> None:
         if self.poses in POSE_KINDS and not Path(str(self.poses)).exists():
             raise ValueError(
-                f'poses = "{self.poses}" names a file of settings, and there is none; for poses of that kind write '
+                f'poses = "{self.poses}" names a file of settings that does not exist; for poses of that kind write '
                 f'poses = {{ kind = "{self.poses}" }}'
             )
 
@@ -118,7 +118,7 @@ class MapperOptions(Config, frozen=True):
     history_frames: Count = 0  # kept on disk for closed loops, where the config does not say how many
     eval_exclude: str = ""  # weights whose finetuning frames are left out of the scores, too
     rerun: str = ""  # write a Rerun recording there; empty = none
-    # Also write the map of the moment to ``map.npz`` in ``out`` every n seconds, beside mapping: what a killed
+    # Also write the map of the moment to ``map.npz`` in ``out`` every n seconds, while mapping goes on: what a killed
     # process leaves. It costs one frame the time to copy what it touches (some 20 ms), and the next ones up to half of
     # a core while it is written. 0 = only at the end.
     save_every_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
@@ -133,7 +133,7 @@ class MapperOptions(Config, frozen=True):
     # most of it are more often wrong than the map is. 0 = the finetuner's own judgement is enough.
     min_map_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.4
 
-    # A fixed endpoint beside that of the launch at which its updates and status can be subscribed to: ipc://PATH,
+    # A fixed endpoint in addition to that of the launch at which its updates and status can be subscribed to: ipc://PATH,
     # tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
     publish: Annotated[str, msgspec.Meta(pattern=ENDPOINT_PATTERN)] = ""
 
@@ -188,7 +188,7 @@ class RecorderOptions(Config, frozen=True):
 
 
 class FinetunerOptions(Config, frozen=True):
-    """Finetunes the weights of a mapper on labelled keyframes, beside it and within a budget."""
+    """Finetunes the weights of a mapper on labelled keyframes, next to it and within a budget."""
 
     mapper: str = "mapper"  # the node that uses the weights; its `learner` is this one
     weights: str = ""  # those that the mapper was started with, the very same file; empty = those of the package

@@ -1,4 +1,4 @@
-"""What every process of ours does first: thread counts, logging, and how it is asked to stop.
+"""What every process of ours does first: thread counts, logging, and how it is requested to stop.
 
 Imports nothing heavy: thread counts must be in the environment before torch or Open3D are loaded.
 """
@@ -92,7 +92,7 @@ class StopRequest:
 
     @property
     def name(self) -> str:
-        """Who asked: SIGINT, SIGTERM, the launcher, or empty."""
+        """Who requested the stop: SIGINT, SIGTERM, the launcher, or empty."""
         if self.signum == STOP_SIGNAL:
             return "the launcher"
         return signal.Signals(self.signum).name if self.signum else ""

@@ -75,7 +75,7 @@ def sweep() -> None:
 
 @contextmanager
 def _lock_of(folder: Path) -> Iterator[FileLock | None]:
-    """Hold its lock; None where there is none, or another process holds it."""
+    """Hold its lock; None where the lock is missing, or another process holds it."""
     lock = FileLock(folder / _LOCK)
     try:
         if not (folder / _LOCK).exists():

@@ -35,6 +35,6 @@ def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0
     try:
         parts = encode(status)
     except CodecError as error:
-        _log.error("status_not_told", reason=str(error))
+        _log.error("status_not_reported", reason=str(error))
         return
     publisher.publish(parts, timeout_s)

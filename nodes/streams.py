@@ -29,7 +29,7 @@ class Streams:
 
     @property
     def label_set(self) -> LabelSet | None:
-        """Of the label images of all streams; None where there are none."""
+        """Of the label images of all streams; None where label images are missing."""
         return next((info.label_set for info in self._infos.values()), None)
 
     @property

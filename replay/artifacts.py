@@ -113,7 +113,7 @@ def finish_session(
 
 
 def clear_results(out: Path) -> None:
-    """Take away what an earlier run left beside its map: beside the next one, it would be of another map."""
+    """Remove what an earlier run left next to its map: next to a new map, it would be of another one."""
     for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html"):
         (out / name).unlink(missing_ok=True)
 

@@ -18,7 +18,7 @@ class AutolabelNote(msgspec.Struct, frozen=True):
     Args:
         weights, digest, kind: Name of the weights file, its SHA-256, and the kind of its field.
         classes: Of the weights.
-        min_confidence, overwrite_labels, depth, max_frames: What was asked for.
+        min_confidence, overwrite_labels, depth, max_frames: What was requested.
         frames: Looked at.
         labelled: With a pseudo label.
         kept: With a label that was there and is no pseudo label.

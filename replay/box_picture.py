@@ -44,7 +44,7 @@ DEPTH_FRAMES = 16  # that the view from above shows surface of
 NEAR_M = 0.05  # edges are cut off nearer than this
 MARGIN, GAP, HEADER, CAPTION = 24, 14, 84, 26
 TILE_WIDTH, PLAN_HEIGHT, LEGEND_WIDTH = 512, 760, 200
-BESIDE_M = 25.0  # the view from above ends this far from the camera's path
+SIDE_M = 25.0  # the view from above ends this far from the camera's path
 ID_PX = (24.0, 13.0)  # around the middle of an id, without another
 POINTS_WIDTH = 160  # of the depth images that the view from above is made of
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]  # of ``Primitive.corners``
@@ -195,8 +195,8 @@ def _put_plan(
     moments = [(box, pose) for box in boxes for pose in _poses(box)]
     prints = [_footprint(replace(box, T_world_box=pose).corners() @ R.T) for box, pose in moments]
     every = np.concatenate([level[:, :2], path[:, :2], *prints])
-    low = np.maximum(every.min(axis=0), path[:, :2].min(axis=0) - BESIDE_M)
-    high = np.minimum(every.max(axis=0), path[:, :2].max(axis=0) + BESIDE_M)
+    low = np.maximum(every.min(axis=0), path[:, :2].min(axis=0) - SIDE_M)
+    high = np.minimum(every.max(axis=0), path[:, :2].max(axis=0) + SIDE_M)
     _, _, w, h = place_at
     scale = 0.94 * min(w / max(high[0] - low[0], 1e-3), h / max(high[1] - low[1], 1e-3))
 

@@ -36,7 +36,7 @@ from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.types import Float64
 
 MAX_FILE_BYTES = 1 << 28  # 50,000 boxes of KITTI-360 take 0.1 GB
-MAX_ID = 65535  # what an instance image of 16 bits holds; 0 is none
+MAX_ID = 65535  # what an instance image of 16 bits holds; 0 is background
 MIN_SIZE_M = 0.001
 QUERY_MARGIN_M = 0.05  # boxes of `query` end in the middle of surface voxels; this far beyond is theirs, too
 MAX_NAMED = 10  # boxes that cannot be used, in an error
@@ -232,7 +232,7 @@ def _box_of(box: Primitive) -> Primitive:
 
     Raises:
         ConfigError: it is thin, open, or crosses itself, or its id cannot be one.
-        PoseError: a pose is none.
+        PoseError: a pose is invalid.
     """
     if not 1 <= box.id <= MAX_ID:
         raise ConfigError(f"id must be a whole number from 1 to {MAX_ID}, got {box.id}")

@@ -51,7 +51,7 @@ def read_corrections(path: Path) -> Trajectory:
     """
     found = read_trajectory(path)
     if found.left_out:  # a recording can do without a frame; who corrects poses wants all of them
-        raise ImportSourceError(f"{found.left_out[0]} ({len(found.left_out)} lines); mend or remove them")
+        raise ImportSourceError(f"{found.left_out[0]} ({len(found.left_out)} lines); fix or remove them")
     return Trajectory(path, found.stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in found.rows]))
 
 
@@ -106,7 +106,7 @@ def correct_session(session: MapSession, trajectory: Trajectory) -> int:
         )
     if len(poses) < given:
         _log.warning("corrections_without_a_frame", left_out=given - len(poses), used=len(poses), frozen=frozen)
-    poses = session.worlds.in_map(poses, session.pipeline.corrector.worlds())
+    poses = session.odometry_sessions.in_map(poses, session.pipeline.corrector.world_by_frame())
     session.pipeline.correct_poses(poses, until_ns=ALWAYS)  # the whole log was recorded in the old world
     while session.pipeline.advance_correction(_PORTION):
         pass

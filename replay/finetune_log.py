@@ -262,7 +262,7 @@ def _go_on(monitor: JobMonitor, done: int, note: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FrameSource:
-    """The frames of a log as a request has them: labels of the folder before the log's, with the depth asked for."""
+    """The frames of a log as a request has them: labels of the folder before the log's, with the requested depth."""
 
     log: Log
     folder: LabelFolder | None

@@ -97,13 +97,13 @@ def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> NDArray[np.
     channel = field.label_set.to_channels(label, f"frame seq={frame.seq}").ravel()
     names = field.label_set.names
     boxed = [names.index(b.class_name) for b in field.shape.boxes if b.thing]
-    asked = torch.from_numpy(np.flatnonzero(np.isin(channel, boxed)))
+    requested = torch.from_numpy(np.flatnonzero(np.isin(channel, boxed)))
     k, found = frame.intrinsics, np.zeros(label.size, np.uint16)
     depth = np.zeros(label.size, np.float32) if frame.depth_m is None else frame.depth_m.ravel()
     pose = torch.from_numpy(frame.T_world_camera).float()
     pixels, near_m = pixel_grid(k.width, k.height), field.sampling.near_m
     with torch.no_grad():
-        for part in asked.split(RAYS):
+        for part in requested.split(RAYS):
             prior = torch.from_numpy(depth[part.numpy()])
             at = {"near_m": near_m, "far_m": field.sampling.far_m, "stamp_ns": frame.stamp_ns}
             rays = pixel_rays(pixels[part], k, pose, **at, prior_depth_m=prior)

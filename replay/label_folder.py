@@ -1,6 +1,6 @@
 """Label images of a log's frames in a folder: ``NNNNNN.png`` (uint8 class ids), each named by the number of its frame.
 
-``labels.json`` beside them holds the classes, as in a sequence folder, and may name the log. A folder without it is in
+``labels.json`` next to them holds the classes, as in a sequence folder, and may name the log. A folder without it is in
 the classes of the log. Pixels of the ignore id are not labelled: strokes are a label image, too.
 """
 
@@ -98,7 +98,7 @@ class LabelFolder:
             size: (height, width) of the frame.
 
         Raises:
-            LogError: there is none, or it is damaged, of another size, or names other classes.
+            LogError: it is missing or damaged, of another size, or names other classes.
         """
         file = self._files().get(number)
         if file is None:
@@ -136,7 +136,7 @@ def open_label_folder(path: Path, log: Log) -> LabelFolder:
 
     Raises:
         LabelError: nobody knows what they mean.
-        LogError: there are none, or they are of another log, or of frames that it does not have.
+        LogError: they are missing, or of another log, or of frames that it does not have.
         ImportSourceError: an invalid labels.json.
     """
     label_set = log.info.label_set
@@ -165,7 +165,7 @@ def make_label_folder(path: Path, log: Log, label_set: LabelSet) -> LabelFolder:
     Raises:
         LogError: it holds labels of another log, or cannot be made.
         LabelError: it holds labels of other classes.
-        ImportSourceError: its labels.json is none.
+        ImportSourceError: its labels.json is invalid.
     """
     if (path / LABELS_FILE).exists():
         _check_log(path, log)

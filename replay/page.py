@@ -48,7 +48,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """One of several things beside each other.
+    """One of several things next to each other.
 
     Args:
         title: Its name.
@@ -72,7 +72,7 @@ class Section:
         notes: Paragraphs that the reader must not miss.
         view: What ``point_view`` returns; at most once a page.
         pictures, tables: The tables are those that the console shows; cells may be ``linked`` texts.
-        cards: Beside each other.
+        cards: Next to each other.
         lines: Paragraphs.
         folded: Texts that a click unfolds, by their heads.
     """

@@ -46,7 +46,7 @@ def relocalize_frames(
         "found": sum(map(len, seen.values())),
         "refused": dict(Counter(row["reason"] for row in rows if "reason" in row).most_common()),
         "unreadable": unreadable,
-        "worlds": [_describe_world(world, sightings) for world, sightings in seen.items()],
+        "sessions": [_describe_world(world, sightings) for world, sightings in seen.items()],
         "looks": rows,
     }
 

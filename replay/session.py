@@ -21,7 +21,7 @@ from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.worlds import MapWorlds, Taken
+from semantic_mapper.mapping.odometry_sessions import OdometrySessions, Taken
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.stats import BoundedLog, LatencyHistogram
 from semantic_mapper.types import MapUpdate, PosedFrame
@@ -53,11 +53,11 @@ class MapSession:
     Args:
         bundle: From ``Mapper.load``.
         stream_labels: Label set of the frames' label images; None where they have none.
-        exclude_stamps: Frames to leave out of the scores, beside those that the weights were finetuned on.
+        exclude_stamps: Frames to leave out of the scores, in addition to those that the weights were finetuned on.
         source: Name of the log or stream, for the summary.
         scale_known: Whether its lengths are metres.
         rerun: Gets every frame, what was rendered for it, and the map at the end; see ``open_recording``.
-        own_first: See ``MapWorlds``; False where the map was there before the stream.
+        own_first: See ``OdometrySessions``; False where the map was there before the stream.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class MapSession:
         self.pipeline = bundle.pipeline
         self.pipeline.voxel_map.note_scale(scale_known)
         self.source = source
-        self.worlds = MapWorlds(
+        self.odometry_sessions = OdometrySessions(
             self.pipeline.voxel_map,
             self.pipeline.classify,
             own_first=own_first,
-            whereabouts=self.pipeline.whereabouts,
+            pose_in_map=self.pipeline.pose_in_map,
             motion=self.pipeline.corrector.motion,
             correcting=lambda: self.pipeline.corrector.status.running,
         )
@@ -119,13 +119,13 @@ class MapSession:
 
     def process(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
         """Take one frame and map what is ready: the frame itself, unless its depth waits for later ones, or its world
-        has to be found in the map first (``worlds``).
+        has to be found in the map first (``odometry_sessions``).
 
         Returns:
             What became of each: the update, or why it was refused (counted and logged, the map unchanged).
         """
         self.published += 1
-        taken = self.worlds.take(frame)
+        taken = self.odometry_sessions.take(frame)
         return [*self._give_up(taken), *(done for item in taken.ready for done in self._prepare(item))]
 
     def _give_up(self, taken: Taken) -> list[MapUpdate | Refusal]:
@@ -142,7 +142,7 @@ class MapSession:
 
     def process_rest(self) -> list[MapUpdate | Refusal]:
         """Map the frames that still wait for later ones, which do not come any more."""
-        left = self._give_up(self.worlds.take_rest())
+        left = self._give_up(self.odometry_sessions.take_rest())
         return [*left, *(self._map(item, 0.0) for item in self.pipeline.prepare_rest())]
 
     def _refuse(self, frame: PosedFrame, error: FrameError) -> Refusal:
@@ -168,7 +168,7 @@ class MapSession:
         self._keep_snapshot(self._score(frame, update), update)
         if self.rerun is not None:
             self.rerun.log_step(frame, update)
-        return replace(update, world=frame.world, T_map_world=self.worlds.where(frame.world))
+        return replace(update, world=frame.world, T_map_world=self.odometry_sessions.where(frame.world))
 
     def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
         """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""
@@ -192,7 +192,7 @@ class MapSession:
             self.too_little_motion += not frame.depth_m.any()
 
     def _note_scene(self, update: MapUpdate) -> None:
-        """How much of a frame weights of one scene know: weights of another scene cannot be told otherwise."""
+        """How much of a frame weights of one scene know: weights of another scene cannot be recognised otherwise."""
         known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
         self._known.append(known)
         self.outside += known < MOSTLY
@@ -242,15 +242,15 @@ class MapSession:
         self.dropped += count
 
     def more_summary(self) -> dict[str, Any]:
-        """What the summary says of some sessions only: of weights of one scene, of worlds found in the map."""
+        """What only some summaries say: of weights of one scene, of odometry sessions found in the map."""
         return {**self._scene_summary(), **self._world_summary()}
 
     def _world_summary(self) -> dict[str, Any]:
-        """Of worlds that had to be found in the map."""
-        worlds = self.worlds
-        if not (worlds.found or worlds.refused):
+        """Of odometry sessions that had to be found in the map."""
+        sessions = self.odometry_sessions
+        if not (sessions.found or sessions.refused):
             return {}
-        return {"relocalization": {"worlds_found": worlds.found, "looks_refused": dict(worlds.refused)}}
+        return {"relocalization": {"sessions_found": sessions.found, "looks_refused": dict(sessions.refused)}}
 
     def _score(self, frame: PosedFrame, update: MapUpdate) -> PosedFrame:
         """Score a frame against its label; returns it without a label that is no truth, or cannot be read."""

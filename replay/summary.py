@@ -11,7 +11,7 @@ from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import read_regular
-from semantic_mapper.mapping.map_scale import MEND, voxel_size_text
+from semantic_mapper.mapping.map_scale import FIX, voxel_size_text
 from semantic_mapper.plain_text import counted
 
 SUMMARY_FILE = "summary.json"
@@ -22,7 +22,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """The summary in a result folder.
 
     Raises:
-        ConfigError: there is none, or it is damaged.
+        ConfigError: it is missing or damaged.
     """
     path = folder / SUMMARY_FILE
     try:
@@ -114,7 +114,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             "the beginning of a walk"
         )
     if summary.get("scale") == "unknown":
-        lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {MEND}")
+        lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {FIX}")
     if frames.get("left_out"):
         lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
     if frames.get("excluded_from_scores"):

@@ -56,7 +56,7 @@ class ReplayedMap:
         return MapMirror.of(self.voxel_map).snapshot()
 
     def class_at(self, point: ArrayLike, radius_m: float | None = None) -> str | None:
-        """Name of the class of the surface at a point; None where there is none, or nobody knows what it is.
+        """Name of the class of the surface at a point; None where there is no surface, or nobody knows what it is.
 
         Raises:
             MapError: not a point, or a radius beyond what ``queries.nearest.at`` takes.

@@ -64,7 +64,7 @@ class EncoderConfig(Config, frozen=True):
     # "efficientnet-lite0": a network that may start from ImageNet weights, between a small stem and a decoder;
     # ``channels`` and ``blocks`` are the decoder's then
     backbone: Literal["residual", "efficientnet-lite0"] = "residual"
-    depth: bool = False  # whether it sees measured depth (as ``fields.surface`` puts it) beside colours
+    depth: bool = False  # whether it sees measured depth (as ``fields.surface`` puts it) next to colours
     # Whether it has learned from depth that was computed from pictures, too (``pool.computed_depth`` of a training).
     # An encoder that has not is shown none: it would be misled.
     computed_depth: bool = False
@@ -118,7 +118,7 @@ class IRTConfig(GridFieldConfig, frozen=True):
     features: Annotated[int, msgspec.Meta(ge=1, le=64)] = 16
     trunk_width: Channels = 64
     # B: each point by itself. RT: the points of a ray attend to each other. RTT: with a token of the image's texture.
-    # BC, RTC: texture beside the composited points. RTTC: token and texture
+    # BC, RTC: texture next to the composited points. RTTC: token and texture
     variant: IRTVariant = "BC"
     # Labelled frames whose labels are carried over to where their surface is seen again, and the size of their images;
     # 0 = labels only teach
@@ -649,7 +649,7 @@ def _members(part: Any) -> list[Any]:
 
 
 def _keys_at(path: str, kind: type[msgspec.Struct]) -> set[str]:
-    """Keys of the section at a place; of all sections where there is none."""
+    """Keys of the section at a place; of all sections where no section is there."""
     sections = [part for part in _types_at(path, kind) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
     return {item.name for part in sections for item in msgspec.structs.fields(part)} or _all_keys(kind)
 

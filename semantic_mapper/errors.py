@@ -1,4 +1,4 @@
-"""The one error tree. Every message says what is wrong, where, and how to mend it."""
+"""The one error tree. Every message says what is wrong, where, and how to fix it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class WeightsError(SemanticMapperError):
 
 
 class MapError(SemanticMapperError):
-    """The voxel map, or a saved one, cannot be used as asked."""
+    """The voxel map, or a saved one, cannot be used as requested."""
 
 
 class DependencyError(SemanticMapperError, ImportError):
@@ -56,7 +56,7 @@ class DependencyError(SemanticMapperError, ImportError):
 
 
 class CameraError(SemanticMapperError, OSError):
-    """A camera, or what tells its pose, is not there, cannot be opened, or does not do what is asked of it."""
+    """A camera, or what tells its pose, is not there, cannot be opened, or does not do what is requested of it."""
 
 
 class NodeError(SemanticMapperError, RuntimeError):

@@ -1,6 +1,6 @@
 """Files that people name: read with a limit, and written so that each is there whole, or as it was before.
 
-What is written goes to a new file beside the one that it becomes, under a name that nobody can foresee, and takes its
+What is written goes to a new file next to the one that it becomes, under a name that nobody can foresee, and takes its
 place in one step (``rename``): an existing link is replaced, never written through. The new file is locked while it is
 written, so that what a killed process has left can be distinguished from what another one is about to finish.
 """
@@ -191,7 +191,7 @@ def _cut(name: str) -> str:
 
 
 def _new_part(path: Path) -> tuple[Path, int]:
-    """A new file beside ``path``, and its lock."""
+    """A new file next to ``path``, and its lock."""
     while True:
         part = path.with_name(f".{_cut(path.name)}.{secrets.token_hex(6)}.part")
         lock = open_unlinked(part, os.O_RDWR | os.O_CREAT | os.O_EXCL)

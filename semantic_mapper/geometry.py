@@ -213,7 +213,7 @@ def nearest_pixels(
 
 
 def unproject(depth_m: Float32, intrinsics: CameraIntrinsics) -> Float64:
-    """Lift a depth image (H, W) to camera points (H, W, 3) in metres; z = 0 where there is no depth.
+    """Unproject a depth image (H, W) to camera points (H, W, 3) in metres; z = 0 where there is no depth.
 
     Raises:
         ShapeError: the depth image is not of the camera's size.

@@ -1,4 +1,4 @@
-"""Resizing of frames to a working size: colours by area, depth by nearest pixel, holes filled where asked."""
+"""Resizing of frames to a working size: colours by area, depth by nearest pixel, holes filled where requested."""
 
 from __future__ import annotations
 

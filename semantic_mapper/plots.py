@@ -206,7 +206,7 @@ class Bar:
 
 @rendered
 def draw_panels(title: str, panels: Sequence[Panel], columns: int = 3, size: tuple[int, int] = (500, 360)) -> Figure:
-    """Panels of one size (width, height) beside and below each other.
+    """Panels of one size (width, height) next to and below each other.
 
     Panels whose curves have the same names share one legend.
     """
@@ -310,7 +310,7 @@ class Histogram:
 
 @rendered
 def draw_histograms(histograms: Sequence[Histogram], columns: int = 3, size: tuple[int, int] = (400, 280)) -> Figure:
-    """Histograms beside and below each other, each with its median as a line."""
+    """Histograms next to and below each other, each with its median as a line."""
     from matplotlib.ticker import MaxNLocator
 
     columns = min(columns, len(histograms))
@@ -360,8 +360,8 @@ def draw_boxes(title: str, boxes: Sequence[PercentileBox], x_label: str) -> Figu
     axes.vlines(middle, places - 0.3, places + 0.3, color=medians, linewidth=2.5, zorder=3)
     for place, box in enumerate(boxes):
         text = f"{_figure(box.percentiles[2])}  n = {box.count}"
-        beside = axes.get_yaxis_transform()  # to the right of the axes, where no grid line crosses it
-        axes.text(1.01, place, text, va="center", fontsize=SMALL_PT, color=_hex(DIM_TEXT), transform=beside)
+        right_of_axes = axes.get_yaxis_transform()  # to the right of the axes, where no grid line crosses it
+        axes.text(1.01, place, text, va="center", fontsize=SMALL_PT, color=_hex(DIM_TEXT), transform=right_of_axes)
     axes.set_yticks(places, [cut(box.name, 260, TEXT_PT) for box in boxes], fontsize=TEXT_PT, color=_hex(TEXT))
     axes.set(xlabel=x_label, ylim=(len(boxes) - 0.4, -0.6))
     axes.set_xlim(float(low.min()) - 0.03 * reach, float(high.max()) + 0.03 * reach)
@@ -376,7 +376,7 @@ def draw_paths(title: str, paths: Mapping[str, Float64], up: Float64) -> Figure:
 
     Args:
         title: Above the picture.
-        paths: Positions (N, 3) in metres by name, all in one world; rows of NaN are gaps.
+        paths: Positions (N, 3) in metres by name, all in one world; rows of NaN are interruptions.
         up: (3,) in that world.
     """
     figure = new_figure(900, 760, layout="constrained")

@@ -2,7 +2,7 @@
 
 ``without_secrets`` is applied wherever text leaves the program for people or files: errors, log events, tables, JSON,
 reports. It knows malformed addresses, too: ``Path`` takes a slash of ``s3://KEY:SECRET@bucket`` away, and people forget
-one. What it cannot judge it hides: a user name, rather than a place, in doubt.
+one. What it cannot judge it hides: a user name, rather than a place, when uncertain.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ class PosedFrame:
 
     Args:
         stamp_ns: Capture time, int64 nanoseconds on the robot's monotonic clock, 0 to ``MAX_STAMP_NS``.
-        seq: Counter of the source, from 0 to 2^63 - 1; gaps mean lost frames.
+        seq: Counter of the source, from 0 to 2^63 - 1; missing numbers mean lost frames.
         camera_id: Name of the camera.
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) float32 z-depth in metres, None without a depth sensor; what is not from ``MIN_DEPTH_M`` to

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.log.gaps import find_gaps, gaps_text
+from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
 
 
 def test_one_thing_is_singular() -> None:
@@ -10,5 +10,5 @@ def test_one_thing_is_singular() -> None:
 
 
 def test_one_gap_of_a_log_is_singular() -> None:
-    text = gaps_text(find_gaps([0, 1, 2, 3, 5], [0, 1_000, 2_000, 3_000, 9_000]))
+    text = missing_frames_text(find_missing_frames([0, 1, 2, 3, 5], [0, 1_000, 2_000, 3_000, 9_000]))
     assert "1 frame missing in 1 gap of" in text and "1 time gap (" in text

@@ -139,7 +139,7 @@ def unpack(soname: str, package: str, scratch: Path) -> str:
 
 
 def fail(reason: str, soname: str) -> int:
-    """Say what is missing and what would mend it."""
+    """Say what is missing and what would fix it."""
     packages = " or ".join(PACKAGES.get(soname, ("the package that holds it",)))
     print(
         f"setup: Open3D needs {soname}, which this machine lacks: {reason}\n"

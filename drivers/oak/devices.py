@@ -69,7 +69,7 @@ def find_device(address: str, search_s: float) -> Any:
         DepthAI's ``DeviceInfo``.
 
     Raises:
-        CameraError: there is none, several where one should be, or another process has it; and how to fix it.
+        CameraError: there is no device, several where one should be, or another process has it; and how to fix it.
     """
     deadline = time.monotonic() + search_s
     while True:

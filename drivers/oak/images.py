@@ -1,4 +1,4 @@
-"""From messages of the device to images: colours, metres, stamps on this machine's clock, numbers with gaps.
+"""From messages of the device to images: colours, metres, stamps on this machine's clock, numbers that show losses.
 
 The same code serves the camera and the tests, which replay messages on the host.
 """
@@ -197,7 +197,7 @@ class ImageMaker:
         )
 
     def _number(self, counted: int, stamp_ns: int) -> int:
-        """Number of the image that the device counts as ``counted``: from 0, with gaps where images were lost."""
+        """Number of the image that the device counts as ``counted``: from 0, with jumps where images were lost."""
         if self._last is None:
             number = 0
         else:

@@ -94,7 +94,7 @@ class Odometry:
             return self._track.newest_ns >= stamp_ns
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
-        """Pose of the colour camera at a moment between two poses; None where there are none round it."""
+        """Pose of the colour camera at a moment between two poses; None outside of the known poses."""
         with self._lock:
             found = self._track.at(stamp_ns)
         if isinstance(found, str):

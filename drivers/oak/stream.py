@@ -120,7 +120,7 @@ class Stream:
         return self._first
 
     def read(self, timeout_s: float) -> tuple[Any, Any | None] | None:
-        """The next colour message and its depth; None where there is none within the time.
+        """The next colour message and its depth; None where it does not come within the time.
 
         Raises:
             StreamEnded: the device has gone, or has given nothing for ``STALL_S`` (``START_S`` before the first).
@@ -167,7 +167,7 @@ def synced_queue(pipeline: Any, outputs: Mapping[str, Any], within_s: float, siz
 
 
 def take(queue: Any, timeout_s: float) -> Any | None:
-    """The next message of a queue; None where there is none within the time.
+    """The next message of a queue; None where it does not come within the time.
 
     Raises:
         StreamEnded: the pipeline has ended.

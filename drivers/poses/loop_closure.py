@@ -60,7 +60,7 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """Align keyframe ``b`` to ``a`` from a guess, or by their features where there is none."""
+    """Align keyframe ``b`` to ``a`` from a guess, or by their features where the guess is missing."""
 
     a: int
     b: int

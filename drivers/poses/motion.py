@@ -60,7 +60,7 @@ class PoseTrack:
         self._samples.clear()
 
     def at(self, stamp_ns: int) -> StampedPose | Miss:
-        """The pose at a moment, or why there is none.
+        """The pose at a moment, or why it is missing.
 
         Returns:
             "empty": no samples; "before": earlier than the first one that is kept; "gap": between two that are too far

@@ -126,8 +126,8 @@ class OdometryPoseSource(PoseSource):
         config: How.
 
     Attributes:
-        counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made; "new_worlds"
-            after the first; with ``loop_closure`` "loops_closed" and "loops_refused".
+        counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made;
+            "new_sessions" after the first; with ``loop_closure`` "loops_closed" and "loops_refused".
     """
 
     def __init__(self, config: OdometryPoses) -> None:
@@ -446,8 +446,8 @@ class OdometryPoseSource(PoseSource):
         lost_ns = 0 if self._lost_ns is None else view.stamp_ns - self._lost_ns
         if not can_be_found(self._config) or (self._images >= _YOUNG and lost_ns < _LOST_NS):
             return self._lose(view, reason)
-        self._counters["new_worlds"] += 1
-        if is_power_of_two(self._counters["new_worlds"]):
+        self._counters["new_sessions"] += 1
+        if is_power_of_two(self._counters["new_sessions"]):
             _log.warning("odometry_begins_new_world", reason=reason, images=self._images, keyframes=len(self._map))
         if self._images >= _YOUNG:  # the map is of the world before: it would take no corrections of this one
             self._corrected = self._trail.correction(self._map.poses, final=True) or self._corrected

@@ -64,7 +64,7 @@ class PosedCamera:
         begins_world: bool = False,
     ) -> None:
         self._world = time.monotonic_ns() if begins_world else 0
-        self._worlds: dict[str, int] = {}  # of each camera's last pose
+        self._world_by_camera: dict[str, int] = {}  # of each camera's last pose
         self._camera = camera
         self._scale_known = scale_known
         self._poses = poses
@@ -145,8 +145,8 @@ class PosedCamera:
             self._follow_correction()
             if estimate is None:
                 continue
-            if self._worlds.setdefault(camera_id, estimate.world) != estimate.world:
-                self._worlds[camera_id] = estimate.world
+            if self._world_by_camera.setdefault(camera_id, estimate.world) != estimate.world:
+                self._world_by_camera[camera_id] = estimate.world
                 if (old := self._filters.pop(camera_id, None)) is not None:
                     yield from self._passed(old.abandon(), camera_id)
             if camera_id not in self._filters:
@@ -246,9 +246,9 @@ class PoseOutlierFilter:
 
     First frames stand in chains, in each of which a pose can be reached from the one before. A chain is believed when
     it is ahead of every other by ``init_consensus``: a wrong first pose loses against what follows it, and of two
-    worlds that take turns none is believed. From there, what is within reach grows with the time since the last pose
-    that passed. A source that has jumped far and continues from there must not pass because of that; one that jumps
-    back may.
+    odometry sessions that take turns none is believed. From there, what is within reach grows with the time since
+    the last pose that passed. A source that has jumped far and continues from there must not pass because of that; one
+    that jumps back may.
 
     Args:
         checks: The limits.

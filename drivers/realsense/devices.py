@@ -71,7 +71,7 @@ def find_device(serial: str, search_s: float) -> Any:
         The SDK's ``device``.
 
     Raises:
-        CameraError: there is none, or several where one should be; and how to fix it.
+        CameraError: there is no device, or several where one should be; and how to fix it.
     """
     rs = load_realsense()
     deadline = time.monotonic() + search_s

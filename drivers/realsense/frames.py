@@ -90,7 +90,7 @@ class Stream:
             raise
 
     def read(self, timeout_s: float) -> FrameSet | None:
-        """The next frames of one moment; None where there are none within the time.
+        """The next frames of one moment; None where they do not come within the time.
 
         Raises:
             StreamEnded: the device has gone, or has given nothing for ``STALL_S`` (``START_S`` before the first).
@@ -267,7 +267,7 @@ class ImageMaker:
         return sent_ns - time.time_ns() + time.monotonic_ns()
 
     def _number(self, counted: int) -> int:
-        """From 0, with gaps where images were lost."""
+        """From 0, with jumps where images were lost."""
         last = -1 if self._last is None else self._last[0]
         if self._shift is None or counted + self._shift <= last:
             self._shift = last + (1 if self._last is None else 2) - counted  # a gap shows that it was away

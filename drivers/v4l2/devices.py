@@ -15,7 +15,7 @@ LINKS = (Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path"))  # by model and seria
 
 
 def stable_path(device: Path) -> Path:
-    """The link that udev keeps for a device, by-id where there is one; the device's own path where there is none."""
+    """The link that udev keeps for a device, by-id where there is one; else the device's own path."""
     if any(device.parent == folder for folder in LINKS):
         return device
     for folder in LINKS:

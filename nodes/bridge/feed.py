@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, MapError, NodeError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_scale import MEND
+from semantic_mapper.mapping.map_scale import FIX
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
 from semantic_mapper.nodes.map_poses import MapPoses
@@ -52,7 +52,7 @@ _log = structlog.get_logger(__name__)
 class Outlet(Protocol):
     """The other tool's side. Frames and status come from one thread, map and graph from another."""
 
-    def asked(self, subject: Subject) -> int:
+    def requests(self, subject: Subject) -> int:
         """How many have begun to receive this so far, or 0 where nobody receives it now."""
         ...
 
@@ -109,7 +109,7 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
         client = stack.enter_context(MapClient(query, attempts=1, identity=identity))
         follower = stack.enter_context(_MapFollower(client, outlet, options))
         messages = stack.enter_context(NewestSubscriber(endpoints, ("frame", "map", "status", "end")))
-        told = _Told(context.name, publisher, messages, follower)
+        report = _StatusReport(context.name, publisher, messages, follower)
         streams, poses = Streams(len(options.cameras)), MapPoses()
         context.heartbeat.ready()
         while not context.stop and not streams.ended:
@@ -121,11 +121,11 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
                     _hand_on(parts, outlet, follower, streams, poses)
                 except CodecError as error:  # of what its sender itself could not read
                     _log.warning("message_left_out", reason=str(error))
-            if told.due:
-                outlet.send_status(told.tell("running"))
+            if report.due:
+                outlet.send_status(report.tell("running"))
         messages.close()  # a camera that has ended waits for its listeners to leave
         context.heartbeat.ending()
-        outlet.send_status(told.tell("ended"))
+        outlet.send_status(report.tell("ended"))
 
 
 def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams: Streams, poses: MapPoses) -> None:
@@ -156,7 +156,7 @@ def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams
             pass
 
 
-class _Told:
+class _StatusReport:
     """Publishes how the bridge is, about once a second."""
 
     def __init__(self, node: str, publisher: Publisher, messages: NewestSubscriber, follower: _MapFollower) -> None:
@@ -241,23 +241,23 @@ class _MapFollower:
                 self.trouble, pause_s = str(error), 0.0
 
     def _look(self) -> None:
-        asked = {subject: self._outlet.asked(subject) for subject in self.sent}
+        requests = {subject: self._outlet.requests(subject) for subject in self.sent}
         if self._labels is None and not self._ended.is_set():
             self._use_labels(self._client.info().label_set)
-        if not asked["graph"]:
+        if not requests["graph"]:
             self.no_graph = ""
-        if not any(asked.values()):
+        if not any(requests.values()):
             return
         mirror = self._client.mirror()
         snapshot = mirror.snapshot()
         self._use_labels(snapshot.label_set)
-        if self._is_new("map", asked["map"], snapshot):
+        if self._is_new("map", requests["map"], snapshot):
             points = surface_points(snapshot, surface_voxels(snapshot))
             self._outlet.send_map(thinned(points), describe_map(snapshot, len(points.xyz), self.stamp_ns))
             self.sent["map"] += 1
-        if asked["graph"] and not snapshot.scale_known:
-            self.no_graph = f"no graph: lengths of the map are not metres: {MEND}"
-        elif self._is_new("graph", asked["graph"], snapshot):
+        if requests["graph"] and not snapshot.scale_known:
+            self.no_graph = f"no graph: lengths of the map are not metres: {FIX}"
+        elif self._is_new("graph", requests["graph"], snapshot):
             if self._graphs is None or self._graphs[0] is not mirror:  # of a mapper that was restarted
                 self._graphs = mirror, GraphTracker()
             self._send_graph(self._graphs[1], snapshot)
@@ -277,10 +277,10 @@ class _MapFollower:
             self._labels = label_set
             self._outlet.send_labels(label_set)
 
-    def _is_new(self, subject: Subject, asked: int, snapshot: MapSnapshot) -> bool:
+    def _is_new(self, subject: Subject, requests: int, snapshot: MapSnapshot) -> bool:
         """Whether somebody receives it who is new, or the map is another one than was shown last; shown it is then."""
         before = self._shown.get(subject)
-        if not asked or (before is not None and before[0] == asked and np.array_equal(before[1], snapshot.serials)):
+        if not requests or (before and before[0] == requests and np.array_equal(before[1], snapshot.serials)):
             return False
-        self._shown[subject] = asked, snapshot.serials
+        self._shown[subject] = requests, snapshot.serials
         return True

@@ -29,15 +29,15 @@ def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions], where: s
             other = taken.setdefault(name, node)
             if other == node:
                 continue
-            mend = "give each its own `id`"
+            fix = "give each its own `id`"
             if options.log is not None or cameras[other].log is not None:
-                mend = (
+                fix = (
                     "frames of a log keep the names that they were recorded under: record one again with another `id`, "
                     "or give each log a mapper of its own; parts of one recording are one node, whose `log` is their "
                     "folder"
                 )
             raise ConfigError(
-                f"{where}: two cameras of node '{reader}', '{other}' and '{node}', have the id '{name}'; {mend}"
+                f"{where}: two cameras of node '{reader}', '{other}' and '{node}', have the id '{name}'; {fix}"
             )
 
 

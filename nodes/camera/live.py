@@ -281,7 +281,7 @@ class _StatusReporter:
 
     def __init__(self, context: NodeContext, publisher: Publisher, note: str = "") -> None:
         self.published = 0
-        self._notes = (note,) if note else ()  # of the settings; told with the warnings
+        self._notes = (note,) if note else ()  # of the settings; reported with the warnings
         self.waiting_for = ""  # why the camera could not be opened yet
         self.sender: CorrectionSender | None = None
         self._context = context

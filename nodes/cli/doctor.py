@@ -63,7 +63,7 @@ def doctor(
         for title in ("", "what", "found", "fix"):
             table.add_column(title, overflow="fold")
         for check in checks:
-            table.add_row(Text(check.state, _STYLES[check.state]), check.name, check.found, check.mend)
+            table.add_row(Text(check.state, _STYLES[check.state]), check.name, check.found, check.fix)
         output.print(table)
     return EXIT_FAILED if any(c.state == "bad" for c in checks) else 0
 

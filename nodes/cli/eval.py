@@ -67,7 +67,7 @@ def evaluate(
     out: OutOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML beside it.
+    """Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML next to it.
 
     A DIR gives the figures of its replay. A LOG is mapped and scored: with --weights that were finetuned on it, the
     keyframes they were fitted to never count, and --baselines adds a per-image U-Net and labels carried over by depth,

@@ -72,7 +72,7 @@ def export(
 
     Maps: .ply points (with --format ply-mesh a mesh), .obj mesh with materials, .glb mesh for viewers, .npz arrays for
     numpy, .yaml/.pgm floor plan for nav2 and map_server, .rrd for Rerun. In a floor plan a cell is free only where the
-    floor was seen. With --costs the costs 0 to 100 of its cells are written beside it (mode raw, unknown 255).
+    floor was seen. With --costs the costs 0 to 100 of its cells are written next to it (mode raw, unknown 255).
 
     Logs: .mcap with Foxglove's schemas, .rrd for Rerun, .txt trajectory (TUM), a folder that `import` reads again
     without loss, or with --format tum a TUM RGB-D sequence.
@@ -124,7 +124,7 @@ def merge(
 ) -> None:
     """Make one map of two: what both have measured adds up.
 
-    Where B lies in A is found by the features that both maps keep, and refused where it cannot be told for sure. Shifts
+    Where B lies in A is found by the features that both maps keep, and refused where it is uncertain. Shifts
     by whole voxels are exact; for others, B's voxels are interpolated. Settings are those of A.
 
     Example: semantic-mapper merge runs/east runs/west --out house.npz

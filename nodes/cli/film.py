@@ -131,7 +131,7 @@ def is_film(source: Path) -> bool:
 
 
 def import_film_log(source: Path, log: Path, options: FilmOptions, *, overwrite: bool) -> tuple[FilmReport, Path]:
-    """Import a film with progress on stderr, and write its report beside the log.
+    """Import a film with progress on stderr, and write its report next to the log.
 
     Returns:
         What became of it, and the path of its report.
@@ -192,7 +192,7 @@ def _figures(report: FilmReport) -> Mapping[str, str]:
     lens = ", ".join(f"{value:.4f}" for value in report.distortion)
     found = {
         "scale": report.scale or "unknown: lengths are not metres",
-        "placed": f"{report.registered} of {report.picked} frames that structure from motion was given",
+        "registered": f"{report.registered} of {report.picked} frames that structure from motion was given",
         "in the log": f"{report.frames} of {report.looked_at} frames of the film",
         "left out": ", ".join(f"{count} {reason}" for reason, count in report.left_out_counts.items()) or "none",
         "reprojection error": f"{report.error_px:.2f} px, mean over {report.points} points",

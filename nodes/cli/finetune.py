@@ -255,7 +255,7 @@ def finetune_lines(result: FinetuneResult, request: FinetuneRequest) -> list[str
         if checkpoint.model.config.classes == "fixed":
             lines.append(
                 "  stopped before classes were learned: they are those of the boxes alone; what is in none of them "
-                "(wall or floor) is not told apart"
+                "(wall or floor) is not separated"
             )
         if boxed["crowded"]:
             lines.append(

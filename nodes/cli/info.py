@@ -27,7 +27,7 @@ from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.box_picture import draw_boxes
 from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_times
-from semantic_mapper.replay.log.gaps import find_gaps, gaps_text
+from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
 from semantic_mapper.replay.log.sequence import LogSequence, open_log, read_part
 from semantic_mapper.replay.run_folder import is_map, map_path, prepare_file
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
@@ -59,10 +59,11 @@ def info(
 ) -> int:
     """Say what a log, a map or a file of boxes holds, or which weights a mapper uses.
 
-    Of a log (topics, frames, cameras, duration, gaps, damage) it reads every message, so that damage anywhere is found;
-    exit code 1 where there is any. Of a map (frames, size, blocks, classes) it reads what the file says of itself,
-    which is quick however large the map is. Of a running mapper it lists the weights that it was offered, with what
-    became of them. Boxes are for `finetune --kind panoptic`; any editor changes their file (docs/scenes.md).
+    Of a log (topics, frames, cameras, duration, missing frames, damage) it reads every message, so that damage
+    anywhere is found; exit code 1 where there is any. Of a map (frames, size, blocks, classes) it reads what the file
+    says of itself, which is quick however large the map is. Of a running mapper it lists the weights that it was
+    offered, with what became of them. Boxes are for `finetune --kind panoptic`; any editor changes their file
+    (docs/scenes.md).
 
     Example: semantic-mapper info kitchen.mcap
     Example: semantic-mapper info runs/demo
@@ -157,7 +158,7 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
             name: {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
             for name, k in stream.cameras.items()
         },
-        "gaps": {name: find_gaps(seqs[name], stamps[name]) for name in sorted(stamps)},
+        "missing_frames": {name: find_missing_frames(seqs[name], stamps[name]) for name in sorted(stamps)},
         "label_set": None
         if stream.label_set is None
         else {"name": stream.label_set.name, "classes": list(stream.label_set.names)},
@@ -222,8 +223,8 @@ def info_table(found: dict[str, Any]) -> Table:
     table.add_row("duration", f"{found['duration_s']:g} s{rate}")
     for name, k in found["cameras"].items():
         table.add_row(f"camera {name}", f"{k['width']}x{k['height']}, fx {k['fx']:.1f} fy {k['fy']:.1f}")
-    for name, gaps in found["gaps"].items():
-        table.add_row(f"gaps {name}", gaps_text(gaps))
+    for name, missing in found["missing_frames"].items():
+        table.add_row(f"missing frames {name}", missing_frames_text(missing))
     label_set = found["label_set"]
     text = "none" if label_set is None else f"{label_set['name']}: {', '.join(label_set['classes'])}"
     table.add_row("classes", text)

@@ -63,7 +63,7 @@ def label(
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="--serve: where labels are saved [LOG-labels, beside the log]."),
+        typer.Option("--out", metavar="DIR", help="--serve: where labels are saved [LOG-labels, next to the log]."),
     ] = None,
     classes: Annotated[
         Path | None,
@@ -125,7 +125,7 @@ def label(
 
 
 def _check_options(suggest: bool, serve: bool, given: dict[str, object]) -> None:
-    """Refuse options whose mode is not asked for.
+    """Refuse options whose mode is not requested.
 
     Raises:
         typer.BadParameter: naming the mode.

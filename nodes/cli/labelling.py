@@ -128,7 +128,7 @@ def suggest_for_log(
 
 
 def open_images(path: Path | None, log: Log) -> LabelFolder | None:
-    """Label images that are there already; None where there are none yet.
+    """Label images that are there already; None before the first.
 
     Raises:
         LabelError, LogError, ImportSourceError: as ``open_label_folder``.

@@ -16,7 +16,7 @@ from semantic_mapper.files import write_json
 from semantic_mapper.mapping.map_types import ALWAYS
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.options import Remote
-from semantic_mapper.nodes.cli.relocalize import all_worlds_found, find_frames, print_frames
+from semantic_mapper.nodes.cli.relocalize import all_sessions_found, find_frames, print_frames
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.running import map_endpoint
@@ -34,7 +34,7 @@ POLL_S = 0.2
 
 
 class Question(StrEnum):
-    """What can be asked."""
+    """What can be requested."""
 
     INFO = "info"
     AT = "at"
@@ -132,7 +132,7 @@ def query(
     info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
     things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
-    that `refine` has told things apart in, those. graph: floors, their rooms, which part at doors, the doors between
+    in which `refine` has separated things, those. graph: floors, their rooms, which part at doors, the doors between
     them, and the same things with their rooms.
 
     correct moves the map of a running mapper to corrected poses (TUM: stamp tx ty tz qx qy qz qw), such as after a
@@ -325,7 +325,7 @@ def _relocalize(source: str, log: Path, every: int, max_frames: int, out: Path |
     print_frames(found, output)
     if out is not None:
         output.print(f"written to {out}")
-    return 0 if all_worlds_found(found) else EXIT_FAILED
+    return 0 if all_sessions_found(found) else EXIT_FAILED
 
 
 def _follow(client: MapClient) -> Correction:

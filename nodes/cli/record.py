@@ -107,8 +107,10 @@ def _report(output: Output, log: Path, recorder: Recorder) -> int:
         raise LogError(f"{log}: its files were removed while it was recorded; record again")
     parts = f" in {done.parts} parts" if done.parts > 1 else ""
     output.print(f"{log}: {counted(done.frames, 'frame')}, {counted(done.messages, 'message')}{parts}")
-    if recorder.gaps.missed:
-        output.print(f"  note: {counted(recorder.gaps.missed, 'frame')} never came: sent too early, or lost on the way")
+    if recorder.missing_frames.missed:
+        output.print(
+            f"  note: {counted(recorder.missing_frames.missed, 'frame')} never came: sent too early, or lost on the way"
+        )
     if done.deleted:
         output.print(f"  note: {counted(done.deleted, 'part')} deleted to make room")
     if not recorder.losses:
@@ -143,7 +145,7 @@ def _join(
 
     Raises:
         TransportError: the launch does not say what it is.
-        ConfigError: a source that is none of its nodes, or options that do not go together.
+        ConfigError: a source that is not one of its nodes, or options that do not go together.
     """
     note = read_launch_note(folder)
     names = [node.name for node in note.nodes]

@@ -45,9 +45,9 @@ def find_frames(saved: Path, log: Path, every: int, max_frames: int) -> dict[str
             return relocalize_frames(voxel_map, frames, every, count, bar.set)
 
 
-def all_worlds_found(found: dict[str, Any]) -> bool:
-    """Whether it is known where each world of the log lies."""
-    return bool(found["worlds"]) and all(world["T_map_world"] is not None for world in found["worlds"])
+def all_sessions_found(found: dict[str, Any]) -> bool:
+    """Whether it is known where each session of the log lies."""
+    return bool(found["sessions"]) and all(session["T_map_world"] is not None for session in found["sessions"])
 
 
 def print_frames(found: dict[str, Any], output: Output) -> None:
@@ -59,11 +59,11 @@ def print_frames(found: dict[str, Any], output: Output) -> None:
         output.print(f"{len(found['unreadable'])} more cannot be read:")
     for frame in found["unreadable"][:_NAMED]:
         output.print(f"  frame {frame['number']}: {frame['reason']}")
-    for world in found["worlds"]:
-        name = f"world {world['world']} of the log" if len(found["worlds"]) > 1 else "the log's world"
-        if world["disagreement"]:
-            output.print(f"where {name} lies in the map is not known: {world['disagreement']}")
+    for session in found["sessions"]:
+        name = f"world {session['world']} of the log" if len(found["sessions"]) > 1 else "the log's world"
+        if session["disagreement"]:
+            output.print(f"where {name} lies in the map is not known: {session['disagreement']}")
             continue
-        output.print(f"{name} in the map, on which {world['agreeing']} of {world['found']} agree, T_map_world:")
-        for row in world["T_map_world"]:
+        output.print(f"{name} in the map, on which {session['agreeing']} of {session['found']} agree, T_map_world:")
+        for row in session["T_map_world"]:
             output.print("  " + " ".join(f"{value:9.4f}" for value in row))

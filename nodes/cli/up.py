@@ -77,6 +77,6 @@ def up(
 
 
 def _written(folder: Path) -> int:
-    """When the folder's summary was written, 0 = there is none."""
+    """When the folder's summary was written, 0 = no summary."""
     file = folder / "summary.json"
     return file.stat().st_mtime_ns if file.exists() else 0

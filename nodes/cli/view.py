@@ -162,7 +162,7 @@ def _find_live(source: str, query: str, remote: Remote) -> Live:
     """Endpoints of a running launch, or of a mapper anywhere.
 
     Raises:
-        TransportError: none runs here, several do, or the folder is none of a launch.
+        TransportError: none runs here, several do, or the folder is not that of a launch.
     """
     folder = None if "://" in source else launch_folder(source)
     from semantic_mapper.nodes.viewer.sources import Live

@@ -10,15 +10,15 @@ from semantic_mapper.errors import SemanticMapperError
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding: ``note`` = works, but worth knowing; ``bad`` = something will fail, ``mend`` says what to do."""
+    """One finding: ``note`` = works, but worth knowing; ``bad`` = something will fail, ``fix`` says what to do."""
 
     name: str
     state: Literal["ok", "note", "bad"]
     found: str
-    mend: str = ""
+    fix: str = ""
 
 
 def failed(name: str, error: SemanticMapperError) -> Check:
-    """Errors say what is wrong; and after a semicolon, how to mend it."""
-    found, _, mend = str(error).partition("; ")
-    return Check(name, "bad", found, mend)
+    """Errors say what is wrong; and after a semicolon, how to fix it."""
+    found, _, fix = str(error).partition("; ")
+    return Check(name, "bad", found, fix)

@@ -60,7 +60,7 @@ def keys_in(folder: Path) -> Check:
 
 
 def _listening(launch: Launch) -> list[tuple[str, str]]:
-    """Addresses that the launch binds beside its own folder, each with the folder of its keys."""
+    """Addresses that the launch binds outside of its own folder, each with the folder of its keys."""
     found = [(launch.publish, launch.keys)]
     for options in launch.options.values():
         if isinstance(options, MapperOptions):
@@ -77,8 +77,8 @@ def _address(endpoint: str, folder: str) -> Check:
         return failed("address", error)
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     if endpoint.startswith("tcp://") and re.fullmatch("[0-9]{1,5}", port) and _port_is_taken(int(port), host):
-        mend = f"`ss -ltnp 'sport = :{port}'` says who; give another with --set"
-        return Check("address", "note", f"{endpoint} is in use (by this very launch, if it runs)", mend)
+        fix = f"`ss -ltnp 'sport = :{port}'` says who; give another with --set"
+        return Check("address", "note", f"{endpoint} is in use (by this very launch, if it runs)", fix)
     return Check("address", "ok", endpoint)
 
 

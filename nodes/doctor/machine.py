@@ -178,8 +178,8 @@ def _machine() -> Iterator[Check]:
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
     small = total < MEMORY_GB
-    mend = "use a larger --voxel-size" if small else ""
-    yield Check("memory", "note" if small else "ok", f"{total:.1f} GB, {free:.1f} GB free", mend)
+    fix = "use a larger --voxel-size" if small else ""
+    yield Check("memory", "note" if small else "ok", f"{total:.1f} GB, {free:.1f} GB free", fix)
 
 
 def _disk() -> Iterator[Check]:
@@ -188,10 +188,10 @@ def _disk() -> Iterator[Check]:
     if free < DISK_GB:
         yield Check("disk", "bad", f"{free:.1f} GB free here", "free some space; logs and maps take gigabytes")
     else:
-        mend = "" if writable else "give --out with a folder that you may write to"
+        fix = "" if writable else "give --out with a folder that you may write to"
         yield Check(
             "disk",
             "ok" if writable else "note",
             f"{free:.0f} GB free here{'' if writable else ', but not writable'}",
-            mend,
+            fix,
         )

@@ -1,4 +1,4 @@
-"""Labelled keyframes in, better weights out: the finetuner beside a mapper, between two messages."""
+"""Labelled keyframes in, better weights out: the finetuner next to a mapper, between two messages."""
 
 from __future__ import annotations
 

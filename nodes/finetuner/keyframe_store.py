@@ -25,7 +25,7 @@ from semantic_mapper.transport.codec import decode_as, encode, pack_parts, unpac
 from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, LabelledKeyframe, digest_of
 from semantic_mapper.types import PosedFrame
 
-FOLDER = "learning"  # beside the map
+FOLDER = "learning"  # next to the map
 MAX_RECORD_BYTES = 1 << 20
 MAX_FILE_BYTES = MAX_KEYFRAME_BYTES + 4096  # with its framing
 

@@ -1,4 +1,4 @@
-"""``fleet run``: one task for each log, placed and tried again by Ray; what is done is in the store alone.
+"""``fleet run``: one task for each log, scheduled and tried again by Ray; what is done is in the store alone.
 
 So a run that was stopped or killed goes on with the same command, and nothing has to be repaired before.
 """

@@ -110,9 +110,9 @@ class FoxgloveServer:
     ) -> None:
         self._server.stop()
 
-    def asked(self, subject: Subject) -> int:
+    def requests(self, subject: Subject) -> int:
         """See ``Outlet``."""
-        return self._listener.asked(subject)
+        return self._listener.requests(subject)
 
     def send_labels(self, label_set: LabelSet) -> None:
         """See ``Outlet``."""
@@ -195,7 +195,7 @@ class _Listener(foxglove.websocket.ServerListener):
         self._joined: Counter[str] = Counter()
         self._last = 0.0  # when somebody joined
 
-    def asked(self, subject: Subject) -> int:
+    def requests(self, subject: Subject) -> int:
         """See ``Outlet``."""
         with self._lock:
             settled = time.monotonic() - self._last > SETTLE_S

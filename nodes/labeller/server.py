@@ -120,7 +120,7 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
                 _log.debug("page_not_served", reason=str(error))
 
         def _path(self) -> str:
-            """What is asked for, behind the token.
+            """What is requested, behind the token.
 
             Raises:
                 _RefusedError: by somebody who may not.

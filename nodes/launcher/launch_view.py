@@ -118,7 +118,7 @@ def _describe(history: list[Status]) -> dict[str, Any]:
 
 
 def _said_s(status: Status) -> float:
-    """When a node told its own totals; the launcher passes them on later."""
+    """When a node reported its own totals; the launcher passes them on later."""
     return status.stamp_ns / 1e9 - status.ages_s.get("status", 0.0)
 
 

@@ -42,7 +42,7 @@ class Launcher:
 
     Args:
         launch: From ``load_launch``.
-        notifier: Receives the state of the launch, beside the status topic.
+        notifier: Receives the state of the launch, in addition to the status topic.
     """
 
     def __init__(self, launch: Launch, notifier: Notifier | None = None) -> None:

@@ -74,7 +74,7 @@ def read_launch_note(folder: Path) -> LaunchNote:
     """Of a launch that runs.
 
     Raises:
-        TransportError: there is none, or it cannot be understood.
+        TransportError: there is no launch, or it cannot be understood.
     """
     try:
         return msgspec.json.decode(read_regular(folder / NOTE, MAX_FILE_BYTES), type=LaunchNote)
@@ -106,7 +106,7 @@ def launch_folder(place: str) -> Path:
         place: The folder itself; empty = that of the one launch that runs.
 
     Raises:
-        TransportError: none runs, several do, or the folder is none of a launch.
+        TransportError: none runs, several do, or the folder is not that of a launch.
     """
     if place:
         if not Path(place).exists():
@@ -200,6 +200,6 @@ def status_endpoint(place: str) -> str:
         place: An endpoint, or a socket folder; empty = that of the one launch that runs.
 
     Raises:
-        TransportError: none runs, several do, or the folder is none of a launch.
+        TransportError: none runs, several do, or the folder is not that of a launch.
     """
     return place if "://" in place else f"ipc://{launch_folder(place)}/{STATUS_SOCKET}"

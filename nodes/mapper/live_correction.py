@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.mapping.map_types import CorrectedPoses
+from semantic_mapper.mapping.odometry_sessions import OdometrySessions
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.worlds import MapWorlds
 from semantic_mapper.nodes.status import PartStatus
 from semantic_mapper.queries.questions import Correction, CorrectPosesRequest
 from semantic_mapper.replay.corrected_poses import match_frames
@@ -42,7 +42,7 @@ class LiveCorrection:
         self._ended = False
         self._followed = 0  # corrections that the session knows of
         self._since_step = 0  # frames of the history
-        self._worlds: MapWorlds | None = None  # of the session
+        self._odometry_sessions: OdometrySessions | None = None  # of the session
 
     @property
     def running(self) -> bool:
@@ -92,7 +92,7 @@ class LiveCorrection:
                 nothing where there was time to spare before this frame. Otherwise no frame waits.
         """
         if session is not None:
-            self._worlds = session.worlds
+            self._odometry_sessions = session.odometry_sessions
         if self.running:
             self._advance(max(0, HISTORY_A_STEP - self._since_step) if mapped else 1)
         self._since_step = 0 if mapped else self._since_step + 1
@@ -130,8 +130,8 @@ class LiveCorrection:
 
     def _begin(self, request: CorrectPosesRequest) -> tuple[int, int]:
         poses = self._to_frames(request)
-        if self._worlds is not None:
-            poses = self._worlds.in_map(poses, self._pipeline.corrector.worlds())
+        if self._odometry_sessions is not None:
+            poses = self._odometry_sessions.in_map(poses, self._pipeline.corrector.world_by_frame())
         known = self._pipeline.corrector.poses()
         stamps = {stamp_ns for _, stamp_ns in known}
         used = sum((key in known) if isinstance(key, tuple) else (key in stamps) for key in poses)

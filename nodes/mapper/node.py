@@ -15,11 +15,10 @@ from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.map_scale import MEND
+from semantic_mapper.mapping.map_scale import FIX
 from semantic_mapper.mapping.moving import KEPT_S
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
-from semantic_mapper.nodes.frame_gaps import Gaps
 from semantic_mapper.nodes.mapper.autosave import Autosave
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
@@ -28,11 +27,12 @@ from semantic_mapper.nodes.mapper.resume import (
     continue_map,
     forbid,
     keep_earlier,
-    note_worlds,
-    noted_worlds,
+    note_sessions,
+    noted_sessions,
     resume_map,
     stored_settings,
 )
+from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.public_publisher import PublicPublisher
@@ -98,7 +98,7 @@ class MapperNode:
 
         self._session: MapSession | None = None
         self._streams = Streams(len(options.cameras))
-        self._gaps = Gaps()
+        self._missing_frames = MissingFrames()
         self._broken = context.restarts > 0  # the camera or the mapper was not there all the time
         self._corrected = False
         self._early = 0  # frames before their stream was announced
@@ -137,7 +137,7 @@ class MapperNode:
             load_keys(Path(keys).expanduser()) if keys else None,
             self._weights,
             self._pipeline.moving.space,
-            self._pipeline.whereabouts,
+            self._pipeline.pose_in_map,
         )
 
     def __enter__(self) -> Self:
@@ -201,7 +201,7 @@ class MapperNode:
             own_first=not self._options.map,
         )
         if self._bundle.voxel_map.frames:
-            self._session.worlds.known.update(noted_worlds(self._context))
+            self._session.odometry_sessions.known.update(noted_sessions(self._context))
         _log.info("stream_begins", source=info.source, frames=info.frame_count)
 
     def _map(self, frame: PosedFrame) -> None:
@@ -210,15 +210,15 @@ class MapperNode:
             self._early += 1
             _log.warning("frame_before_stream_info", seq=frame.seq)
             return
-        self._gaps.note(frame.camera_id, frame.seq)
+        self._missing_frames.note(frame.camera_id, frame.seq)
         self._streams.note_frame(frame.camera_id)
-        before = len(session.worlds.known)
+        before = len(session.odometry_sessions.known)
         results = session.process(frame)
-        if len(session.worlds.known) != before:
-            note_worlds(self._context, session.worlds.known)
-        if not results and session.worlds.held:  # a player in lockstep waits for an answer to every frame
+        if len(session.odometry_sessions.known) != before:
+            note_sessions(self._context, session.odometry_sessions.known)
+        if not results and session.odometry_sessions.held:  # a player in lockstep waits for an answer to every frame
             self._publisher.publish(
-                encode(FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, session.worlds.warning))
+                encode(FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, session.odometry_sessions.warning))
             )
         self._capture_age_s = (time.monotonic_ns() - frame.stamp_ns) / 1e9
         for result in results:
@@ -258,8 +258,9 @@ class MapperNode:
             return False
         self._ended_by = self._streams.ended_by
         if session is not None:
-            broken = self._broken or self._gaps.begun_anew > 0  # then the camera has not counted all that we have had
-            missed = self._gaps.missed if broken else max(0, self._streams.published - session.received)
+            # A camera that was restarted has not counted all that we have had.
+            broken = self._broken or self._missing_frames.restarts > 0
+            missed = self._missing_frames.missed if broken else max(0, self._streams.published - session.received)
             session.count_dropped(missed)
         return True
 
@@ -317,11 +318,11 @@ class MapperNode:
 
     def _own_status(self) -> PartStatus:
         """Of the stream and the pipeline."""
-        counters = {"rejected": self._frames.rejected, "early": self._early, "missed": self._gaps.missed}
+        counters = {"rejected": self._frames.rejected, "early": self._early, "missed": self._missing_frames.missed}
         pipeline, warnings = self._pipeline, [self._resumed]
         session = self._session
         if session is not None:
-            worlds = session.worlds
+            sessions = session.odometry_sessions
             counters |= {
                 "published": session.published,
                 "fused": session.fused,
@@ -330,13 +331,13 @@ class MapperNode:
                 "cleared": pipeline.voxel_map.cleared,
                 "moving": pipeline.moving.pixels,
                 "step_us": self._step_us,
-                "held": worlds.held,
-                "relocalized": worlds.found,
-                "not_found": worlds.refused.total(),
+                "held": sessions.held,
+                "relocalized": sessions.found,
+                "not_found": sessions.refused.total(),
             }
-            warnings.append(worlds.warning)
+            warnings.append(sessions.warning)
         if not pipeline.voxel_map.scale_known:
-            warnings.append(f"scale: unknown; lengths of the map are not metres: {MEND}")
+            warnings.append(f"scale: unknown; lengths of the map are not metres: {FIX}")
         counters |= pipeline.picture_check.counters
         warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning, pipeline.moving.warning]
         return PartStatus(counters, tuple(filter(None, warnings)))

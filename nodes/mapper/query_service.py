@@ -22,9 +22,9 @@ import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.mapping.moving import MovingSpace
+from semantic_mapper.mapping.odometry_sessions import PoseInMap
 from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.mapping.worlds import Whereabouts
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.status import PartStatus
@@ -109,7 +109,7 @@ class QueryService:
         keys: See ``QueryServer``.
         weights: Takes other weights; without it questions about them are refused.
         moving: Where something moves now that is left out of the map.
-        whereabouts: Pose of the last frame.
+        pose_in_map: Pose of the last frame.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
@@ -123,14 +123,14 @@ class QueryService:
         keys: Keys | None = None,
         weights: LiveWeights | None = None,
         moving: MovingSpace | None = None,
-        whereabouts: Whereabouts | None = None,
+        pose_in_map: PoseInMap | None = None,
     ) -> None:
         self.map_id = uuid.uuid4().hex
         self._map = voxel_map
         self._correction = correction
         self._weights = weights
         self._moving = moving
-        self._whereabouts = whereabouts or Whereabouts()
+        self._pose_in_map = pose_in_map or PoseInMap()
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
         self._tracked: dict[Point, _Tracked] = {}  # by direction; the last one used stands last
@@ -368,7 +368,7 @@ class QueryService:
                     raise MapError("this mapper takes no weights while it runs (option `learner`)")
                 return self._weights.describe() if request.to is None else self._weights.return_to(request.to)
             case questions.PoseRequest():
-                return self._whereabouts.last
+                return self._pose_in_map.last
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
 

@@ -19,7 +19,7 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.replay.run_folder import free_name
 from semantic_mapper.types import Float64
 
-_EARLIER, _UNSOUND, _WORLDS = "earlier", "unsound", "worlds"  # notes
+_EARLIER, _UNSOUND, _SESSIONS = "earlier", "unsound", "sessions"  # notes
 _NO_FILE = "none"
 _RESULTS = (
     "map.npz",
@@ -69,7 +69,7 @@ def resume_map(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
 
 
 def continue_map(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
-    """Make ``voxel_map`` the saved one, unless it was taken up already.
+    """Make ``voxel_map`` the saved one, unless it was resumed already.
 
     Raises:
         ConfigError: its classes are others.
@@ -111,15 +111,17 @@ def stored_settings(config: MapperConfig, path: Path | None, voxel_size_m: float
     return msgspec.structs.replace(config, voxel_map=msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size))
 
 
-def note_worlds(context: NodeContext, known: Mapping[int, Float64]) -> None:
+def note_sessions(context: NodeContext, known: Mapping[int, Float64]) -> None:
     """Note where sessions lie in the map, for a mapper that resumes it."""
     plain = {str(world): T.ravel().tolist() for world, T in known.items()}
-    context.try_to_leave_note(_WORLDS, json.dumps(plain), "a mapper that replaces it has to look for the camera again")
+    context.try_to_leave_note(
+        _SESSIONS, json.dumps(plain), "a mapper that replaces it has to look for the camera again"
+    )
 
 
-def noted_worlds(context: NodeContext) -> dict[int, Float64]:
-    """What ``note_worlds`` has noted in this launch."""
-    noted = context.note(_WORLDS)
+def noted_sessions(context: NodeContext) -> dict[int, Float64]:
+    """What ``note_sessions`` has noted in this launch."""
+    noted = context.note(_SESSIONS)
     return {int(world): np.array(T).reshape(4, 4) for world, T in json.loads(noted or "{}").items()}
 
 

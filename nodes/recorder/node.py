@@ -14,8 +14,8 @@ import msgspec
 import structlog
 
 from semantic_mapper.errors import CodecError, LogError, TransportError
-from semantic_mapper.nodes.frame_gaps import Gaps
 from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
+from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import NodeJob, RecorderOptions
 from semantic_mapper.nodes.status import publish_status
@@ -110,7 +110,7 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
 
 
 def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessSubscriber]) -> None:
-    """Write what had come before somebody asked to stop; what there is no time for is counted."""
+    """Write what had come before a stop was requested; what there is no time for is counted."""
     deadline = time.monotonic() + DRAIN_S
     for source in sources:
         while (parts := source.receive_parts(DRAINED_S)) is not None:
@@ -179,15 +179,15 @@ class Recorder:
             self._packing = CodecOptions(rgb=options.rgb, jpeg_quality=options.jpeg_quality)
         self.recording: Recording | None = None
         self.rejected = self.unpacked = self.left = self.received = 0
-        self.gaps = Gaps()
+        self.missing_frames = MissingFrames()
         self._streams = Streams(options.streams)
         self._cameras: dict[str, CameraIntrinsics] = {}  # of all streams so far
         self._before = _last_frames(self._path) if self._goes_on else {}  # the first frames now should follow these
         for camera_id, seq in self._before.items():  # what was lost in between is counted
-            self.gaps.note(camera_id, seq)
+            self.missing_frames.note(camera_id, seq)
         self._interrupted: list[str] = []
         self._early_lost = 0
-        self._told: set[bytes] = set()  # what the recording holds of streams
+        self._recorded: set[bytes] = set()  # what the recording holds of streams
         self._early: deque[list[bytes]] = deque(maxlen=MAX_EARLY)
 
     @property
@@ -229,9 +229,9 @@ class Recorder:
             self._cameras |= info.cameras
             if self.recording is None:
                 self._begin(info)
-            elif bytes(parts[1]) not in self._told:  # of another camera, or of one that was restarted
+            elif bytes(parts[1]) not in self._recorded:  # of another camera, or of one that was restarted
                 self.recording.announce(parts, self._calibration())
-            self._told.add(bytes(parts[1]))
+            self._recorded.add(bytes(parts[1]))
         elif topic.name != "end":
             if self.recording is None:
                 if len(self._early) == MAX_EARLY:
@@ -261,7 +261,7 @@ class Recorder:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         before = self._context.note(NOTE) if self._goes_on else ""
         name = before or uuid.uuid4().hex
-        self._context.try_to_leave_note(NOTE, name, "who replaces it begins another recording beside")
+        self._context.try_to_leave_note(NOTE, name, "who replaces it begins another recording next to it")
         self.recording = Recording(
             self._path,
             info,
@@ -292,7 +292,7 @@ class Recorder:
             return parts
         envelope = read_envelope(parts)
         self._note_restart(envelope.source, envelope.seq)
-        self.gaps.note(envelope.source, envelope.seq)
+        self.missing_frames.note(envelope.source, envelope.seq)
         if self._packing is None:
             return parts
         try:
@@ -352,7 +352,11 @@ class StatusReporter:
     def tell(self, recorder: Recorder, state: NodeState) -> None:
         """Tell now."""
         self._last_sent = time.monotonic()
-        counters = {"missed": recorder.gaps.missed, "rejected": recorder.rejected, "unpacked": recorder.unpacked}
+        counters = {
+            "missed": recorder.missing_frames.missed,
+            "rejected": recorder.rejected,
+            "unpacked": recorder.unpacked,
+        }
         degraded: tuple[str, ...] = ()
         if (r := recorder.recording) is not None:
             counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost + recorder.left}

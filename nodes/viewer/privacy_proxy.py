@@ -29,7 +29,7 @@ class QuietPage:
     Args:
         address: Where; port 0 = any that is free.
         source: Host and port of the other server.
-        allowed: Origins that the page may fetch from, beside this server.
+        allowed: Origins that the page may fetch from, in addition to this server.
 
     Raises:
         TransportError: the port is taken.

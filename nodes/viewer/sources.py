@@ -104,7 +104,7 @@ def show_saved(path: Path, begin: Begin) -> None:
 def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]) -> None:
     """Show a running system until its streams have ended or somebody asks to stop.
 
-    The mapper is asked first, and waited for: a camera that waits for its listeners would else count this one in.
+    The mapper is queried first, and waited for: a camera that waits for its listeners would else count this one in.
 
     Args:
         live: Where it is.
@@ -192,7 +192,7 @@ def _follow_nodes(live: Live, log: RerunLog, following: _Following, stop: StopRe
                     following.stamp_ns = message.stamp_ns
                     pose = poses.place(message.world, message.T_world_camera)
                     if pose is None:  # the mapper does not know yet where in the map it was taken
-                        log.log_frame(message, placed=False)
+                        log.log_frame(message, posed=False)
                     else:
                         log.log_frame(replace(message, T_world_camera=pose))
                 case MapUpdate():

@@ -58,7 +58,7 @@ ThingTeller = Callable[[PosedFrame, UInt8], NDArray[np.uint16]]  # ids (H, W) of
 class Evaluation:
     """Metrics by method, and how many frames were scored, left out, and refused, or have pseudo labels.
 
-    Beside the figures of ``SegmentationMetrics`` a method has ``ece``, ``sure`` (fraction of the pixels above a
+    In addition to the figures of ``SegmentationMetrics`` a method has ``ece``, ``sure`` (fraction of the pixels above a
     confidence of 0.9), ``sure_right`` (of those), and ``open_set_auroc`` where some labels are of classes that it
     cannot name; all None without confidences. The map also has ``open_set_unknown``: the fraction of
     its voted points of such classes that it calls unknown (``voxel_map.unknown_below``), None without such points.

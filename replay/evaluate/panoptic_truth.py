@@ -97,7 +97,7 @@ class PanopticTruth:
         Args:
             frame: Of the log.
             truth: (H, W) ids of the map.
-            found: By method, what it says of the frame (H, W), ids of the map; asked where objects are known.
+            found: By method, what it says of the frame (H, W), ids of the map; called where objects are known.
 
         Raises:
             LogError: see ``InstanceFolder.read``.

@@ -94,8 +94,8 @@ class FolderExporter:
 class TumExporter:
     """A TUM RGB-D sequence: ``rgb/``, ``depth/`` (5000 units a metre), their lists and ``groundtruth.txt``.
 
-    Beside what the data set has there is ``intrinsics.json``, which our import reads. Depth that was computed is left
-    out, since readers would take it for a sensor's.
+    In addition to what the data set has there is ``intrinsics.json``, which our import reads. Depth that was computed
+    is left out, since readers would take it for a sensor's.
 
     Args:
         folder: Is there, and empty.

@@ -113,14 +113,14 @@ class RerunLog:
         self.log_frame(frame)
         self.log_update(update, frame.intrinsics)
 
-    def log_frame(self, frame: PosedFrame, *, placed: bool = True) -> None:
+    def log_frame(self, frame: PosedFrame, *, posed: bool = True) -> None:
         """A camera image with its pose, or the image alone where its pose is not of the map's world."""
         path, k, T = self._camera(frame.camera_id), frame.intrinsics, frame.T_world_camera
         size, scale = _logged_size(k)
         self._set_time(frame.stamp_ns, frame.seq)
         rgb = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
         self._stream.log(f"{path}/image/rgb", rr.Image(np.asarray(rgb, np.uint8)).compress(jpeg_quality=JPEG_QUALITY))
-        if not placed:
+        if not posed:
             return
         self._stream.log(path, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
         self._stream.log(

@@ -268,7 +268,7 @@ def metres(values: NDArray[np.generic]) -> Float32:
 
 
 def numpy_notice(files: Iterable[Path], scale: DepthScale) -> list[str]:
-    """A sentence on the unit of depth in NumPy's files, where nothing tells it; none where there are none."""
+    """A sentence on the unit of depth in NumPy's files, where nothing tells it; empty without such files."""
     if scale.float_units_per_m is not None or not any(file.suffix.lower() in NUMPY for file in files):
         return []
     return [
@@ -517,7 +517,7 @@ def _is_number(word: str) -> bool:
 
 
 def without_picture(kind: str, numbers: Iterable[int], pictures: Iterable[int], where: Path) -> list[str]:
-    """A sentence on poses or the like whose picture is missing; none where there are none."""
+    """A sentence on poses or the like whose picture is missing; empty where all are there."""
     missing = sorted({*numbers} - {*pictures})
     if not missing:
         return []
@@ -589,7 +589,7 @@ _NEUTRAL_WORDS = ("", "none", "identity", "pinhole", "perspective", "m", "meter"
 
 
 def read_plain_json(file: Path, limit: int, kind: type[Any] = dict) -> Any:
-    """JSON of another program, as plain data: a ``dict`` or ``list``. Numbers that are none (NaN) are None.
+    """JSON of another program, as plain data: a ``dict`` or ``list``. NaN becomes None.
 
     Raises:
         ImportSourceError: missing, no JSON, or larger than ``limit`` bytes.
@@ -641,7 +641,7 @@ def unknown_keys(
 
 
 def unknown_notice(file: Path, keys: Sequence[str]) -> list[str]:
-    """A sentence on keys that are not read; none where there are none."""
+    """A sentence on keys that are not read; empty where all are."""
     if not keys:
         return []
     names = ", ".join(f"'{key[:40]}'" for key in keys[:8])

@@ -15,7 +15,7 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import PICTURES, ImportOptions, inside
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, has_picture, place_model
 from semantic_mapper.replay.sfm.colmap_model import ColmapImage, ColmapModel, find_models, read_model
-from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
+from semantic_mapper.replay.sfm.scale import RegisteredFrame, median_depth
 
 
 def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -54,8 +54,8 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
         )
     poses = np.stack([image.T_world_camera for _, image in images])
     pictures = [PosedPicture(file, model.cameras[image.camera_id], image.T_world_camera) for file, image in images]
-    placed = place_model(poses, pictures, options, lambda: _depth(model))
-    opened = placed.pictures("colmap", folder, pictures, options)
+    posed = place_model(poses, pictures, options, lambda: _depth(model))
+    opened = posed.pictures("colmap", folder, pictures, options)
     opened.notices += notices
     return opened
 
@@ -92,7 +92,7 @@ def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:
 def _depth(model: ColmapModel) -> float:
     """Median depth of the points as the images see them; 0 = none sees any."""
     frames = [
-        PlacedFrame(
+        RegisteredFrame(
             0,
             image.T_world_camera,
             np.array([model.points[int(p)] for p in image.point_ids if int(p) in model.points]).reshape(-1, 3),

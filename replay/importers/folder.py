@@ -168,16 +168,16 @@ class FolderRecording:
         image_size_must_be(rgb, self._measured, file)
         size = (self._measured.height, self._measured.width)
         depth, sigma = read_depth_if_there(self._depth.get(number), self.depth_scale, size), None
-        if depth is None and self._computed_depth and self._beside(file, COMPUTED_DEPTH).exists():
-            depth = read_depth_if_there(self._beside(file, COMPUTED_DEPTH), self.depth_scale, size)
-            sigma = read_depth_if_there(self._beside(file, DEPTH_SIGMA), self.depth_scale, size)
+        if depth is None and self._computed_depth and self._image_of(file, COMPUTED_DEPTH).exists():
+            depth = read_depth_if_there(self._image_of(file, COMPUTED_DEPTH), self.depth_scale, size)
+            sigma = read_depth_if_there(self._image_of(file, DEPTH_SIGMA), self.depth_scale, size)
             if sigma is None:
-                raise BadFrameError(self._beside(file, DEPTH_SIGMA), "is missing: the spread of computed depth")
+                raise BadFrameError(self._image_of(file, DEPTH_SIGMA), "is missing: the spread of computed depth")
         label, label_error, pseudo = None, None, False
         if self._has_label and self.info.label_set is not None:
-            label_file = self._beside(file, "label")
-            if not label_file.exists() and self._beside(file, PSEUDO_LABEL).exists():
-                label_file, pseudo = self._beside(file, PSEUDO_LABEL), True
+            label_file = self._image_of(file, "label")
+            if not label_file.exists() and self._image_of(file, PSEUDO_LABEL).exists():
+                label_file, pseudo = self._image_of(file, PSEUDO_LABEL), True
             try:
                 label = read_label(label_file, self.info.label_set, size)
             except BadFrameError as error:
@@ -197,7 +197,7 @@ class FolderRecording:
         )
         return LoadedFrame(frame, None if bent else encoded, label_error)
 
-    def _beside(self, color: Path, kind: str) -> Path:
+    def _image_of(self, color: Path, kind: str) -> Path:
         return self._folder / kind / f"{color.stem}.png"
 
     def _pose(self, number: int) -> Float64:

@@ -2,8 +2,8 @@
 
 The layout is that of https://opensfm.org/docs/dataset.html. Pixels count from the picture's middle, divided by its
 longer side. Poses are world to camera, rotations as axis times angle, camera axes are OpenCV's. With a
-``reference_lla`` that is not zero OpenSfM has placed the model by GPS: then x is east, y north, z up, and lengths are
-metres. Without, the model is placed as one of COLMAP.
+``reference_lla`` that is not zero OpenSfM has aligned the model by GPS: then x is east, y north, z up, and
+lengths are metres. Without, the model is oriented like one of COLMAP.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from semantic_mapper.replay.importers.base import (
 )
 from semantic_mapper.replay.importers.posed import PosedModel, PosedPicture, PosedPictures, has_picture, place_model
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
-from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth, scene_depth
+from semantic_mapper.replay.sfm.scale import RegisteredFrame, median_depth, scene_depth
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
 
 FILE, REFERENCE = "reconstruction.json", "reference_lla.json"
@@ -125,15 +125,15 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     poses = np.stack([picture.T_world_camera for picture in pictures])
     reference = model.reference_lla or _reference_in_file(file)
     if reference is None or not (reference.latitude or reference.longitude):
-        placed = place_model(poses, pictures, options, lambda: _depth(model.points, pictures))
+        posed = place_model(poses, pictures, options, lambda: _depth(model.points, pictures))
     elif options.scale is not None:
         raise ImportSourceError(f"{file}: is in metres already, by GPS; leave out --scale")
     else:
         origin = GpsPosition(reference.latitude, reference.longitude, reference.altitude)
         said = ["scale, up and north are those that OpenSfM found by GPS"]
         far = scene_depth(_depth(model.points, pictures))
-        placed = PosedModel(poses, True, said, {ORIGIN_KEY: str(origin), **far})
-    opened = placed.pictures("opensfm", folder, pictures, options)
+        posed = PosedModel(poses, True, said, {ORIGIN_KEY: str(origin), **far})
+    opened = posed.pictures("opensfm", folder, pictures, options)
     opened.notices += unknown_notice(file, unknown_keys(map(_table, model.cameras.values()), _Camera))
     unposed = [
         path for path in sorted(root.iterdir()) if path.suffix.lower() in PICTURES and path.name not in model.shots
@@ -230,7 +230,7 @@ def _depth(points: Any, pictures: list[PosedPicture]) -> float:
     ]
     xyz = np.array(numbers, np.float64).reshape(-1, 3)
     step = max(1, len(pictures) // _LOOKED_AT)
-    frames = [PlacedFrame(0, p.T_world_camera, _seen(xyz, p)) for p in pictures[::step]]
+    frames = [RegisteredFrame(0, p.T_world_camera, _seen(xyz, p)) for p in pictures[::step]]
     return median_depth(frames) if any(len(frame.xyz) for frame in frames) else 0.0
 
 

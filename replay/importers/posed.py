@@ -272,8 +272,8 @@ def place_model(
                 said = [f"scale, up and north: {fit}"]
                 moved = np.stack([fit.moved(pose) for pose in poses])
                 return PosedModel(moved, True, said, {ORIGIN_KEY: str(fit.origin), **scene_depth(fit.scale * median)})
-    placed = upright(poses[0], camera_up(poses)) @ poses
+    posed = upright(poses[0], camera_up(poses)) @ poses
     if options.scale is not None:
-        return PosedModel(placed, False, notices, scene_depth(options.scale * median))
-    placed[:, :3, 3] *= UNSCALED_DEPTH_M / median if median > 0 else 1.0
-    return PosedModel(placed, False, notices)
+        return PosedModel(posed, False, notices, scene_depth(options.scale * median))
+    posed[:, :3, 3] *= UNSCALED_DEPTH_M / median if median > 0 else 1.0
+    return PosedModel(posed, False, notices)

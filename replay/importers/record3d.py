@@ -104,7 +104,7 @@ def _number(value: Any) -> float | None:
 
 
 def _numbers(values: Any, at: int | None = None) -> list[float | None]:
-    """Numbers of a list, or of the list at a place in it; empty where there is none."""
+    """Numbers of a list, or of the list at a place in it; empty where it is missing."""
     if at is not None:
         values = values[at] if isinstance(values, list) and at < len(values) else None
     return [_number(value) for value in values] if isinstance(values, list) else []

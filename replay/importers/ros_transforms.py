@@ -19,7 +19,7 @@ from semantic_mapper.geometry import interpolate_pose, invert_pose, pose_matrix
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
 
-WORLDS = ("map", "world", "odom")  # names of a world by REP 105 and habit, the preferred first
+WORLD_FRAMES = ("map", "world", "odom")  # names of a world by REP 105 and habit, the preferred first
 MAX_NORM_ERROR = 0.1  # of a unit quaternion; more is no rotation
 MAX_GAP_NS = 1_000_000_000  # over a longer gap nothing is interpolated
 _SAME = 1e-3  # of a transform's entries; two that are published may differ by it

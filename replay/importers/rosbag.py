@@ -39,7 +39,7 @@ from semantic_mapper.replay.importers.base import (
 from semantic_mapper.replay.importers.posed import KEPT_RECTIFIERS
 from semantic_mapper.replay.importers.ros_files import readable_bag
 from semantic_mapper.replay.importers.ros_transforms import (
-    WORLDS,
+    WORLD_FRAMES,
     Track,
     TransformTree,
     fill_stamps,
@@ -345,10 +345,10 @@ class RosbagRecording:
         if not wanted and len(infos) == 1:
             self.notices.append(f"the calibration of {topic.name} is that of {infos[0]}, the only one")
             return infos[0]
-        there = f"there are {', '.join(infos[:LISTED])}: name one with --topic info=NAME" if infos else "there is none"
+        others = f"there are {', '.join(infos[:LISTED])}: name one with --topic info=NAME"
         raise ImportSourceError(
             f"{self._bag.src}: no camera_info at {name}, without which the focal length of {topic.name} is not known; "
-            f"{there}"
+            f"{others if infos else 'the bag has no such topic'}"
         )
 
     def _with_frame(self, topic: _Topic, info: str) -> _Topic:
@@ -373,7 +373,7 @@ class RosbagRecording:
         if name and name not in found:
             there = ", ".join(found[:LISTED]) or "none"
             raise ImportSourceError(f"{self._bag.src}: no topic '{name}' of poses; there are {there}")
-        in_world = set(WORLDS) & set(self._tree.way_up(self._color_topic.frame))
+        in_world = set(WORLD_FRAMES) & set(self._tree.way_up(self._color_topic.frame))
         if name or self._options.world or in_world:
             return name
         if len(found) > 1:
@@ -660,7 +660,7 @@ class RosbagRecording:
             if wanted in way:
                 return wanted
             raise ImportSourceError(f"{self._bag.src}: tf has no way from {camera} to {wanted}: {_on(way)}")
-        for world in WORLDS:
+        for world in WORLD_FRAMES:
             if world in way:
                 return world
         if len(way) == 1:
@@ -670,12 +670,12 @@ class RosbagRecording:
             )
         if not self._tree.moving_above(camera, way[-1]):
             raise ImportSourceError(
-                f"{self._bag.src}: tf has no frame {', '.join(WORLDS)} above the camera: {_on(way)}; and nothing tells "
-                f"how '{way[-1]}' moves: record tf or odometry{self._path_hint()}. Only where the camera stood still: "
-                f"--world {way[-1]}"
+                f"{self._bag.src}: tf has no frame {', '.join(WORLD_FRAMES)} above the camera: {_on(way)}; and nothing "
+                f"tells how '{way[-1]}' moves: record tf or odometry{self._path_hint()}. Only where the camera stood "
+                f"still: --world {way[-1]}"
             )
         raise ImportSourceError(
-            f"{self._bag.src}: tf has no frame {', '.join(WORLDS)} above the camera: {_on(way)}; name the world: "
+            f"{self._bag.src}: tf has no frame {', '.join(WORLD_FRAMES)} above the camera: {_on(way)}; name the world: "
             f"--world {way[-1]}, or a topic of poses: --topic pose=NAME"
         )
 

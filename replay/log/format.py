@@ -126,7 +126,7 @@ class LogWriter:
         trouble: Why it takes nothing more; None where all is well.
 
     Raises:
-        LogError: the file exists, or cannot be written; then there is none.
+        LogError: the file exists, or cannot be written; then no file is left.
     """
 
     def __init__(
@@ -321,7 +321,7 @@ def atomic_log(
     attachments: Sequence[LogAttachment] = (),
     overwrite: bool = False,
 ) -> Iterator[LogWriter]:
-    """A writer of the log ``path``, which gets its name as the last thing; after an error there is none.
+    """A writer of the log ``path``, which gets its name as the last thing; after an error no log is left.
 
     Args:
         path, info, options, attachments: See ``LogWriter``.

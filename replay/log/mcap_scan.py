@@ -110,7 +110,7 @@ def scan_end(fd: int, length: int) -> Scan:
 
 
 def _read_index(fd: int, size: int) -> Scan | None:
-    """What the index says; None where there is none, or it is damaged."""
+    """What the index says; None where it is missing or damaged."""
     end = size - len(MAGIC) - _FOOTER.size
     tail = os.pread(fd, _FOOTER.size + len(MAGIC), max(end, 0))
     if not tail.endswith(MAGIC) or len(tail) != _FOOTER.size + len(MAGIC):

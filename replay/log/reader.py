@@ -217,7 +217,7 @@ class LogReader:
             )
         raise LogError(
             f"{self.path}: says nothing of its cameras and classes: not a log of semantic-mapper (what `export` writes "
-            f"for Foxglove is none either: use the log it was made of), or cut off before its first frame"
+            f"for Foxglove is not one either: use the log it was made of), or cut off before its first frame"
         )
 
     def _report_damages(self, found: Scan) -> None:
@@ -259,7 +259,7 @@ class LogReader:
         return unpack_parts(payloads[entry.position])
 
     def _read_chunk(self, entry: _Entry) -> list[bytes] | str:
-        """Messages of a chunk, or why there are none; the last chunk is kept for those that have several messages."""
+        """Messages of a chunk, or why they are missing; the last chunk is kept for those that have several messages."""
         offset, payloads = self._last_chunk  # one read and one write: other threads may exchange it
         if offset != entry.offset:
             try:

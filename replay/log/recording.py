@@ -233,7 +233,7 @@ class Recording:
             _log.warning("part_not_closed", log=str(part.path), error=str(error))
 
     def _make_room(self, size: int) -> bool:
-        """Whether a message fits beside the reserve; deletes parts for it where that is the rule."""
+        """Whether a message fits next to the reserve; deletes parts for it where that is the rule."""
         reserve = self._rules.reserve_bytes
         try:
             while (free := self._free(self._path.parent)) - size < reserve:

@@ -71,7 +71,7 @@ class LogSequence:
             opened.sort(key=lambda entry: entry[0])
             self.logs = [log for _, log in opened]
             self.path, self.info = self.logs[0].path, self.logs[0].info
-            self._notices = _gaps(opened)
+            self._notices = _missing_parts(opened)
             self._ends = list(accumulate(len(log) for log in self.logs))
             if not allow_empty and not len(self):
                 raise LogError(f"{self.path} and the parts after it hold no frames")
@@ -186,7 +186,7 @@ def logs_in(folder: Path) -> list[Path]:
     """The logs in a folder.
 
     Raises:
-        LogError: there is none.
+        LogError: there is no log.
     """
     files = sorted(folder.glob(f"*{SUFFIX}"))
     if not files:
@@ -224,7 +224,7 @@ def parts_on_disk(first: Path) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _gaps(opened: Sequence[tuple[int, LogReader]]) -> list[str]:
+def _missing_parts(opened: Sequence[tuple[int, LogReader]]) -> list[str]:
     """What is missing of a recording, for people.
 
     Raises:

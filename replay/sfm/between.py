@@ -1,4 +1,4 @@
-"""Poses of the frames between those that structure from motion has placed: its points, followed into them."""
+"""Poses of the frames between those that structure from motion has registered: its points, followed into them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _WINDOW, _LEVELS = (21, 21), 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchor:
-    """A placed frame.
+    """A registered frame.
 
     Args:
         gray: (H, W) its picture.
@@ -38,7 +38,7 @@ def follow_pose(anchor: Anchor, gray: UInt8, intrinsics: CameraIntrinsics) -> Fl
     """T_world_camera (4, 4) of a frame soon after the anchor; None where too few of its points are found again.
 
     Args:
-        anchor: The placed frame.
+        anchor: The registered frame.
         gray: (H, W) picture of the other one.
         intrinsics: Of both, with their distortion.
     """

@@ -24,7 +24,7 @@ REQUEST, RESULT, DATABASE, FEATURES = "request.json", "result.json", "database.d
 OVERLAP = 8  # frames before each that it is matched to
 PAIRS_AT_ONCE = 64
 ENOUGH = 0.9  # of the frames in one model: no further focal length is tried
-LEAST_FREE = 0.5  # of the frames, placed with a free focal length: it is not tried held
+LEAST_FREE = 0.5  # of the frames, registered with a free focal length: it is not tried held
 SEED = 1  # pycolmap takes 0 for "another each time"
 MIN_MODEL_IMAGES = 5
 INIT_TRIALS = 40
@@ -199,7 +199,7 @@ def main(folder: Path) -> None:
 
 
 def _attempts(pycolmap: Any, folder: Path, camera: Camera, count: int, *, turns: bool) -> list[Attempt]:
-    """Until one has placed most frames; a camera that turns on the spot gets none that begins straight ahead.
+    """Until one has registered most frames; a camera that turns on the spot gets none that begins straight ahead.
 
     Straight ahead, the focal length is tried free. It is held only where that places next to nothing: two frames of a
     way without any turn fit all of them, and a wrong one that is held bends the path.
@@ -208,8 +208,8 @@ def _attempts(pycolmap: Any, folder: Path, camera: Camera, count: int, *, turns:
     for number, prior in enumerate(camera.focal_priors if camera.fixed is None else (camera.fixed[0],)):
         known = camera.about and number == 0
         for ahead, held in dict.fromkeys(((False, known), (True, known), (True, camera.fixed is None))):
-            placed = max((a.models[0].images for a in attempts if a.models), default=0)
-            if ahead and (turns or (held and not known and placed >= LEAST_FREE * count)):
+            registered = max((a.models[0].images for a in attempts if a.models), default=0)
+            if ahead and (turns or (held and not known and registered >= LEAST_FREE * count)):
                 continue
             models = _map(pycolmap, folder, len(attempts), camera, prior, count, held=held, ahead=ahead)
             if known:

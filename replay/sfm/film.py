@@ -303,7 +303,7 @@ class FilmNote(msgspec.Struct, frozen=True):
     Args:
         frames: Of the film.
         left_out: Of these, not in the log, by reason.
-        picked, registered: Frames that structure from motion was given, and has placed.
+        picked, registered: Frames that structure from motion was given, and has registered.
         error_px: Mean reprojection error.
         focal_px: In pixels of the film.
         sigmas: How exact the poses are; None where that is unknown.

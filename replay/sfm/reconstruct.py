@@ -52,7 +52,7 @@ from semantic_mapper.replay.sfm.scale import (
     UNSCALED_DEPTH_M,
     BoardScale,
     Mark,
-    PlacedFrame,
+    RegisteredFrame,
     ScaleHint,
     find_edges,
     floor_under,
@@ -72,7 +72,7 @@ RETRY_PRIORS = (1.0, 0.85, 1.2)  # of the focal length that was given as a guess
 FILL = 0.02  # motion between two frames of the log, of the image's width
 FILL_NS, FILL_LEAST = 140_000_000, LEAST_MOTION  # ... or this long after the last one, with this much motion
 MAX_FRAMES = 3000  # in a log; longer ways get longer steps
-FOLLOWED = 2.5 * STEP  # motion since the last placed frame within which a frame is followed
+FOLLOWED = 2.5 * STEP  # motion since the last registered frame within which a frame is followed
 MAX_POINT_ERROR_PX = 2.0  # points that are less exact are no guide
 EDGE_FRAMES = 60  # about as many are searched for upright edges
 MAX_POINTS = 20_000  # that the report shows
@@ -134,7 +134,7 @@ class FilmReport:
     Args:
         film: Its file or folder.
         looked_at: Frames of the film.
-        picked, registered: Frames that structure from motion was given, and has placed.
+        picked, registered: Frames that structure from motion was given, and has registered.
         frames: In the log, with those in between.
         left_out: The others, in order.
         error_px: Mean reprojection error of the points.
@@ -283,10 +283,10 @@ class _Lens:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
+class _Registered:
     """The frames of the chosen model, by their index in the film, in the world of the log."""
 
-    frames: dict[int, PlacedFrame]
+    frames: dict[int, RegisteredFrame]
     xy: dict[int, Float64]  # (N, 2) pixels of the points of each
     seen: CameraIntrinsics  # of what was seen, with distortion
 
@@ -318,27 +318,27 @@ class _Import:
         picked = self._find_features(look, rows, board)
         outcome = self._run_colmap()
         models, attempt = self._judge(outcome, look, picked)
-        placed, scale, height, others = self._orient(models, look, picked, board)
+        registered, scale, height, others = self._orient(models, look, picked, board)
         chosen = attempt.models[0]
-        report = self._write(dst, look, picked, placed, scale, chosen.error_px, outcome.sigmas, overwrite=overwrite)
+        report = self._write(dst, look, picked, registered, scale, chosen.error_px, outcome.sigmas, overwrite=overwrite)
         ratio = film.full_width / film.width
         return FilmReport(
             film=film.path,
             looked_at=len(look.index),
             picked=len(picked),
-            registered=len(placed.frames),
+            registered=len(registered.frames),
             frames=len(report.stamps),
             left_out=tuple(report.left_out),
             error_px=chosen.error_px,
             points=len(models[0].points),
-            focal_px=placed.seen.fx * ratio,
+            focal_px=registered.seen.fx * ratio,
             focal_source=self._lens.source,
-            distortion=(self._lens.measured or placed.seen).distortion,
+            distortion=(self._lens.measured or registered.seen).distortion,
             scale=scale,
             height_m=height,
             stamps_ns=np.array(report.stamps, np.int64),
             T_world_camera=np.stack(report.poses),
-            xyz=self._some_points(placed),
+            xyz=self._some_points(registered),
             others=others,
             notices=tuple(self._notices),
             pictures=tuple(report.pictures),
@@ -429,11 +429,11 @@ class _Import:
 
     def _orient(
         self, models: list[ColmapModel], look: FilmLook, picked: list[int], board: BoardScale | None
-    ) -> tuple[_Placed, str, float | None, tuple[OtherModel, ...]]:
+    ) -> tuple[_Registered, str, float | None, tuple[OtherModel, ...]]:
         """The largest model with z up, in metres, its floor at 0; how its scale was found; and the other ones."""
         model = models[0]
         seen = model.cameras[model.images[0].camera_id]
-        frames: dict[int, PlacedFrame] = {}
+        frames: dict[int, RegisteredFrame] = {}
         xy: dict[int, Float64] = {}
         for image in model.images:
             index = picked[int(image.name)]
@@ -444,23 +444,25 @@ class _Import:
             ]
             xyz = np.array([model.points[p] for _, p in good]).reshape(-1, 3)
             xy[index] = image.xy[[n for n, _ in good]]
-            frames[index] = PlacedFrame(_stamp(look, index), image.T_world_camera, xyz)
+            frames[index] = RegisteredFrame(_stamp(look, index), image.T_world_camera, xyz)
         poses = {index: frame.T_world_camera for index, frame in frames.items()}
         guess = camera_up(np.stack(list(poses.values())))
         up = vertical(self._edges, poses, seen, guess)
         if up is None:
             self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
         frames = _moved(frames, upright(frames[min(frames)].T_world_camera, guess if up is None else up), 1.0)
-        placed = _Placed(_moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values()))), xy, seen)
-        self._gps = self._place_by_gps(placed)
+        registered = _Registered(
+            _moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values()))), xy, seen
+        )
+        self._gps = self._place_by_gps(registered)
         if self._gps is not None:
             fit, scale = self._gps, str(self._gps)
             T_world_model = fit.T_world_model.copy()
             T_world_model[:3, 3] /= fit.scale
-            frames = _moved(placed.frames, T_world_model, fit.scale)
+            frames = _moved(registered.frames, T_world_model, fit.scale)
         else:
-            factor, scale = self._scale(placed, look, board)
-            frames = _moved(placed.frames, np.eye(4), factor)
+            factor, scale = self._scale(registered, look, board)
+            frames = _moved(registered.frames, np.eye(4), factor)
         floor = floor_under(list(frames.values()))
         height = None
         if floor is not None:
@@ -483,26 +485,26 @@ class _Import:
                 f"the part from {other.start_s:.1f} to {other.end_s:.1f} s ({counted(other.frames, 'view')}) does not "
                 "hang together with the rest and is left out; import it as a film of its own"
             )
-        return _Placed(frames, xy, seen), scale, height, others
+        return _Registered(frames, xy, seen), scale, height, others
 
-    def _place_by_gps(self, placed: _Placed) -> GpsFit | None:
+    def _place_by_gps(self, registered: _Registered) -> GpsFit | None:
         """Where the pictures' positions put the model, unless a scale is given; None = they do not say."""
         if self._options.scale != ScaleHint():
             return None
-        poses = np.stack([frame.T_world_camera for frame in placed.frames.values()])
+        poses = np.stack([frame.T_world_camera for frame in registered.frames.values()])
         try:
-            return place_by_gps(poses, [self._film.position(index) for index in placed.frames])
+            return place_by_gps(poses, [self._film.position(index) for index in registered.frames])
         except ImportSourceError as error:
             self._notices.append(f"GPS is not used: {error}")
             return None
 
-    def _scale(self, placed: _Placed, look: FilmLook, board: BoardScale | None) -> tuple[float, str]:
+    def _scale(self, registered: _Registered, look: FilmLook, board: BoardScale | None) -> tuple[float, str]:
         """Metres per unit, and how they were found; empty = they were not."""
-        hint, frames = self._options.scale, placed.frames
+        hint, frames = self._options.scale, registered.frames
         if hint.factor is not None:
             return hint.factor, f"given: {hint.factor:g} m per unit"
         if board is not None:
-            return board.metres_per_unit({i: f.T_world_camera for i, f in frames.items()}, placed.seen)
+            return board.metres_per_unit({i: f.T_world_camera for i, f in frames.items()}, registered.seen)
         if hint.camera_height_m is not None:
             floor = floor_under(list(frames.values()))
             if floor is None:
@@ -513,7 +515,7 @@ class _Import:
             height = float(np.median([f.T_world_camera[2, 3] for f in frames.values()])) - floor
             return hint.camera_height_m / height, f"camera {hint.camera_height_m:g} m over the floor that was found"
         if hint.distance is not None:
-            a, b = (self._marked_place(mark, placed, look) for mark in (hint.distance.a, hint.distance.b))
+            a, b = (self._marked_place(mark, registered, look) for mark in (hint.distance.a, hint.distance.b))
             found = float(np.linalg.norm(a - b))
             if found < 1e-6:
                 raise ImportSourceError("the two marked points are one; mark two that are far apart")
@@ -538,12 +540,12 @@ class _Import:
                 f"{film.full_width}x{film.full_height}"
             )
 
-    def _marked_place(self, mark: Mark, placed: _Placed, look: FilmLook) -> Float64:
+    def _marked_place(self, mark: Mark, registered: _Registered, look: FilmLook) -> Float64:
         ratio = self._film.width / self._film.full_width
         seen = Mark(mark.time_s, *self._lens.seen_pixel(mark.u * ratio, mark.v * ratio))
         row = nearest_frame(mark.time_s, look.stamp_ns)
         way = look.way
-        order = sorted(placed.frames)
+        order = sorted(registered.frames)
         rows = np.searchsorted(look.index, order)
         near = [_seconds(look, order[n]) for n in np.argsort(np.abs(rows - row), kind="stable")[:4]]
         if np.abs(way[rows] - way[row]).min() > FOLLOWED:
@@ -555,15 +557,15 @@ class _Import:
         marked = int(look.index[row])
         chosen = {marked, *order[max(0, at - NEIGHBOURS) : at + NEIGHBOURS + 1]}
         pictures = {f.index: _gray(self._lens.seen(f.bgr)) for f in self._frames(chosen)}
-        poses = {index: frame.T_world_camera for index, frame in placed.frames.items()}
-        return marked_place(seen, marked, pictures, poses, placed.seen)
+        poses = {index: frame.T_world_camera for index, frame in registered.frames.items()}
+        return marked_place(seen, marked, pictures, poses, registered.seen)
 
     def _write(
         self,
         dst: Path,
         look: FilmLook,
         picked: list[int],
-        placed: _Placed,
+        registered: _Registered,
         scale: str,
         error_px: float,
         sigmas: colmap.Sigmas | None,
@@ -572,10 +574,10 @@ class _Import:
     ) -> _Written:
         film, camera = self._film, self._options.camera_id
         try:
-            rectify = self._lens.rectify or Rectifier(placed.seen)
+            rectify = self._lens.rectify or Rectifier(registered.seen)
         except ConfigError as error:
             raise ImportSourceError(f"{film.path}: the lens that was found cannot be undone: {error}") from error
-        chooser = _Chooser(look, set(picked), placed)
+        chooser = _Chooser(look, set(picked), registered)
         info = StreamInfo(
             source=f"film {film.path.resolve().name}",
             cameras={camera: rectify.intrinsics},
@@ -583,7 +585,7 @@ class _Import:
             metadata={
                 "poses": "structure from motion",
                 SCALE_KEY: scale or SCALE_UNKNOWN,
-                **scene_depth(median_depth(list(placed.frames.values()))),
+                **scene_depth(median_depth(list(registered.frames.values()))),
                 "stamps": "time within the film",
             }
             | ({} if self._gps is None else {ORIGIN_KEY: str(self._gps.origin)}),
@@ -627,9 +629,9 @@ class _Import:
                 frames=len(look.index),
                 left_out=dict(counts),
                 picked=len(picked),
-                registered=len(placed.frames),
+                registered=len(registered.frames),
                 error_px=error_px,
-                focal_px=placed.seen.fx * ratio,
+                focal_px=registered.seen.fx * ratio,
                 sigmas=sigmas,
             )
             writer.attach(note.attachment())
@@ -637,8 +639,8 @@ class _Import:
             self._notices.append(f"{file.name} {reason}; it is left out")
         return written
 
-    def _some_points(self, placed: _Placed) -> Float64:
-        xyz = np.unique(np.concatenate([frame.xyz for frame in placed.frames.values()]), axis=0)
+    def _some_points(self, registered: _Registered) -> Float64:
+        xyz = np.unique(np.concatenate([frame.xyz for frame in registered.frames.values()]), axis=0)
         return xyz[np.random.default_rng(0).permutation(len(xyz))[:MAX_POINTS]]
 
 
@@ -664,8 +666,8 @@ class _Written:
 class _Chooser:
     """Which frames come into the log, and with which pose; frames come in order."""
 
-    def __init__(self, look: FilmLook, picked: set[int], placed: _Placed) -> None:
-        self._look, self._picked, self._placed = look, picked, placed
+    def __init__(self, look: FilmLook, picked: set[int], registered: _Registered) -> None:
+        self._look, self._picked, self._registered = look, picked, registered
         self._way, self._blurred = look.way, look.blurred
         self._fill = max(FILL, float(self._way[-1]) / MAX_FRAMES)
         self._anchor: Anchor | None = None
@@ -675,13 +677,13 @@ class _Chooser:
     def pose(self, row: int, frame: FilmFrame, lens: _Lens) -> tuple[Float64 | None, str]:
         """T_world_camera (4, 4) of a frame of the log; or None and why it is left out."""
         way = float(self._way[row])
-        placed = self._placed.frames.get(frame.index)
-        if placed is not None:
+        registered = self._registered.frames.get(frame.index)
+        if registered is not None:
             self._anchor = Anchor(
-                _gray(lens.seen(frame.bgr)), self._placed.xy[frame.index], placed.xyz, placed.T_world_camera
+                _gray(lens.seen(frame.bgr)), self._registered.xy[frame.index], registered.xyz, registered.T_world_camera
             )
             self._anchor_way = way
-            return self._taken(placed.T_world_camera, way, frame.stamp_ns), ""
+            return self._taken(registered.T_world_camera, way, frame.stamp_ns), ""
         if self._look.dark[row]:
             return None, "shows nothing"
         if self._blurred[row]:
@@ -692,7 +694,7 @@ class _Chooser:
             return None, "moved too little"
         if self._anchor is None or way - self._anchor_way > FOLLOWED:
             return None, "its place was not found"
-        pose = follow_pose(self._anchor, _gray(lens.seen(frame.bgr)), self._placed.seen)
+        pose = follow_pose(self._anchor, _gray(lens.seen(frame.bgr)), self._registered.seen)
         if pose is None:
             return None, "its place was not found"
         return self._taken(pose, way, frame.stamp_ns), ""
@@ -702,13 +704,13 @@ class _Chooser:
         return pose
 
 
-def _moved(frames: dict[int, PlacedFrame], T: Float64, scale: float) -> dict[int, PlacedFrame]:
+def _moved(frames: dict[int, RegisteredFrame], T: Float64, scale: float) -> dict[int, RegisteredFrame]:
     """The frames after a rigid motion, then a change of scale."""
-    result: dict[int, PlacedFrame] = {}
+    result: dict[int, RegisteredFrame] = {}
     for index, frame in frames.items():
         pose = T @ frame.T_world_camera
         pose[:3, 3] *= scale
-        result[index] = PlacedFrame(frame.stamp_ns, pose, scale * (frame.xyz @ T[:3, :3].T + T[:3, 3]))
+        result[index] = RegisteredFrame(frame.stamp_ns, pose, scale * (frame.xyz @ T[:3, :3].T + T[:3, 3]))
     return result
 
 

@@ -97,7 +97,7 @@ def parse_distance(text: str) -> MarkedDistance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlacedFrame:
+class RegisteredFrame:
     """A frame of the model.
 
     Args:
@@ -127,7 +127,7 @@ def upright(T_world_first: Float64, up: Float64) -> Float64:
     return T_level_world
 
 
-def median_depth(frames: Sequence[PlacedFrame]) -> float:
+def median_depth(frames: Sequence[RegisteredFrame]) -> float:
     """Of all points as their frames see them."""
     depths = [
         (frame.xyz - frame.T_world_camera[:3, 3]) @ frame.T_world_camera[:3, 2] for frame in frames if len(frame.xyz)
@@ -168,7 +168,7 @@ def fit_to_scene(config: MapperConfig, info: StreamInfo) -> tuple[MapperConfig, 
     return msgspec.structs.replace(config, voxel_map=voxel_map, depth=fitted_depth), said
 
 
-def floor_under(frames: Sequence[PlacedFrame]) -> float | None:
+def floor_under(frames: Sequence[RegisteredFrame]) -> float | None:
     """z of the floor under the frames, where z is up; None if no floor is found."""
     camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames]))
     return floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames]), camera_z)
@@ -243,18 +243,18 @@ class BoardScale:
                 frames += 1
                 for point, xy in zip(points, pixels, strict=True):
                     rays.setdefault(tuple(np.round(point, 6)), []).append(ray_of(poses[index], xy, intrinsics))
-        placed = {corner: place for corner, seen in rays.items() if (place := triangulate(seen)) is not None}
-        if len(placed) < MIN_BOARD_CORNERS:
+        corners = {corner: place for corner, seen in rays.items() if (place := triangulate(seen)) is not None}
+        if len(corners) < MIN_BOARD_CORNERS:
             raise ImportSourceError(
-                f"the board tells no scale: {frames} placed frames see it (of {len(self._seen)}), and {len(placed)} "
-                f"of its corners are seen from two sides, {MIN_BOARD_CORNERS} needed; film it larger and walk past it, "
-                "or give the scale in another way"
+                f"the board tells no scale: {frames} registered frames see it (of {len(self._seen)}), and "
+                f"{len(corners)} of its corners are seen from two sides, {MIN_BOARD_CORNERS} needed; film it larger "
+                "and walk past it, or give the scale in another way"
             )
-        on_board, in_world = np.array(list(placed)), np.stack(list(placed.values()))
+        on_board, in_world = np.array(list(corners)), np.stack(list(corners.values()))
         true = np.linalg.norm(on_board[:, None] - on_board[None], axis=2)
         found = np.linalg.norm(in_world[:, None] - in_world[None], axis=2)
         pairs = true > 0.5 * true.max()  # long ones are the most exact
-        return float(np.median(true[pairs] / found[pairs])), f"board: {len(placed)} corners in {frames} frames"
+        return float(np.median(true[pairs] / found[pairs])), f"board: {len(corners)} corners in {frames} frames"
 
 
 def marked_place(
@@ -265,8 +265,8 @@ def marked_place(
     Args:
         mark: The pixel.
         marked: Index of the frame that it is a pixel of; one without a pose will do.
-        pictures: (H, W) gray pictures of this frame and of placed frames around it, by their index.
-        poses: T_world_camera (4, 4) of placed frames, by their index.
+        pictures: (H, W) gray pictures of this frame and of registered frames around it, by their index.
+        poses: T_world_camera (4, 4) of registered frames, by their index.
         intrinsics: Of all.
 
     Raises:
@@ -292,7 +292,7 @@ def marked_place(
     place = triangulate(rays)
     if place is None:
         raise ImportSourceError(
-            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be placed: it is followed into {followed} "
+            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be located: it is followed into {followed} "
             "frames, from one side only; mark a corner with texture around it, at a time when the camera moves sideways"
         )
     return place

@@ -46,7 +46,7 @@ def other_worlds(folder: Path, rounds: int) -> Iterator[Outcome]:
         summary = json.loads((place / "two" / "summary.json").read_text(encoding="utf-8"))
         search = summary["relocalization"]
         lost = FRAMES - summary["frames"]["fused"] - (len(after) if elsewhere else 0)
-        wrong = int(search["worlds_found"] != (0 if elsewhere else 1)) + int(_wrong(found, expected) > WRONG)
+        wrong = int(search["sessions_found"] != (0 if elsewhere else 1)) + int(_wrong(found, expected) > WRONG)
         yield Outcome(
             f"camera comes back in {'another room (mirrored)' if elsewhere else 'another world'}",
             0.0 if elsewhere else told["found"] - told["sought"],
@@ -54,7 +54,7 @@ def other_worlds(folder: Path, rounds: int) -> Iterator[Outcome]:
             others=wrong,
             counts={
                 "frames refused as not found": summary["frames"]["refused"],
-                "worlds found": search["worlds_found"],
+                "worlds found": search["sessions_found"],
             },
         )
 

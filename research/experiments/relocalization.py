@@ -44,8 +44,8 @@ from semantic_mapper.localization.consensus import Sighting, agreed, find_consen
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import MAX_FEATURES, PlaceStore, make_place
 from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.mapping.odometry_sessions import REMEMBERED
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.mapping.worlds import REMEMBERED
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 

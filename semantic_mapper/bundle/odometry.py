@@ -1,6 +1,6 @@
 """Where a single camera went, from its pictures alone, up to scale (monocular visual odometry).
 
-Two views with enough parallax begin the world; from there each picture is placed among the points that earlier ones
+Two views with enough parallax begin the world; from there each picture is registered to the points that earlier ones
 found, and a sliding bundle keeps points and keyframes in agreement. A picture that fits nowhere is lost: no pose, until
 one looks like a keyframe again.
 """
@@ -324,12 +324,12 @@ def _flat_views(
         return None
     if between is None or len(found) == 1:
         return found[0]
-    errors = [_placed_error(points[good], between[good], intrinsics) for _, points, good in found]
+    errors = [_registration_error(points[good], between[good], intrinsics) for _, points, good in found]
     order = np.argsort(errors)
     return found[int(order[0])] if errors[order[1]] > _DECIDED * errors[order[0]] else None
 
 
-def _placed_error(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> float:
+def _registration_error(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> float:
     """RMS pixels by which points (N, 3) are off in the view that they fit best."""
     K = camera_matrix(intrinsics)
     _, turn, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_ITERATIVE)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, UInt8
 
-MIN_VOXELS = 30  # smaller true instances do not count; smaller pieces are none (``queries.instances``)
+MIN_VOXELS = 30  # smaller true instances do not count; smaller pieces are not instances (``queries.instances``)
 IOU = 0.5
 NEITHER = 0.5  # most of a found instance that may lie where nothing counts
 

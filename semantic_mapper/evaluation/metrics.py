@@ -356,7 +356,7 @@ class ConfidenceScores:
     @property
     def open_set_auroc(self) -> float | None:
         """Probability that a pixel of a class that can be predicted has more confidence than one of another class;
-        0.5 = confidence knows nothing of it; None where there are none of either."""
+        0.5 = confidence knows nothing of it; None where either is missing."""
         known, strange = int(self._count.sum()), int(self._strange.sum())
         if not known or not strange:
             return None

@@ -79,7 +79,7 @@ class ViewStrip:
         name: Says which frame ("frame 120").
         rgb: (H, W, 3) uint8.
         rendered: (h, w) uint8 class ids; the ignore id is drawn grey.
-        truth: (H, W) uint8 class ids, None where there are none.
+        truth: (H, W) uint8 class ids, None where they are missing.
         depth_m: (H, W) float32, 0 = none; None for a stream without depth.
         depth_rendered: The field rendered it; no sensor measured it.
     """

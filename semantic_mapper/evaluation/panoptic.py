@@ -49,7 +49,7 @@ class ClassQuality:
 
 @dataclass(frozen=True, slots=True)
 class PanopticMetrics:
-    """Means over the classes that were true or found somewhere, in 0..1; None where there are none.
+    """Means over the classes that were true or found somewhere, in 0..1; None without such classes.
 
     Args:
         pq, sq, rq, pq_plus: Of all classes.

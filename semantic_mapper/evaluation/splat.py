@@ -169,10 +169,10 @@ def _edge_shading(depth: Float32, hit: NDArray[np.bool_], scale: float) -> Float
         reach = radius / scale  # metres on the picture: a slope of 45 degrees darkens no more than by its fraction
         for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)):
             shift = np.array(((1, 0, radius * dx), (0, 1, radius * dy)), np.float32)
-            beside = cv2.warpAffine(
+            shifted = cv2.warpAffine(
                 filled, shift, filled.shape[::-1], flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
             )
-            in_front = (filled - beside) / np.float32(6 * reach + 0.05)
+            in_front = (filled - shifted) / np.float32(6 * reach + 0.05)
             total += np.float32(weight / 8) * np.clip(in_front, 0, 1)
     return np.exp(-EDGE_STRENGTH * total).astype(np.float32)
 

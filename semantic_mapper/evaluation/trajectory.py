@@ -69,7 +69,7 @@ def absolute_trajectory_error(estimated: Float64, truth: Float64) -> TrajectoryE
     """Distances between positions after the estimated path has been aligned to the true one, without scale.
 
     Args:
-        estimated, truth: (N, 4, 4) T_world_camera of the same moments; the worlds may differ.
+        estimated, truth: (N, 4, 4) T_world_camera of the same moments; their world frames may differ.
 
     Raises:
         ShapeError: paths of different lengths, or fewer than 3 poses.
@@ -79,7 +79,7 @@ def absolute_trajectory_error(estimated: Float64, truth: Float64) -> TrajectoryE
 
 
 def relative_pose_error(estimated: Float64, truth: Float64, gap: int = 1) -> TrajectoryError:
-    """How much the motion over ``gap`` poses differs from the true one; independent of the worlds' frames.
+    """How much the motion over ``gap`` poses differs from the true one; independent of their world frames.
 
     Args:
         estimated, truth: (N, 4, 4) T_world_camera of the same moments, N > gap >= 1.

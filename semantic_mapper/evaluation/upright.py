@@ -46,7 +46,7 @@ def upright_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float
 
     Args:
         xyz: (N, 3) world points in metres, N may be 0.
-        up: (3,) rough direction in the world frame; ten degrees off is mended, and so is any error up to 45 degrees
+        up: (3,) rough direction in the world frame; ten degrees off is corrected, and so is any error up to 45 degrees
             where the truth is an axis of the world. ``None`` tries the six axes.
 
     Returns:

@@ -84,7 +84,7 @@ def find_checkpoint(path: Path) -> Path:
 
 
 def shipped_checkpoint(name: Path) -> Path | None:
-    """Weights that ship with the package under a name; None where there are none."""
+    """Weights that ship with the package under a name; None where they are missing."""
     named = _shipped() / f"{name}.safetensors"
     return named if name.parent == Path() and named.exists() else None
 

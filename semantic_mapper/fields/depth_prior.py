@@ -1,7 +1,7 @@
 """Where the surface of each pixel of a view is expected: sensor depth without holes, its borders on the image's edges.
 
-A depth sensor errs at borders: stereo widens what is near and leaves holes beside it, and the nearest measured pixel of
-a hole is often on the wrong surface. Where the neighbourhood of a pixel holds two surfaces, the pixel belongs to the
+A depth sensor errs at borders: stereo widens what is near and leaves holes next to it, and the nearest measured pixel
+of a hole is often on the wrong surface. Where the neighbourhood of a pixel holds two surfaces, the pixel belongs to the
 one whose pixels look more like it: a joint bilateral filter that chooses between both, so that no depth lies between.
 """
 

@@ -403,7 +403,7 @@ def surface_maps(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
     """Maps of the surface (m, 5, H, W) at each pixel; all 0 where depth is not measured.
 
     Channels: inverse depth (1 / m), 1 where depth is measured, height above the lowest point in view (m), cosine of
-    the normal with up, cosine of the normal with the viewing axis (0 beside holes, where there is no normal).
+    the normal with up, cosine of the normal with the viewing axis (0 next to holes, where there is no normal).
 
     Args:
         depth_m: (m, H, W), 0 = none.

@@ -1,6 +1,6 @@
 """Semantic Ray (S-Ray, CVPR 2023): semantics of a query ray from its reprojections into posed source views.
 
-Read top to bottom beside section 3 of the paper: ``encode`` gives the F_j, ``contextual_space`` is Eq. 3 to 5,
+Read top to bottom next to section 3 of the paper: ``encode`` gives the F_j, ``contextual_space`` is Eq. 3 to 5,
 ``attend`` Eq. 6 to 10, ``blend_views`` Eq. 11 and 12, ``render_samples`` Eq. 13.
 
 ``tokens = "samples"`` is the paper's order: attention among all samples, then blending of the views, then

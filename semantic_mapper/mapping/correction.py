@@ -243,7 +243,7 @@ class MapCorrector:
         """(camera_id, stamp_ns) -> T_world_camera (4, 4) of the frames that can be corrected, as the map has them."""
         return {entry.key: entry.frame.T_world_camera for entry in tuple(self._entries)}
 
-    def worlds(self) -> dict[tuple[str, int], int]:
+    def world_by_frame(self) -> dict[tuple[str, int], int]:
         """(camera_id, stamp_ns) -> world in which its pose came, of the frames that can be corrected."""
         return {entry.key: entry.frame.world for entry in tuple(self._entries)}
 

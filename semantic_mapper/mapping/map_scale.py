@@ -10,7 +10,7 @@ from typing import Literal
 
 from semantic_mapper.errors import MapError
 
-MEND = (
+FIX = (
     "give a scale when the film or recording is imported (--distance, --square-mm, --camera-height or --scale), or to "
     "visual odometry (scale, distance_m or camera_height_m), and map it again"
 )
@@ -27,7 +27,7 @@ def require_metres(scale_known: bool, what: str) -> None:
         MapError: lengths of the map are not metres.
     """
     if not scale_known:
-        raise MapError(f"{what}: needs metres, but the scale is unknown; {MEND}")
+        raise MapError(f"{what}: needs metres, but the scale is unknown; {FIX}")
 
 
 def require_same_scale(one_known: bool, other_known: bool, what: str) -> None:
@@ -37,7 +37,7 @@ def require_same_scale(one_known: bool, other_known: bool, what: str) -> None:
         MapError: it is so.
     """
     if one_known != other_known:
-        raise MapError(f"{what}: one map is in metres, the scale of the other is unknown; {MEND}")
+        raise MapError(f"{what}: one map is in metres, the scale of the other is unknown; {FIX}")
 
 
 def scale_name(scale_known: bool) -> Literal["metres", "unknown"]:

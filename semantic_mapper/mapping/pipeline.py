@@ -38,13 +38,13 @@ from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust, rend
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
 from semantic_mapper.mapping.map_types import CorrectedPoses
 from semantic_mapper.mapping.moving import BEYOND_M, MovingFilter
+from semantic_mapper.mapping.odometry_sessions import PoseInMap
 from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer, add_own_image
 from semantic_mapper.mapping.views.virtual_views import RenderedVirtualView, ViewpointChooser, add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.mapping.worlds import Whereabouts
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
 _log = get_logger(__name__)
@@ -86,7 +86,7 @@ class MappingPipeline:
         anchors: Labelled keyframes that the field was finetuned on; they are source views from the first frame on.
 
     Attributes:
-        whereabouts: Of the last frame of a session.
+        pose_in_map: Of the last frame of a session.
         picture_check: What was wrong with pictures that depth was to be computed from, and between them and their
             poses.
 
@@ -112,7 +112,7 @@ class MappingPipeline:
         self.picture_check: PictureCheck = self._frame_depth.pictures
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
         self.moving = MovingFilter(config, label_set)
-        self.whereabouts = Whereabouts()
+        self.pose_in_map = PoseInMap()
         self._viewpoints = ViewpointChooser(config.seed)
         self._uses_own_view = config.keyframes.use_current_view
         self._own_image_weight = config.keyframes.own_image_weight if self._uses_own_view else 0.0

@@ -142,7 +142,7 @@ def search_blocks(
     voxels: BlockVoxels,
     found: Float64,
 ) -> int:
-    """Look for a surface point nearer than ``found``; returns slot * 512 + voxel of it, -1 where there is none.
+    """Look for a surface point nearer than ``found``; returns slot * 512 + voxel of it, -1 where no point is nearer.
 
     Args:
         p: (3,) in units of voxels, as all that follows.

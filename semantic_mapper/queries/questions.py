@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import CodecError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import CorrectionStatus, MapPoints
+from semantic_mapper.mapping.odometry_sessions import CameraPose
 from semantic_mapper.mapping.storage.changes import BlockChanges
-from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
@@ -319,7 +319,7 @@ def decode_question(parts: Parts) -> Request[Any]:
     """A question of any kind.
 
     Raises:
-        CodecError: it is none.
+        CodecError: it is not a question.
     """
     name = read_name(parts)
     if name not in QUESTIONS:

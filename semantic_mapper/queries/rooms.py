@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from semantic_mapper.types import Bool, Float64, Int64
 
 DOOR_M = 1.05  # wider passages part no rooms
-LEAST_DOOR_M = 0.5  # narrower passages are gaps in what was seen of a wall
+LEAST_DOOR_M = 0.5  # narrower passages are holes in what was seen of a wall
 SAME_WIDTH = 0.77  # of the smaller basin's greatest clearance: a passage so wide parts no rooms
 LEAST_ROOM_M2 = 1.0  # what is smaller belongs to the room that it opens to, or to none
-WALL_CLOSING_M = 0.15  # gaps of a wall up to twice this are closed, and so is its inside
+WALL_CLOSING_M = 0.15  # holes of a wall up to twice this are closed, and so is its inside
 LEAST_WALL_M = 0.5  # a wall that is shorter (a column, a lamp) parts no rooms
 MOST_UNSEEN_M = 0.6  # width of a gap in what was seen of one room: no wall is known to be in it
 MOST_HIDDEN_M2 = 1.5  # of floor that is hidden, behind or under furniture
@@ -51,7 +51,7 @@ class RoomPlan(NamedTuple):
 
 
 def find_walls(shown: Bool, cell_m: float) -> Bool:
-    """Cells (H, W) of walls, of those where one was seen: gaps and their inside are closed, short pieces left out."""
+    """Cells (H, W) of walls, of those where one was seen: holes and their inside are closed, short pieces left out."""
     reach = round(WALL_CLOSING_M / cell_m)
     closed = cv2.morphologyEx(
         np.pad(shown, 2 * reach).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8)
@@ -92,7 +92,7 @@ def part_rooms(seen: Bool, wall: Bool, cell_m: float) -> RoomPlan:
 
 
 def _bridged(seen: Bool, reach: int) -> Bool:
-    """With the gaps (H, W) between what was seen that are at most ``2 * reach`` cells wide."""
+    """With the cells (H, W) between what was seen that are at most ``2 * reach`` cells wide."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
     padded = np.pad(seen, 2 * reach).astype(np.uint8)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc) > 0

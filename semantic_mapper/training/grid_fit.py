@@ -173,10 +173,10 @@ def render_frame(grid: SceneGrid, rays: FrameRays, frame: int, near_m: float) ->
     """Colour (H, W, 3) in [0, 1] and z (H, W) in metres of a frame, 0 where less than half of the light is stopped."""
     with torch.no_grad():
         batch = rays.rays(rays.pixels_of(frame), near_m)
-        placed = grid.rays(batch)
-        marched = grid.march(placed)
+        in_grid = grid.rays(batch)
+        marched = grid.march(in_grid)
         weight = marched.weight / marched.weight.sum(1, keepdim=True).clamp_min(1e-6)
-        colour = (weight[..., None] * grid.colour(placed.points(marched.z))).sum(1) * (1 - marched.light)[:, None]
+        colour = (weight[..., None] * grid.colour(in_grid.points(marched.z))).sum(1) * (1 - marched.light)[:, None]
         colour += marched.light[:, None] * grid.sky_colour(batch.direction)
         depth = (weight * marched.z).sum(1) * (marched.light < 0.5)
     size = rays.image_size(frame)

@@ -41,7 +41,7 @@ def semantic_loss(logits: torch.Tensor, channel: torch.Tensor, weight: torch.Ten
 
 
 def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> torch.Tensor:
-    """Cross-entropy over labelled pixels, 0 where there is none.
+    """Cross-entropy over labelled pixels, 0 without any.
 
     Args:
         logits: (m, L, h, w).
@@ -61,7 +61,7 @@ def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> t
 
 
 def guess_loss(geometry: torch.Tensor, given_m: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
-    """Negative log likelihood of the true depth of views that were given none; 0 where there are none.
+    """Negative log likelihood of the true depth of views that were given none; 0 without such views.
 
     A Laplace distribution of log depth round the field's guess, as wide as the field says: near and far errors count
     alike, and the width is learned with the guess.

@@ -143,7 +143,7 @@ def draw_rays(
 
 def classifies_images(model: LearnedField) -> bool:
     """Whether a field of this kind says anything of single images."""
-    # The class decides: the field itself would need views to encode, and there are none yet where a run is checked.
+    # The class decides: the field itself would need views to encode, which are still missing where a run is checked.
     return type(model).source_logits is not LearnedField.source_logits
 
 

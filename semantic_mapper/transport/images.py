@@ -108,7 +108,7 @@ def depth_from_uint16(raw: NDArray[np.uint16], scale: float) -> Float32:
 
 
 def depth_to_uint16(depth_m: Float32, scale: float) -> NDArray[np.uint16] | None:
-    """The sensor units that give exactly ``depth_m`` back, bit for bit; None where there are none."""
+    """The sensor units that give exactly ``depth_m`` back, bit for bit; None where no units do."""
     with np.errstate(invalid="ignore", over="ignore"):
         raw = np.rint(depth_m * np.float32(scale))
         if not bool(np.all((raw >= 0) & (raw <= 65535))):  # NaN compares False

@@ -102,7 +102,7 @@ def load_keys(folder: Path) -> Keys:
     """Read the keys of this machine.
 
     Raises:
-        TransportError: there are none, they are damaged, or others could read the secret one.
+        TransportError: they are missing or damaged, or others could read the secret one.
     """
     path = folder / f"{_OWN}.key_secret"
     if not path.is_file():
@@ -184,7 +184,7 @@ def secure_client(socket: zmq.Socket[bytes], identity: ServerIdentity) -> None:
 
 
 class _AllowList:
-    """Asked by ZeroMQ's authenticator, on its thread, for each connection."""
+    """Called by ZeroMQ's authenticator, on its thread, for each connection."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
@@ -200,7 +200,7 @@ class _AllowList:
         if not allowed:
             self._refused += 1
             if is_power_of_two(self._refused):
-                _log.warning("stranger_refused", key=key.decode(), refused=self._refused)
+                _log.warning("unknown_key_refused", key=key.decode(), refused=self._refused)
         return allowed
 
 

@@ -241,7 +241,7 @@ class WeightsInUse(Wire, frozen=True):
         judged: The version that it was offered last; 0 = none yet.
         accepted: Whether that one was taken.
         reason: Why it was not, for people.
-        rolled_back: How often somebody has asked for other weights.
+        rolled_back: How often somebody has requested other weights.
         contradicts: Whether it was not taken because it contradicts the map, rather than for any other reason.
     """
 

@@ -68,7 +68,7 @@ def receive_bounded(
         Its parts and an empty text; of a message beyond the limits those before the first that is too much, and why.
 
     Raises:
-        zmq.Again: there is none, and the flags say not to wait.
+        zmq.Again: there is no message, and the flags say not to wait.
     """
     parts: list[bytes] = []
     count = size = 0
@@ -497,7 +497,7 @@ class LosslessSubscriber(_Subscriber):
     def _receive_raw(self, poll_ms: float) -> list[bytes] | None:
         with self._mutex:
             self._check_open()
-            self._connections.mend()
+            self._connections.reconnect()
             if not self._socket.poll(math.ceil(poll_ms)):
                 return None
             return self._take_off()
@@ -599,7 +599,7 @@ class NewestSubscriber(_Subscriber):
     def _run(self) -> None:
         try:
             while not self._closed.is_set():
-                self._connections.mend()
+                self._connections.reconnect()
                 if self._socket.poll(_POLL_MS) and (parts := self._take_off()) is not None:
                     self._take(parts)
         except zmq.ZMQError as error:
@@ -675,7 +675,7 @@ class Connections:
         self._listen()
         return max(0, self._count)
 
-    def mend(self) -> None:
+    def reconnect(self) -> None:
         """Make those again that ZeroMQ has given up; often called, costs nothing."""
         self._listen()
         now = time.monotonic()

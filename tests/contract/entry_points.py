@@ -1,4 +1,4 @@
-"""Every import of the project that the contract tests make. A module that moves is mended here, and nowhere else.
+"""Every import of the project that the contract tests make. A module that moves is corrected here, and nowhere else.
 
 The tests speak to what users have: the command, files, sockets, and the Python names of the README and how-tos. What
 they need beyond these (the codec, the table of commands, the structs of the settings) has a name of its own here.
@@ -37,9 +37,9 @@ from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_pat
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.odometry_sessions import CameraPose
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.mapping.worlds import CameraPose
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.console import Output

@@ -35,4 +35,4 @@ def test_a_status_that_cannot_be_sent_is_logged_and_the_next_one_goes_out(tmp_pa
         publish_status(publisher, Status("no such name", "running", 1))
         publish_status(publisher, Status("eye", "running", 2))
         assert subscriber.receive(30) == Status("eye", "running", 2)
-    assert [entry["event"] for entry in told] == ["status_not_told"]
+    assert [entry["event"] for entry in told] == ["status_not_reported"]

@@ -16,9 +16,9 @@ import pytest
 
 from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.labels import NYU40, ROOMS
-from semantic_mapper.nodes.frame_gaps import Gaps
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
+from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions, RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -80,10 +80,10 @@ def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(t
         assert log.info.source == "left eye + right eye"
     assert [f.seq for f in frames if f.camera_id == "left"] == [0, 1, 2, 0, 1, 2]
     assert [f.seq for f in frames if f.camera_id == "right"] == [0, 1]
-    gaps = Gaps()
+    missing = MissingFrames()
     for f in frames:
-        gaps.note(f.camera_id, f.seq)
-    assert (gaps.missed, gaps.begun_anew) == (0, 1)
+        missing.note(f.camera_id, f.seq)
+    assert (missing.missed, missing.restarts) == (0, 1)
 
 
 def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) -> None:

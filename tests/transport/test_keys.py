@@ -78,7 +78,7 @@ def test_peers_alone_are_answered_and_come_and_go_while_the_server_runs(
         pytest.raises(TransportError, match="Does it know this machine's key"),
     ):
         query(server, ServerIdentity(unknown, "robot"))
-    refusals = [e for e in logs if e["event"] == "stranger_refused"]
+    refusals = [e for e in logs if e["event"] == "unknown_key_refused"]
     assert refusals and refusals[0]["key"] == unknown.public.decode()
     with pytest.raises(TransportError, match="no answer"):
         query(server, None)  # in the clear

@@ -387,7 +387,7 @@ def test_a_reader_whose_thread_has_failed_says_why(endpoint: str, monkeypatch: p
         subscriber.wait_until_heard(WAIT_S)
         publisher.publish(encode_frame(samples.make_frame(5)))
         eventually(lambda: subscriber.silent_s is not None)
-        monkeypatch.setattr(subscriber._connections, "mend", fails)
+        monkeypatch.setattr(subscriber._connections, "reconnect", fails)
         assert isinstance(subscriber.receive(WAIT_S), PosedFrame), "what had come before"
         for use in (subscriber.receive, subscriber.wait_until_heard):
             with pytest.raises(TransportError, match="Too many open files"):

@@ -116,7 +116,7 @@ async function show(wanted) {
     const picture = new Image();
     picture.src = `frames/${wanted}/image`;
     await picture.decode();
-    if (mine !== showing) return;  // another one was asked for meanwhile
+    if (mine !== showing) return;  // another one was requested meanwhile
     endStroke();
     image.width = picture.naturalWidth;
     image.height = picture.naturalHeight;

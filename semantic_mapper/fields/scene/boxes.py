@@ -60,8 +60,8 @@ class Intervals:
     """Where R rays are inside of primitives: at most M intervals each, by ascending ``enter``.
 
     Args:
-        enter, leave: (R, M) float32 metres of z; infinite where there is none.
-        index: (R, M) int64 position of the primitive; -1 where there is none.
+        enter, leave: (R, M) float32 metres of z; infinite after the last interval.
+        index: (R, M) int64 position of the primitive; -1 after the last.
         count: (R,) int64 how many there are; those beyond M are left out.
     """
 

@@ -372,11 +372,11 @@ class GridField(LearnedField):
 
     def march(self, rays: RayBatch, kept: int = KEPT, jitter: torch.Tensor | None = None) -> RaySamples:
         """The samples of greatest weight of each ray."""
-        placed = self.grid.rays(rays, jitter)
-        marched = self.grid.march(placed, kept)
+        in_grid = self.grid.rays(rays, jitter)
+        marched = self.grid.march(in_grid, kept)
         if not self.fitted:
             marched = March(marched.z, torch.zeros_like(marched.weight), torch.ones_like(marched.light))
-        return RaySamples(rays, placed.points(marched.z), marched.z, marched.weight, marched.light)
+        return RaySamples(rays, in_grid.points(marched.z), marched.z, marched.weight, marched.light)
 
     def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
         """Depths (R, K) of the samples of greatest weight."""
@@ -391,8 +391,8 @@ class GridField(LearnedField):
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
     ) -> tuple[FieldRender, torch.Tensor]:
         """Render rays at given sample depths z (R, N), metres; also the compositing weights (R, N)."""
-        placed = self.grid.rays(rays)
-        samples = self.samples_at(rays, placed, z)
+        in_grid = self.grid.rays(rays)
+        samples = self.samples_at(rays, in_grid, z)
         return self.render_marched(samples, sources), samples.weight
 
     def render_marched(self, samples: RaySamples, sources: EncodedViews) -> FieldRender:
@@ -415,13 +415,13 @@ class GridField(LearnedField):
             return self.grid.colour(samples.points)
         return self.trunk.colour(self.trunk(samples.points), samples.rays.direction)
 
-    def samples_at(self, rays: RayBatch, placed: GridRays, z: torch.Tensor) -> RaySamples:
+    def samples_at(self, rays: RayBatch, in_grid: GridRays, z: torch.Tensor) -> RaySamples:
         """Samples at given depths, each as long as it is to the next one."""
-        points = placed.points(z)
+        points = in_grid.points(z)
         top = points.new_tensor([n - 1 for n in self.config.grid.shape])
         inside = ((points >= 0) & (points <= top)).all(-1)
         raw = gather(self.grid.values, points)[..., 0]
-        length = interval_lengths(z, placed.direction.norm(dim=1))
+        length = interval_lengths(z, in_grid.direction.norm(dim=1))
         depth = SceneGrid.optical_depth(raw) * length * inside * self.fitted
         before = torch.cumsum(depth, 1) - depth
         weight = torch.exp(-before) * -torch.expm1(-depth)

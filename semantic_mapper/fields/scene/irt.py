@@ -2,7 +2,7 @@
 
 A scene grid with features, fitted to the colours of all frames, stays as it is. Along a ray its points of greatest
 weight become tokens; they attend to each other and to the texture of the ray's own pixel, where the image is there.
-Composited like colours, beside that texture, they give the classes.
+Composited like colours, next to that texture, they give the classes.
 """
 
 from __future__ import annotations

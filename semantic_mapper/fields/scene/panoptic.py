@@ -233,7 +233,7 @@ class Panoptic(GridField):
         return torch.maximum(torch.minimum(*ends).amax(1), rays.near_m), torch.maximum(*ends).amin(1)
 
     def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
-        """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 where there is none.
+        """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 outside of all boxes.
 
         Where boxes of one class overlap, a point is of the one whose centre is nearer.
         """

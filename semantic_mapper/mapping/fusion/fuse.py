@@ -158,7 +158,7 @@ def frame_votes(
     """Votes of a frame, none without a table; each weighs what the depth under it does, where ``trust`` says so.
 
     Raises:
-        FrameError: probabilities that are none.
+        FrameError: invalid probabilities.
     """
     if table is None:
         return no_votes(depth.shape[0], depth.shape[1], classes)

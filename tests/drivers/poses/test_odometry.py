@@ -118,7 +118,7 @@ def test_a_camera_that_stays_lost_begins_a_new_world_and_goes_on_there() -> None
     assert all(e is not None and e.world == 0 for e in follow(here, source))
     found = follow(there, source)
     assert found[:5] == [None] * 5  # it may see an old place again
-    assert source.counters["new_worlds"] == 1 and source.warnings == ()
+    assert source.counters["new_sessions"] == 1 and source.warnings == ()
     later = [e for e in found[5:] if e is not None]
     assert len(later) == 4 and {e.world for e in later} == {1}
     assert np.array_equal(later[0].T_world_camera, np.eye(4)) and source.counters["loops_closed"] == 0

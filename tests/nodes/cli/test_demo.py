@@ -31,5 +31,5 @@ def test_doctor_finds_what_the_tests_themselves_need(tmp_path: Path) -> None:
     for name in ("Python", "packages", "libusb", "Open3D", "torch", "sockets", "CPU"):
         assert checks[name]["state"] == "ok", checks[name]
     assert (checks["weights"]["state"] == "ok") == default_checkpoint_path().is_file()
-    assert all(c["mend"] for c in checks.values() if c["state"] == "bad")
+    assert all(c["fix"] for c in checks.values() if c["state"] == "bad")
     assert done.returncode == int(any(c["state"] == "bad" for c in checks.values()))

@@ -82,7 +82,7 @@ def test_info_shows_topics_frames_and_classes(log: Path) -> None:
         assert text in done.stdout
 
 
-def test_info_lists_the_gaps_of_each_camera(tmp_path: Path) -> None:
+def test_info_lists_the_missing_frames_of_each_camera(tmp_path: Path) -> None:
     """Frames that a recorder dropped, and a camera that stood still; another camera is whole."""
     whole, frames = tiny_frames(6), []
     for camera, seqs in (("left", (0, 1, 2, 6, 7, 9)), ("right", range(6))):
@@ -91,18 +91,18 @@ def test_info_lists_the_gaps_of_each_camera(tmp_path: Path) -> None:
             for frame, seq in zip(whole, seqs, strict=True)
         ]
     frames.sort(key=lambda frame: frame.stamp_ns)
-    log = tmp_path / "gaps.mcap"
+    log = tmp_path / "missing.mcap"
     with LogWriter(log, StreamInfo("test", {"left": INTRINSICS, "right": INTRINSICS}, ROOMS)) as writer:
         for frame in frames:
             writer.write_frame(frame)
-    gaps = json.loads(run("info", log, "--json").stdout)["gaps"]
-    left = gaps["left"]
-    assert (left["frames_missing"], left["sequence_gaps"], left["largest_sequence_gap"]) == (4, 2, 3)
-    assert (left["time_gaps"], left["longest_time_gap_s"], left["interval_s"]) == (1, 0.4, 0.1)
+    missing = json.loads(run("info", log, "--json").stdout)["missing_frames"]
+    left = missing["left"]
+    assert (left["frames_missing"], left["sequence_gap_count"], left["largest_sequence_gap"]) == (4, 2, 3)
+    assert (left["time_gap_count"], left["longest_time_gap_s"], left["interval_s"]) == (1, 0.4, 0.1)
     assert left["largest_sequence_gap_after_seq"] == left["longest_time_gap_after_seq"] == 2
-    assert gaps["right"]["frames_missing"] == gaps["right"]["time_gaps"] == 0
+    assert missing["right"]["frames_missing"] == missing["right"]["time_gap_count"] == 0
     shown = " ".join(run("info", log).stdout.split())
-    assert "gaps left" in shown and "4 frames missing" in shown and "after seq 2" in shown
+    assert "missing frames left" in shown and "4 frames missing" in shown and "after seq 2" in shown
 
 
 def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.mapping.rendered_views import small_map
-from tests.mapping.test_worlds import INTRINSICS, abroad, even_map, off, other_world, walk
+from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even_map, off, other_world, walk
 from tests.nodes.support import error_line, run
 
 
@@ -40,6 +40,7 @@ def test_the_frames_of_a_log_are_found_in_a_map_each_world_by_itself(tmp_path: P
     told = json.loads(found.stdout)
     assert (told["frames"], told["found"], told["refused"]) == (5, 5, {})
     assert [frame["number"] for frame in told["unreadable"]] == [5]
-    assert [(w["world"], w["agreeing"]) for w in told["worlds"]] == [(0, 4), (2, 1)]
-    assert off(np.array(told["worlds"][0]["T_map_world"]) @ other_world(), np.eye(4))[0] < 0.1
-    assert told["worlds"][1]["T_map_world"] is None and told["worlds"][1]["disagreement"] == "1 of 3 frames agree on it"
+    assert [(w["world"], w["agreeing"]) for w in told["sessions"]] == [(0, 4), (2, 1)]
+    assert off(np.array(told["sessions"][0]["T_map_world"]) @ other_world(), np.eye(4))[0] < 0.1
+    alone = told["sessions"][1]
+    assert alone["T_map_world"] is None and alone["disagreement"] == "1 of 3 frames agree on it"

@@ -27,7 +27,7 @@ def of(path: Path, *settings: str) -> dict[str, list[Check]]:
 
 def test_launch_file_that_up_would_refuse_is_bad(tmp_path: Path) -> None:
     (refused,) = of(REPLAY_LAUNCH)["replay.toml"]
-    assert refused.state == "bad" and "needs 'log'" in refused.found and "--set camera.log=" in refused.mend
+    assert refused.state == "bad" and "needs 'log'" in refused.found and "--set camera.log=" in refused.fix
     assert of(tmp_path / "none.toml")["none.toml"][0].state == "bad"
 
 
@@ -44,9 +44,9 @@ def test_addresses_are_told_with_who_has_them() -> None:
         ("note", f"{taken} is in use (by this very launch, if it runs)"),
         ("ok", "tcp://127.0.0.1:0"),
     ]
-    assert f"sport = :{taken.rpartition(':')[2]}" in found["address"][1].mend
+    assert f"sport = :{taken.rpartition(':')[2]}" in found["address"][1].fix
     (refused,) = [c for c in of(ROBOT, f"mapper.query={everywhere}")["address"] if c.state == "bad"]
-    assert "which needs keys" in refused.found + refused.mend
+    assert "which needs keys" in refused.found + refused.fix
 
 
 def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,10 +55,10 @@ def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pyt
     found = of(ROBOT, *settings)
     (none,) = found["keys"]
     assert "address" not in found, "told once"
-    assert (none.state, none.mend) == ("bad", f"make them with `semantic-mapper keys make --keys {folder}`")
+    assert (none.state, none.fix) == ("bad", f"make them with `semantic-mapper keys make --keys {folder}`")
     own = make_keys(folder)
     found = of(ROBOT, *settings)
-    assert found["keys"][0].state == "note" and "keys allow" in found["keys"][0].mend
+    assert found["keys"][0].state == "note" and "keys allow" in found["keys"][0].fix
     assert [c.state for c in found["address"]] == ["ok", "bad", "ok"], "nobody could come in from elsewhere"
     allow(folder, "desk", make_keys(tmp_path / "desk").public.decode())
     found = of(ROBOT, *settings)
@@ -67,7 +67,7 @@ def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pyt
     secret = next(folder.glob("*.key_secret"))
     secret.chmod(0o644)
     open_to_all = of(ROBOT, *settings)["keys"][0]
-    assert open_to_all.state == "bad" and f"chmod 600 {secret}" in open_to_all.mend
+    assert open_to_all.state == "bad" and f"chmod 600 {secret}" in open_to_all.fix
     assert own.secret.decode() not in str(of(ROBOT, *settings))
 
     monkeypatch.setattr(doctor_launch, "user_key_folder", lambda: tmp_path / "nowhere")
@@ -96,7 +96,7 @@ def test_packages_of_bridges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.delitem(sys.modules, "semantic_mapper.nodes.foxglove.sdk")
     monkeypatch.setitem(sys.modules, "foxglove", None)
     (missing,) = of(CAMERA, "camera.kind=oak", "foxglove.enabled=true")["foxglove"]
-    assert missing.state == "bad" and "semantic-mapper[foxglove]" in missing.found + missing.mend
+    assert missing.state == "bad" and "semantic-mapper[foxglove]" in missing.found + missing.fix
 
 
 def test_a_camera_that_is_not_connected_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

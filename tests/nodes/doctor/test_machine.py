@@ -18,6 +18,6 @@ def test_packages_are_checked_with_their_versions_and_without_extras(monkeypatch
 
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: requires)
     monkeypatch.setattr(doctor.metadata, "version", version)
-    told = " ".join(f"{check.state} {check.found} {check.mend}" for check in doctor._packages())
+    told = " ".join(f"{check.state} {check.found} {check.fix}" for check in doctor._packages())
     assert "open3d 0.21.0, not <0.21,>=0.20" in told and "no-such-package" in told
     assert "torch 2.5.1+cpu, not" not in told and "rerun-sdk" not in told

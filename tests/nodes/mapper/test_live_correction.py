@@ -321,7 +321,7 @@ def test_corrected_poses_are_in_the_world_of_their_frames(bundle_of):
     frames = tiny_frames(2)
     session = session_of(bundle_of(), ())
     T_map_world = drift(0.5)
-    session.worlds.known |= {0: np.eye(4), 7: T_map_world}
+    session.odometry_sessions.known |= {0: np.eye(4), 7: T_map_world}
     for frame, world in zip(frames, (0, 7), strict=True):
         session.process(dataclasses.replace(frame, world=world))
     poses = {f.stamp_ns: drift(0.2) @ f.T_world_camera for f in frames}

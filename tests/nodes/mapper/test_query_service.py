@@ -20,8 +20,8 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError
 from semantic_mapper.geometry import transform
 from semantic_mapper.mapping.moving import MovingSpace
+from semantic_mapper.mapping.odometry_sessions import CameraPose, PoseInMap
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.mapping.worlds import CameraPose, Whereabouts
 from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.queries.instances import Instance, InstanceTracker
@@ -420,20 +420,20 @@ def test_a_mapper_that_nobody_asks_is_not_looked_at(endpoint: str, monkeypatch: 
 
 
 def test_where_the_last_frame_was_taken_is_told() -> None:
-    whereabouts = Whereabouts()
+    pose_in_map = PoseInMap()
     with (
         a_folder() as folder,
-        QueryService(f"ipc://{folder / 'query'}", whole_map(), whereabouts=whereabouts) as service,
+        QueryService(f"ipc://{folder / 'query'}", whole_map(), pose_in_map=pose_in_map) as service,
         MapClient(service.endpoint, timeout_s=60) as client,
     ):
         assert client.pose() is None
-        whereabouts.last = CameraPose("oak", 5, None, "looking")
+        pose_in_map.last = CameraPose("oak", 5, None, "looking")
         unknown = client.pose()
         assert unknown is not None and unknown.T_map_camera is None
         assert (unknown.camera_id, unknown.stamp_ns, unknown.reason) == ("oak", 5, "looking")
         pose = np.diag([-1.0, -1.0, 1.0, 1.0])
         pose[:3, 3] = 1.5, -2.0, 1 / 3
-        whereabouts.last = CameraPose("oak", 6, pose)
+        pose_in_map.last = CameraPose("oak", 6, pose)
         known = client.pose()
         assert known is not None and known.reason == "" and known.T_map_camera is not None
         np.testing.assert_array_equal(known.T_map_camera, pose)

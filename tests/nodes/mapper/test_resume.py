@@ -23,8 +23,8 @@ from semantic_mapper.nodes.mapper.resume import (
     continue_map,
     forbid,
     keep_earlier,
-    note_worlds,
-    noted_worlds,
+    note_sessions,
+    noted_sessions,
     resume_map,
     stored_settings,
 )
@@ -120,9 +120,9 @@ def test_a_saved_map_is_gone_on_in_where_it_can_be_found_again(tmp_path: Path) -
 
 def test_where_worlds_lie_is_noted_for_the_mapper_after_this_one(tmp_path: Path) -> None:
     T = np.diag([-1.0, -1.0, 1.0, 1.0])
-    assert noted_worlds(context(tmp_path / "notes", 0)) == {}
-    note_worlds(context(tmp_path / "notes", 0), {0: np.eye(4), 2**60: T})
-    noted = noted_worlds(context(tmp_path / "notes", 1))
+    assert noted_sessions(context(tmp_path / "notes", 0)) == {}
+    note_sessions(context(tmp_path / "notes", 0), {0: np.eye(4), 2**60: T})
+    noted = noted_sessions(context(tmp_path / "notes", 1))
     assert set(noted) == {0, 2**60} and np.array_equal(noted[2**60], T)
 
 

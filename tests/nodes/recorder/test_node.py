@@ -28,9 +28,9 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.nodes.cli.record import _join
-from semantic_mapper.nodes.frame_gaps import MAX_MISSED
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder, read_launch_note
+from semantic_mapper.nodes.missing_frames import MAX_MISSED
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest

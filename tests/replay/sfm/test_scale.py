@@ -13,7 +13,7 @@ from semantic_mapper.replay.sfm.scale import (
     BoardScale,
     Mark,
     MarkedDistance,
-    PlacedFrame,
+    RegisteredFrame,
     ScaleHint,
     fit_to_scene,
     floor_under,
@@ -79,11 +79,11 @@ def test_the_floor_is_the_lowest_strong_layer(rng: np.random.Generator) -> None:
     table = np.column_stack((rng.uniform(-1, 1, (300, 2)), rng.normal(0.75, 0.01, 300)))
     stray = rng.uniform((-2, -2, -0.5), (2, 2, 2.5), (40, 3))
     few = floor[:15]
-    frames = [PlacedFrame(0, T, np.concatenate((floor, table, stray)))]
+    frames = [RegisteredFrame(0, T, np.concatenate((floor, table, stray)))]
     found = floor_under(frames)
     assert found is not None and abs(found) < 0.05
-    assert floor_under([PlacedFrame(0, T, np.concatenate((table, few)))]) is None  # most is on the table
-    assert floor_under([PlacedFrame(0, T, table + np.array((0, 0, 2.0)))]) is None
+    assert floor_under([RegisteredFrame(0, T, np.concatenate((table, few)))]) is None  # most is on the table
+    assert floor_under([RegisteredFrame(0, T, table + np.array((0, 0, 2.0)))]) is None
 
 
 def test_up_is_where_upright_edges_meet(rng: np.random.Generator) -> None:
@@ -149,7 +149,7 @@ def test_a_marked_pixel_counts_in_its_own_frame_also_where_that_has_no_pose(rng:
     place = marked_place(Mark(0.4, 180.0, 100.0), 4, pictures, poses, camera)
     true = ((180 - 159.5) / 100 + 4 * step * 0.01, (100 - 119.5) / 100, 3.0)
     assert place == pytest.approx(true, abs=0.02)
-    with pytest.raises(ImportSourceError, match="cannot be placed"):
+    with pytest.raises(ImportSourceError, match="cannot be located"):
         marked_place(Mark(0.4, 180.0, 100.0), 4, {4: pictures[4]}, poses, camera)
 
 

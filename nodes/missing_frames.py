@@ -1,12 +1,12 @@
-"""Frames that never came, told by the numbers of those that did."""
+"""Frames that never came, counted by the numbers of those that did."""
 
 from __future__ import annotations
 
 MAX_MISSED = 2**53  # numbers may jump by anything; beyond this, sums of counts would not be exact in every reader
 
 
-class Gaps:
-    """Counts the gaps between the numbers of frames, camera by camera.
+class MissingFrames:
+    """Counts the frames that are missing between others by their numbers, camera by camera.
 
     Attributes:
         missed: Frames, ``MAX_MISSED`` at most.
@@ -14,7 +14,7 @@ class Gaps:
 
     def __init__(self) -> None:
         self.missed = 0
-        self.begun_anew = 0  # times that a camera began to count from the start: it was restarted
+        self.restarts = 0  # times that a camera began to count from the start: it was restarted
         self._last: dict[str, int] = {}
 
     def note(self, camera_id: str, seq: int) -> None:
@@ -24,6 +24,6 @@ class Gaps:
         if last is None:
             return
         if seq <= last:
-            self.begun_anew += 1
+            self.restarts += 1
         else:
             self.missed = min(self.missed + seq - last - 1, MAX_MISSED)

@@ -14,8 +14,8 @@ from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.correction import ALWAYS
 from semantic_mapper.mapping.map_alignment import find_alignment
+from semantic_mapper.mapping.odometry_sessions import HELD, OdometrySessions
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.mapping.worlds import HELD, MapWorlds
 from semantic_mapper.replay.session import MapSession, Refusal
 from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 
@@ -72,58 +72,58 @@ def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
     held = 0
     for frame in walk()[1:12:2]:
         results = session.process(abroad(frame))
-        last = session.pipeline.whereabouts.last
+        last = session.pipeline.pose_in_map.last
         assert last is not None and last.stamp_ns == frame.stamp_ns
         if not results:
             held += 1
-            assert session.worlds.held == held and "held until" in session.worlds.warning
+            assert session.odometry_sessions.held == held and "held until" in session.odometry_sessions.warning
             assert last.T_map_camera is None and last.reason
         else:
             assert last.T_map_camera is not None and off(last.T_map_camera, frame.T_world_camera)[0] < 0.05
             told = results[-1]
             assert isinstance(told, MapUpdate) and told.world == 7
             np.testing.assert_allclose(told.T_map_world @ abroad(frame).T_world_camera, last.T_map_camera, atol=1e-9)
-    assert held >= 2 and session.worlds.found == 1 and not session.worlds.held
-    moved, turned = off(session.worlds.known[7], invert_pose(other_world()))
+    assert held >= 2 and session.odometry_sessions.found == 1 and not session.odometry_sessions.held
+    moved, turned = off(session.odometry_sessions.known[7], invert_pose(other_world()))
     assert moved < 0.1 and turned < 1.0  # where the map's origin lies, metres away
     assert session.fused == 12 and not len(session.refusals.first)
 
 
 def test_the_same_room_mirrored_and_another_room_are_refused_with_the_reason() -> None:
     for frames in ([mirrored(f) for f in walk()[1::5]], list(walk(TRAIN_SEEDS[19], 8)[1::3])):
-        worlds = MapWorlds(even_map(), own_first=False)
+        sessions = OdometrySessions(even_map(), own_first=False)
         for frame in frames:
-            taken = worlds.take(abroad(frame))
+            taken = sessions.take(abroad(frame))
             assert not taken.ready
-        assert worlds.found == 0 and worlds.refused.total() == len(frames)
-        given_up = worlds.take_rest().given_up
+        assert sessions.found == 0 and sessions.refused.total() == len(frames)
+        given_up = sessions.take_rest().given_up
         assert len(given_up) == len(frames) and all("its place in the map is not known" in why for _, why in given_up)
 
 
 def test_frames_that_wait_are_bounded_and_the_oldest_are_given_up() -> None:
-    worlds = MapWorlds(VoxelMap(SETTINGS.voxel_map, even_map().label_set), own_first=False)
-    given_up = [f for n in range(HELD + 5) for f, _ in worlds.take(replace(abroad(walk()[0]), seq=n)).given_up]
-    assert [f.seq for f in given_up] == [0, 1, 2, 3, 4] and worlds.held == HELD
-    assert worlds.refused["no-places"] == HELD + 5
+    sessions = OdometrySessions(VoxelMap(SETTINGS.voxel_map, even_map().label_set), own_first=False)
+    given_up = [f for n in range(HELD + 5) for f, _ in sessions.take(replace(abroad(walk()[0]), seq=n)).given_up]
+    assert [f.seq for f in given_up] == [0, 1, 2, 3, 4] and sessions.held == HELD
+    assert sessions.refused["no-places"] == HELD + 5
 
 
 def test_no_world_is_found_in_a_map_that_is_about_to_move() -> None:
     moving = [True]
-    worlds = MapWorlds(even_map(), own_first=False, correcting=lambda: moving[0])
+    sessions = OdometrySessions(even_map(), own_first=False, correcting=lambda: moving[0])
     for frame in walk()[1:6]:
-        assert not worlds.take(abroad(frame)).ready
-    assert worlds.reason == "the map is being corrected" and worlds.held == 5
+        assert not sessions.take(abroad(frame)).ready
+    assert sessions.reason == "the map is being corrected" and sessions.held == 5
     moving[0] = False
-    ready = [f.seq for frame in walk()[6:12] for f in worlds.take(abroad(frame)).ready]
-    assert worlds.found == 1 and ready[:5] == [frame.seq for frame in walk()[1:6]]
+    ready = [f.seq for frame in walk()[6:12] for f in sessions.take(abroad(frame)).ready]
+    assert sessions.found == 1 and ready[:5] == [frame.seq for frame in walk()[1:6]]
 
 
 def test_classes_that_are_not_the_maps_are_refused() -> None:
     ids = even_map().label_set.ids
-    worlds = MapWorlds(even_map(), lambda frame: np.full((30, 40), ids[-1], np.uint8), own_first=False)
+    sessions = OdometrySessions(even_map(), lambda frame: np.full((30, 40), ids[-1], np.uint8), own_first=False)
     for frame in walk()[1:8:2]:
-        assert not worlds.take(abroad(frame)).ready
-    assert worlds.refused["classes"] >= 3
+        assert not sessions.take(abroad(frame)).ready
+    assert sessions.refused["classes"] >= 3
 
 
 def test_frames_are_found_where_a_correction_has_moved_the_map() -> None:
@@ -140,7 +140,7 @@ def test_frames_are_found_where_a_correction_has_moved_the_map() -> None:
     results: list[MapUpdate | Refusal] = []
     for frame in walk()[1:8:2]:
         results += session.process(abroad(frame))
-    last = session.pipeline.whereabouts.last
+    last = session.pipeline.pose_in_map.last
     assert results and last is not None and last.T_map_camera is not None
     assert off(last.T_map_camera, shift @ walk()[7].T_world_camera)[0] < 0.05
 

@@ -1,4 +1,4 @@
-"""Frames of other worlds, brought into that of the map.
+"""Frames of other odometry sessions, brought into the map's world.
 
 A camera that tracks itself begins its world where it starts: after it was unplugged, or in another launch, its poses
 say nothing of where it is in the map. Its frames are held until they are found there (``localization.relocalizer``),
@@ -59,28 +59,28 @@ class CameraPose:
     reason: str = ""
 
 
-class Whereabouts:
+class PoseInMap:
     """Where the last frame was taken, ``last``, for any thread; None before the first."""
 
     def __init__(self) -> None:
         self.last: CameraPose | None = None
 
 
-class MapWorlds:
-    """Which worlds are known in a map, and the search for those that are not.
+class OdometrySessions:
+    """Which odometry sessions are known in a map, and the search for those that are not.
 
     Args:
         voxel_map: With its places.
         classify: Class ids (h, w) of a frame as its pixels alone tell them; they have to agree with the map's. None =
             classes are not looked at.
         own_first: The first world that comes is the map's own, as in a map that begins empty.
-        whereabouts: Is given the pose of every frame.
+        pose_in_map: Is given the pose of every frame.
         motion: By how much frames to come of a world are moved later on, (4, 4); see ``MapCorrector.motion``.
         correcting: Whether the map is about to move; no world is looked for meanwhile.
 
     Attributes:
         known: T_map_world (4, 4) by world.
-        found: Worlds that were found.
+        found: Sessions that were found.
         refused: Looks at a frame that did not find it, by reason.
         reason: Why the last frame was not found; empty where it was, or needs no search.
     """
@@ -91,7 +91,7 @@ class MapWorlds:
         classify: Callable[[PosedFrame], UInt8] | None = None,
         *,
         own_first: bool = True,
-        whereabouts: Whereabouts | None = None,
+        pose_in_map: PoseInMap | None = None,
         motion: Callable[[int], Float64] = lambda world: np.eye(4),
         correcting: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -105,7 +105,7 @@ class MapWorlds:
         self.known: dict[int, Float64] = {}
         self.found = 0
         self.refused: Counter[str] = Counter()
-        self._whereabouts = whereabouts or Whereabouts()
+        self._pose_in_map = pose_in_map or PoseInMap()
         self.reason = ""
 
     @property
@@ -124,15 +124,15 @@ class MapWorlds:
         """T_map_world (4, 4) of a known world, for frames that come now."""
         return move(self._motion(world), self.known[world])
 
-    def in_map(self, poses: CorrectedPoses, worlds: Mapping[tuple[str, int], int]) -> CorrectedPoses:
-        """Corrected poses, each in the world of its frame (``MapCorrector.worlds``), in that of the map.
+    def in_map(self, poses: CorrectedPoses, world_by_frame: Mapping[tuple[str, int], int]) -> CorrectedPoses:
+        """Corrected poses, each in the world of its frame (``MapCorrector.world_by_frame``), in that of the map.
 
         Of frames that are not known the pose stays as it is.
         """
-        by_stamp = {stamp_ns: world for (_, stamp_ns), world in worlds.items()}
+        by_stamp = {stamp_ns: world for (_, stamp_ns), world in world_by_frame.items()}
         moved: dict[Any, Float64] = {}
         for key, pose in poses.items():
-            world = worlds.get(key) if isinstance(key, tuple) else by_stamp.get(key)
+            world = world_by_frame.get(key) if isinstance(key, tuple) else by_stamp.get(key)
             moved[key] = move(self.known[world], pose) if world in self.known else pose
         return moved
 
@@ -151,7 +151,7 @@ class MapWorlds:
         self._held.append(frame)
         given_up = ((self._held.popleft(), self._why()),) if len(self._held) > HELD else ()
         if not self._look(frame):
-            self._whereabouts.last = CameraPose(frame.camera_id, frame.stamp_ns, None, self.reason)
+            self._pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, None, self.reason)
             return Taken(given_up=given_up)
         ready = [f for f in self._held if f.world in self.known]
         self._held = deque(f for f in self._held if f.world not in self.known)
@@ -170,7 +170,7 @@ class MapWorlds:
         """A frame of a known world."""
         pose = move(self.known[frame.world], frame.T_world_camera)
         self.reason = ""
-        self._whereabouts.last = CameraPose(frame.camera_id, frame.stamp_ns, move(self._motion(frame.world), pose))
+        self._pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, move(self._motion(frame.world), pose))
         return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
 
     def _look(self, frame: PosedFrame) -> bool:
