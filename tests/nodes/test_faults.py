@@ -68,6 +68,7 @@ def frame_numbers(log: Path) -> list[int]:
         return [envelope.seq for envelope, _ in reader.frame_parts()]
 
 
+@pytest.mark.gate
 @pytest.mark.slow
 def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
     long_log: Path, weights: Path, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
