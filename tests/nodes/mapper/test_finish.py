@@ -21,6 +21,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.config import load_mapper_config
 from semantic_mapper.replay.jobs import ReplayRequest, replay_log
 from semantic_mapper.nodes.process import StopRequest, prepare_process
 prepare_process()
