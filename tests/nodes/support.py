@@ -118,9 +118,9 @@ def run_here(*arguments: str | Path) -> tuple[int, str]:
 class Running:
     """The command in the background; its stderr is read line by line."""
 
-    def __init__(self, *arguments: str | Path) -> None:
+    def __init__(self, *arguments: str | Path, command: Path = COMMAND) -> None:
         self.process = subprocess.Popen(
-            [str(COMMAND), *map(str, arguments)],
+            [str(command), *map(str, arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

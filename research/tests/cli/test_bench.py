@@ -1,4 +1,4 @@
-"""``bench map`` as people run it."""
+"""``semantic-mapper-research bench map`` as people run it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Pat
     assert "1 of 1 rooms unchanged" in done.stdout
     assert "too short for a slope" in done.stdout.replace("\n", " ") and "% a minute" not in done.stdout
     found = json.loads(file.read_text(encoding="utf-8"))
-    assert found["map"]["frames"] == 12 and found["map"]["memory_mb"] == 30
-    assert found["map"]["step_p50_ms"] > 0 and found["machine"]["cpu"]
+    assert found["frames"] == 12 and found["memory_mb"] == 30
+    assert found["step_p50_ms"] > 0
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 import signal
 from pathlib import Path
 
@@ -16,10 +15,12 @@ from semantic_mapper.fields.checkpoint import find_checkpoint, load_checkpoint
 from semantic_mapper.fields.nesf import load_nesf
 from semantic_mapper.labels import ROOMS
 from tests.mapping.test_refine import UP, make_map
+from tests.nodes.support import COMMAND as PRODUCT
 from tests.nodes.support import Running, error_line, eventually
 from tests.small import tiny_frames
 
 ROOT = Path(__file__).resolve().parents[3]
+COMMAND = PRODUCT.with_name("semantic-mapper-research")
 CONFIG = """
 seconds = 0
 steps = 4
@@ -74,7 +75,7 @@ def test_ctrl_c_saves_what_resume_goes_on_with(recipe: Path, tmp_path: Path) -> 
     recipe.write_text(f'keep = "last"\n{CONFIG}', encoding="utf-8")
     out = tmp_path / "rooms.safetensors"
     history = tmp_path / "rooms-training" / "history.jsonl"
-    with Running("train", "--config", recipe, "--out", out, "--steps", "100000") as running:
+    with Running("train", "--config", recipe, "--out", out, "--steps", "100000", command=COMMAND) as running:
         assert eventually(lambda: history.is_file() and len(history.read_text().splitlines()) >= 2), running.text
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 130, running.text
@@ -85,39 +86,6 @@ def test_ctrl_c_saves_what_resume_goes_on_with(recipe: Path, tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
     assert f"the weights of the last validation, of step {stopped_at + 2}: mIoU" in done.stdout
     assert load_checkpoint(out).recipe["steps"] == stopped_at + 2
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_ctrl_c_under_ray_saves_what_resume_goes_on_with(recipe: Path, tmp_path: Path) -> None:
-    recipe.write_text(f'keep = "last"\n{CONFIG}', encoding="utf-8")
-    out = tmp_path / "run"
-    history = out / "history.jsonl"
-    with Running("train", "--config", recipe, "--out", out, "--steps", "100000", "--ray", "local") as running:
-        assert eventually(lambda: history.is_file() and len(history.read_text().splitlines()) >= 2, 240), running.text
-        os.killpg(running.process.pid, signal.SIGINT)  # a terminal interrupts all processes, Ray's as well
-        assert running.wait() == 130, running.text
-    assert "the state and the latest weights are saved, --resume goes on" in running.text
-    assert not list(out.glob(".ray-*"))
-    stopped_at = load_checkpoint(out / "weights.safetensors").recipe["steps"]
-    assert stopped_at >= 4
-    done = run("train", "--config", recipe, "--out", out, "--steps", str(stopped_at + 2), "--resume")
-    assert done.returncode == 0, done.stderr
-    assert load_checkpoint(out / "weights.safetensors").recipe["steps"] == stopped_at + 2
-
-
-def test_ranks_without_ray_and_ray_under_torchrun_are_refused(
-    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = run("train", "--config", recipe, "--out", tmp_path / "run", "--ranks", "2")
-    assert done.returncode == 1 and "need --ray; torchrun has --nproc_per_node" in done.stderr
-    for options in (("--ray", "local"), ("--ranks", "2")):
-        done = run("train", "--kind", "nesf", "--out", tmp_path / "run", *options)
-        assert done.returncode == 1 and "--ray and its options are for fields" in done.stderr
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    done = run("train", "--config", recipe, "--out", tmp_path / "run", "--ray", "local")
-    assert done.returncode == 1 and "run it without torchrun" in done.stderr
-    assert not (tmp_path / "run").exists()
 
 
 def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:

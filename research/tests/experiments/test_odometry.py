@@ -20,7 +20,7 @@ def test_a_log_is_followed_judged_drawn_and_written_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, config = tmp_path / "room.mcap", tmp_path / "odometry.toml"
-    config.write_text("width = 160\ndepth_max_m = 6.0\n", encoding="utf-8")
+    config.write_text("loop_closure = false\n", encoding="utf-8")
     with LogWriter(log, StreamInfo("room", {"rooms": INTRINSICS}, label_set=ROOMS)) as writer:
         for frame in room_frames(TRAIN_SEEDS[7], 12, INTRINSICS, path=CameraPathConfig(step_m=0.04)):
             writer.write_frame(frame)
