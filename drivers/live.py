@@ -195,7 +195,7 @@ class LiveCamera:
 
     def stop(self) -> None:
         """As of ``Camera``."""
-        self._stopping.set()  # no lock: a signal handler may interrupt whoever holds it
+        self._stopping.set()  # no lock: a signal handler may interrupt the thread that holds it
 
     def _open(self) -> Device:
         """Raises: CameraError: see ``__enter__``."""
