@@ -30,7 +30,6 @@ from research.suites.klevr_nesf import (
     exact_grid,
     last_fifth,
     nesf_arms,
-    nesf_curve,
     nesf_network,
     nesf_scores,
     network_path,
@@ -133,7 +132,7 @@ def test_damaged_files_of_an_arm_are_made_again(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     first, curve = arm_network(few, "exact-points", tmp_path)
     kept = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    assert len(kept) == 2 and curve[-1].step == 20 and nesf_curve(few, "exact-points", tmp_path) == curve
+    assert len(kept) == 2 and curve[-1].step == 20
     for path, content in kept.items():
         path.write_bytes(content[: len(content) // 2])
         again, same = arm_network(few, "exact-points", tmp_path)
