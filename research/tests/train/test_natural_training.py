@@ -9,16 +9,15 @@ import torch
 
 from research.train.step import StepConfig, pick_views_on_path
 from research.train.view_draws import degrade_view, natural_weights
-from semantic_mapper.config import EncoderConfig, SRayConfig, UNetFieldConfig
+from semantic_mapper.config import EncoderConfig, SRayConfig
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.losses import guess_loss, semantic_loss
 from semantic_mapper.training.views import draw_pixels
 from semantic_mapper.types import SourceViews
 from tests.fields.scene import pose_at, wall_sources
-from tests.small import SMALL_ENCODER, tiny_field
+from tests.small import SMALL_ENCODER
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -96,21 +95,6 @@ def test_a_frozen_colour_network_keeps_weights_and_statistics_while_the_other_le
     with encoder.batch_statistics():
         encoder(views).square().mean().backward()
     assert all(p.grad is not None for p in encoder.colour_net.parameters())
-
-
-def test_a_field_starts_as_the_classifier_of_a_unet() -> None:
-    field = tiny_field()
-    unet = UNetField(UNetFieldConfig(field.config.feature_dim, field.config.encoder), ROOMS).eval()
-    unet.encoder.load_state_dict(field.encoder.state_dict())
-    assert field.start_from_classifier(*unet.image_classifier())
-    views = source_views(2, (36, 48))
-    with torch.no_grad():
-        encoded = field.encode(views)
-        torch.testing.assert_close(
-            field.source_logits(encoded), unet.source_logits(unet.encode(views)), atol=1e-4, rtol=1e-4
-        )
-    other = torch.zeros(len(ROOMS), field.config.feature_dim + 4)
-    assert not field.start_from_classifier(other, torch.zeros(len(ROOMS)))
 
 
 @pytest.mark.parametrize("name", ["own_view_degraded", "wide_fraction"])
