@@ -15,7 +15,7 @@ from semantic_mapper.nodes.launcher.processes import NodeProcess
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.plain_text import visible
 from semantic_mapper.replay.log.format import LogAttachment, LogWriter
-from semantic_mapper.replay.page import Card, Section, table_of, write_page
+from semantic_mapper.replay.page import Section, table_of, write_page
 from semantic_mapper.transport.messages import StreamInfo
 from tests.nodes.support import error_line, run, run_here
 from tests.small import INTRINSICS, tiny_field, tiny_frames
@@ -110,8 +110,7 @@ def test_report_pages_hold_names_as_text(results: Path) -> None:
     hostile = "</script><b>\u202e"
     view = {"classes": [{"id": 1, "name": hostile, "color": "red", "share": "1 %"}], "data": {"name": hostile}}
     table = table_of(("<i>",), [("\x1b[2J",)])
-    cards = [Card(hostile, lines=[hostile])]
-    section = Section(hostile, [hostile], view, cards=cards, tables=[table], lines=[hostile], folded={hostile: hostile})
+    section = Section(hostile, [hostile], view, tables=[table], folded={hostile: hostile})
     write_page(results / "made.html", hostile, [section])
     text = (results / "made.html").read_text(encoding="utf-8")
     assert visible(text, keep="\n") == text and text.count("</script>") == 2
