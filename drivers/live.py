@@ -319,6 +319,43 @@ def nominal_hz(reported: float) -> float:
     return reported if MIN_HZ <= reported <= 1000 else 0.0
 
 
+class FrameCounter:
+    """Numbers a camera's images from 0, with jumps where images were lost, over all its connections.
+
+    Args:
+        hz: Nominal rate, by which the images that are lost while the device is away are counted.
+    """
+
+    def __init__(self, hz: float) -> None:
+        self._period_ns = 1e9 / hz
+        self._last: tuple[int, int] | None = None  # number and stamp of the last image
+        self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
+
+    def restart(self) -> None:
+        """The device counts again from here."""
+        self._shift = None
+
+    def refusal(self, stamp_ns: int) -> str:
+        """Why an image of this stamp is passed over (not later than the one before, or of the future); or empty."""
+        if stamp_ns > time.monotonic_ns() + FUTURE_NS:
+            return "its stamp is in the future: check the clocks of this machine and of the device"
+        if self._last is not None and stamp_ns <= self._last[1]:
+            return "its stamp is not later than that of the image before"
+        return ""
+
+    def number(self, counted: int, stamp_ns: int) -> int:
+        """Number of the image that the device counts as ``counted``."""
+        number = 0
+        if self._last is not None:
+            last, last_ns = self._last
+            number = counted + self._shift if self._shift is not None else last
+            if number <= last:  # the device counts again: ask the clock
+                number = last + max(2, round((stamp_ns - last_ns) / self._period_ns))
+        self._shift = number - counted
+        self._last = (number, stamp_ns)
+        return number
+
+
 class StreamClock:
     """Stamps images by the sender's clock.
 

@@ -72,7 +72,7 @@ class RealSenseCamera(PolledCamera):
                 raise CameraError(f"{stream.name}: a stop was requested before its first image")
             lens = frames.color.profile.as_video_stream_profile().get_intrinsics()
             if self._maker is None:
-                self._maker = ImageMaker(self._camera_id, lens)
+                self._maker = ImageMaker(self._camera_id, lens, self._config.fps)
             else:
                 self._maker.connected(lens)
         except StreamEnded as end:

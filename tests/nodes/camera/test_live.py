@@ -339,30 +339,12 @@ def test_a_driver_that_hangs_is_told_apart_from_a_camera_that_is_waited_for(mach
     os.close(theirs)
 
 
-def test_counters_add_up_to_what_was_captured(machine: Machine, tmp_path: Path) -> None:
-    with running(v4l2(machine.plug(Sensor(), 0), tmp_path) | {"max_frames": 12}) as node:
-        end = node.until(lambda m: isinstance(m, EndOfStream))
-        node.thread.join(PATIENCE_S)
-    assert isinstance(end, EndOfStream) and end.published == 12 and end.reason == "end"
-    frames = node.frames()
-    assert len(frames) == 12 and all(f.seq % 3 != 2 for f in frames)
-
-
 def test_a_camera_that_is_not_there_yet_is_waited_for(machine: Machine, tmp_path: Path) -> None:
     with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path)) as node:
         waiting = node.until(lambda m: isinstance(m, Status) and m.state == "starting" and bool(m.degraded))
         assert isinstance(waiting, Status) and "is it plugged in" in waiting.degraded[0]
         machine.plug(Sensor(), 0)
         node.until(lambda m: isinstance(m, PosedFrame))
-    assert node.error is None
-
-
-def test_stopped_while_it_waits_for_the_camera_it_ends(machine: Machine, tmp_path: Path) -> None:
-    with running(v4l2(machine.dev / "video0", tmp_path)) as node:
-        node.until(lambda m: isinstance(m, Status))
-        node.stop.signum = 15
-        node.thread.join(PATIENCE_S)
-        assert not node.thread.is_alive()
     assert node.error is None
 
 
@@ -373,18 +355,6 @@ def test_patience_with_a_camera_can_be_limited(machine: Machine, tmp_path: Path)
         node.thread.join(PATIENCE_S)
         assert not node.thread.is_alive()
     assert isinstance(node.error, CameraError) and "is it plugged in" in str(node.error)
-
-
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [({"calibration": ""}, "semantic-mapper calibrate"), ({"devise": "x"}, "did you mean `device`")],
-)
-def test_mistakes_are_told_before_the_camera_is_waited_for(
-    machine: Machine, tmp_path: Path, settings: dict[str, Any], says: str
-) -> None:
-    with running(v4l2(machine.dev / "video0", tmp_path, **settings)) as node:
-        node.thread.join(PATIENCE_S)
-    assert isinstance(node.error, CameraError | ConfigError) and says in str(node.error)
 
 
 @pytest.mark.parametrize(
