@@ -33,7 +33,7 @@ from semantic_mapper.mapping.fusion.fuse import (
     trusted_depth,
 )
 from semantic_mapper.mapping.map_scale import require_same_scale, scale_name
-from semantic_mapper.mapping.map_types import InstanceLayer, MapMesh, MapPoints, MapView
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.changes import (
@@ -66,9 +66,8 @@ class VoxelMap:
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
     are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
-    where none did. ``instances`` says which voxels belong to which thing, where that refinement found out; None
-    otherwise, and as soon as anything changes. ``places`` are views to find the map again by. ``cleared`` counts the
-    voxels of surfaces that frames saw through, and that were forgotten (``clear_free_space``), in this process.
+    where none did. ``places`` are views to find the map again by. ``cleared`` counts the voxels of surfaces that frames
+    saw through, and that were forgotten (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.
@@ -89,7 +88,6 @@ class VoxelMap:
         self.last_stamp_ns = 0
         self.scale_known = True
         self.refined = ""
-        self.instances: InstanceLayer | None = None
         self.places = PlaceStore()
         self.cleared = 0
         self._cleared_rows = NONE_CLEARED
@@ -268,7 +266,6 @@ class VoxelMap:
             MapError: see ``BlockGrid.batches``.
         """
         version = self.version + 1
-        self.instances = None
         for blocks in self._grid.batches(packed):
             yield blocks
             self._grid.mark_changed(blocks, version)
@@ -289,7 +286,7 @@ class VoxelMap:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
             self.note_scale(other.scale_known)
-            self.refined, self.instances, self.places = other.refined, other.instances, other.places
+            self.refined, self.places = other.refined, other.places
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
@@ -410,7 +407,7 @@ class VoxelMap:
                 scale=scale_name(self.scale_known),
                 refined=self.refined,
             )
-            return MapSaving(self.locked, manifest, self.instances, self.places.places)
+            return MapSaving(self.locked, manifest, self.places.places)
 
     @classmethod
     def load(cls, path: Path, memory_mb: int | None = None, config: VoxelMapConfig | None = None) -> VoxelMap:
@@ -446,7 +443,6 @@ class VoxelMap:
                 with _KERNEL_LOCK:
                     blocks = loaded._grid.fill(pack_keys(keys), values)
                     loaded._grid.mark_changed(blocks, saved.frames)
-            loaded.instances = reader.instances()
             loaded.places = PlaceStore(reader.places())
         loaded.frames = loaded.version = saved.frames
         loaded.last_stamp_ns = saved.last_stamp_ns
@@ -497,7 +493,6 @@ class VoxelMap:
             self.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)
             self.note_scale(other.scale_known)
             self.refined = self.refined or other.refined
-            self.instances = None
             for place in other.places.places:
                 self.places.add(moved_place(place, T_self_other))
 

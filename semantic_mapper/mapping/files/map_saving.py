@@ -14,7 +14,6 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.localization.places import Place
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, BlockPart, MapManifest, write_map
-from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import unpack_keys
 from semantic_mapper.mapping.storage.block_store import BlockValues, find_sorted, unpack_blocks
@@ -102,7 +101,6 @@ class MapSaving:
     Args:
         locked: Gives the storage of the map, alone; it is held while this is made.
         manifest: Settings, classes and counters of the map.
-        instances: Which voxels belong to which thing, if the map says so.
         places: What the map is found again by.
     """
 
@@ -110,12 +108,10 @@ class MapSaving:
         self,
         locked: Callable[[], AbstractContextManager[BlockGrid]],
         manifest: MapManifest,
-        instances: InstanceLayer | None = None,
         places: tuple[Place, ...] = (),
     ) -> None:
         self._locked = locked
         self._manifest = manifest
-        self._instances = instances
         self._places = places
         with locked() as grid:
             self._snapshot = GridSnapshot(grid)
@@ -131,7 +127,7 @@ class MapSaving:
             MapError: the file cannot be written; one that was there before is as it was.
         """
         try:
-            manifest = write_map(path, self._manifest, self._parts(between), self._instances, self._places)
+            manifest = write_map(path, self._manifest, self._parts(between), self._places)
         finally:
             with self._locked():
                 self._snapshot.close()
