@@ -37,7 +37,7 @@ from semantic_mapper.mapping.correction import CorrectionStatus, FusedFrame, Map
 from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust, rendered_trust
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
 from semantic_mapper.mapping.map_types import CorrectedPoses
-from semantic_mapper.mapping.moving import BEYOND_M, MovingFilter
+from semantic_mapper.mapping.moving import MovingFilter
 from semantic_mapper.mapping.odometry_sessions import PoseInMap
 from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.mapping.pose_check import PoseCheck
@@ -394,8 +394,6 @@ class MappingPipeline:
         depth_m = full.depth_m
         if full.moving is not None and frame.depth_m is not None:
             depth_m = np.where(full.moving, frame.depth_m, depth_m)
-        if self.config.voxel_map.no_return_range_m > 0:
-            depth_m = np.where(depth_m == BEYOND_M, np.float32(0), depth_m)
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -576,8 +574,6 @@ class MappingPipeline:
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
             depth, trust = views.depth(frame.intrinsics), None
-            if self.config.voxel_map.no_return_range_m > 0:  # what is left out is no free space
-                depth = np.where(frame.depth_m == BEYOND_M, BEYOND_M, depth)
             if frame.depth_sigma_m is not None:
                 trust = computed_trust(depth, frame.depth_sigma_m)
         rows = upsample(view.probabilities, view.known, views.rgb(low), views.depth(low), frame.rgb, depth)

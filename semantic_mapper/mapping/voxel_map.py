@@ -22,7 +22,7 @@ from semantic_mapper.mapping.files.map_file import MapManifest, open_map
 from semantic_mapper.mapping.files.map_saving import MapSaving
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
-from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, clear_in_view, clear_without_return, depth_bounds
+from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, clear_in_view, depth_bounds
 from semantic_mapper.mapping.fusion.fuse import (
     SURFACE_WEIGHT,
     check_depth,
@@ -177,8 +177,7 @@ class VoxelMap:
 
         Args:
             frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
-            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement. All but
-                the last are free space up to ``no_return_range_m``.
+            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement.
             probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
@@ -199,8 +198,7 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if frame.intrinsics.distorted:
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        given = check_depth(depth_m, frame.intrinsics, where)
-        depth, weights = trusted_depth(given, trust, where)
+        depth, weights = trusted_depth(check_depth(depth_m, frame.intrinsics, where), trust, where)
         table = None
         if probabilities is not None:
             table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
@@ -236,10 +234,7 @@ class VoxelMap:
                 )
                 cleared.append((pack_keys(self._grid.buffers().keys[blocks]), voxels))
             if clears:
-                grid, limits, reach = self._grid, self._limits, self.config.no_return_range_m
-                cleared += clear_in_view(grid, packed, camera, limits, depth, rgb, bounds, self.version)
-                if reach > 0:
-                    cleared += clear_without_return(grid, camera, limits, given, rgb, reach, self.version)
+                cleared += clear_in_view(self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version)
                 for keys, voxels in cleared:
                     self.cleared += int(voxels.sum())
                     some = np.flatnonzero(voxels)
