@@ -229,8 +229,8 @@ class PoseRefinerConfig(Config, frozen=True):
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
-    # Corrections reach the last this many frames; older ones stay in the map where they are, and are kept in a second
-    # map for that. 0 = keep none.
+    # Corrections reach at least the last this many frames, at most twice as many; older ones stay in the map where they
+    # are. 0 = keep none.
     max_frames: NotNegative = 0
     # In the folder for temporary files; the oldest frames leave earlier for it.
     max_disk_mb: AtLeastOne = 4000

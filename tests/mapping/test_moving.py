@@ -153,8 +153,8 @@ def test_a_passer_by_is_no_wall_neither_when_the_map_is_built_again() -> None:
     assert abs(np.median(on.moving.space.points[:, 2]) - THING_M) < 0.1 and not len(off.moving.space.points)
     assert wall_of(on) < 0.05 * wall_of(off) and on.moving.pixels > 10_000 and off.moving.pixels == 0
     before = on.voxel_map.block_state()
-    on.correct_poses({11 * 10**9 // HZ: on.corrector.place(scene(11, None, shift_m=0.33)[0]).T_world_camera})
-    while not on.advance_correction(4):
+    on.corrector.start({11 * 10**9 // HZ: on.corrector.place(scene(11, None, shift_m=0.33)[0]).T_world_camera})
+    while not on.corrector.advance(4):
         pass
     after = on.voxel_map.block_state()
     assert all(np.array_equal(before[name], after[name]) for name in before)
