@@ -13,6 +13,7 @@ Same images, same poses and corrections, bit for bit.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -140,7 +141,8 @@ class OdometryPoseSource(PoseSource):
         self._next_try = 0  # keyframe that is tried next while lost
         self._closer = LoopCloser(self._counters) if config.loop_closure else None
         self._trail = PoseTrail()  # stays empty where no loops are closed: nothing moves then
-        self._world = 0
+        # That of another process, or of this one after it, is another world.
+        self._world = time.monotonic_ns() if can_be_found(config) else 0
         self._images = 0  # with a pose in this world
         self._corrected: CorrectedWorld | None = None
         self._closed_ns = -_PAUSE_NS

@@ -18,7 +18,7 @@ from semantic_mapper.backoff import backoff_s
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
 from semantic_mapper.drivers.mounts import Mount, mount_of
-from semantic_mapper.drivers.poses.config import OdometryPoses, PoseChecks, begins_world, can_be_found, gives_metres
+from semantic_mapper.drivers.poses.config import PoseChecks, begins_world, can_be_found, gives_metres
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 from semantic_mapper.drivers.registry import open_camera
@@ -118,7 +118,6 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> PosedCam
         checks=checks,
         T_rig_camera=mount.for_poses(poses),
         scale_known=gives_metres(poses),
-        begins_world=isinstance(poses, OdometryPoses) and can_be_found(poses),  # a device tells it itself
     )
 
 
