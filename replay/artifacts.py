@@ -16,7 +16,6 @@ from semantic_mapper import __version__
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.evaluation.metrics import confusion_of
-from semantic_mapper.evaluation.overview import ViewStrip, draw_overview, draw_strip
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
@@ -26,6 +25,7 @@ from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import SceneGraph, find_graph
+from semantic_mapper.replay.overview import ViewStrip, draw_overview, draw_strip
 from semantic_mapper.replay.page import (
     Section,
     picture,

@@ -20,14 +20,14 @@ from markupsafe import Markup, escape
 from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.overview import ELEVATION, LabelledPoints
-from semantic_mapper.evaluation.splat import open_side, point_spacing
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.plain_text import visible
 from semantic_mapper.plots import UNKNOWN, class_rows, encode_picture
 from semantic_mapper.redaction import without_secrets
+from semantic_mapper.replay.overview import open_side, point_spacing
 from semantic_mapper.types import Float64, UInt8
 
 MAX_VIEW_POINTS = 300_000  # 10 bytes each
@@ -124,7 +124,7 @@ def picture_files(*files: tuple[Path, str]) -> Iterator[Picture]:
             yield picture(np.asarray(cv2.cvtColor(data, cv2.COLOR_BGR2RGB), np.uint8), caption, photo=True)
 
 
-def point_view(points: LabelledPoints, label_set: LabelSet, up: Float64 | None) -> dict[str, Any]:
+def point_view(points: MapPoints, label_set: LabelSet, up: Float64 | None) -> dict[str, Any]:
     """The map for the page's 3D view: ``classes`` as a legend, and ``data`` for ``templates/points.js``.
 
     The points are turned upright. Positions are uint16 fractions of their bounds, below a millimetre in a map of 60 m.
@@ -160,7 +160,7 @@ def point_view(points: LabelledPoints, label_set: LabelSet, up: Float64 | None) 
         "size": max(float(np.linalg.norm(np.ptp(middle, axis=0))), 0.1),
         "spacing": point_spacing(xyz),
         "ceiling": ceiling_height(xyz),
-        "azimuth": open_side(xyz, ELEVATION),
+        "azimuth": open_side(xyz),
         "classes": _base64(table.tobytes()),
         "xyz": _base64(np.round((xyz - low) / extent * 65535).astype("<u2").tobytes()),
         "rgb": _base64(points.rgb[chosen].tobytes()),
