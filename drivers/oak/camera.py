@@ -68,7 +68,7 @@ class OakCamera(PolledCamera):
 
     def _images(self) -> Iterator[CameraImage]:
         waiting: deque[CameraImage] = deque()  # for their poses
-        while not self._stopped.is_set() and self._stream is not None:
+        while not self._stopping.is_set() and self._stream is not None:
             try:
                 messages = self._stream.read(SLICE_S if not waiting else SLICE_S / 10)
             except StreamEnded:
@@ -157,7 +157,7 @@ class OakCamera(PolledCamera):
         Raises:
             CameraError, StreamEnded: there is no image, or neither says anything.
         """
-        messages = stream.first(self._stopped)
+        messages = stream.first(self._stopping)
         reported = None if messages is None else reported_intrinsics(messages[0])
         self._warn("geometry", "" if messages is None else geometry_trouble(*messages))
         config = self._config

@@ -50,7 +50,7 @@ class _Entry:
 
 
 class LogReader:
-    """A recorded log, open for reading; a ``FrameSource``. Iterate it as often as you like, also from several threads.
+    """A recorded log, open for reading. Iterate it as often as you like, also from several threads.
 
     A message that is damaged or cannot be decoded becomes a ``LogError`` in ``errors`` (each once) and goes to
     ``on_error``; iteration goes on with the next. A message whose checksum is wrong is never used.

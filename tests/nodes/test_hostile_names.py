@@ -10,7 +10,7 @@ from rich.table import Table
 
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS, LabelSet
-from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.processes import NodeProcess
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.plain_text import visible
@@ -148,17 +148,3 @@ def test_every_place_of_a_table_and_a_line_is_plain(name: str, shown: str) -> No
     for place in ("head", "title", "caption", "cell", "line"):
         assert f"{place} {shown}" in stream.getvalue()
     assert len(stream.getvalue().splitlines()) == 5  # title, table of 5 lines, caption, line
-
-
-def test_progress_is_plain(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm")
-    with frame_progress("play [/b]\x1b]0;x\x07", 3) as bar:
-        bar.set(1, note="[/b]\x1b]0;y\x07")
-    said = capsys.readouterr().err
-    assert r"play [/b]\x1b]0;x\x07" in said and r"[/b]\x1b]0;y\x07" in said and "\x1b]0" not in said
-
-
-def test_messages_in_a_style_are_plain(capsys: pytest.CaptureFixture[str]) -> None:
-    stderr_console().print("stopped; the map is in /tmp/[/b]\x1b[2J", style="yellow")
-    assert r"/tmp/[/b]\x1b[2J" in capsys.readouterr().err
