@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Literal, cast
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
+from semantic_mapper.types import Float32, Float64, UInt8
 
 PICTURES = (".jpg", ".jpeg", ".png")
 DEPTHS = (".png", ".npy", ".npz")
@@ -133,41 +133,6 @@ class ImportReport:
     format: str
     info: StreamInfo
     bytes: int
-
-
-@dataclass(frozen=True, slots=True)
-class LoadedFrame:
-    """One frame of a recording.
-
-    Args:
-        frame: Ready for the log.
-        encoded_rgb: Its colour image as the file holds it; None where it had to be changed.
-        label_error: Why it has no label image although there is a file; None where all is well.
-    """
-
-    frame: PosedFrame
-    encoded_rgb: EncodedImage | None
-    label_error: BadFrameError | None = None
-
-
-class Recording(Protocol):
-    """A foreign recording, opened. ``load`` may be called in any order."""
-
-    info: StreamInfo
-    depth_scale: DepthScale  # of its depth images
-    notices: list[str]
-
-    def __len__(self) -> int:
-        """Frames, good and bad."""
-        ...
-
-    def load(self, number: int) -> LoadedFrame:
-        """Read one frame.
-
-        Raises:
-            BadFrameError: it cannot be used.
-        """
-        ...
 
 
 class BadFrameError(ImportSourceError):
@@ -312,20 +277,6 @@ def read_label(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt8:
 def same_view(a: tuple[int, int], b: tuple[int, int]) -> bool:
     """Whether images of two sizes have one form, so that one can be the other made smaller; their sides are rounded."""
     return abs(a[0] * b[1] - a[1] * b[0]) <= max(*a, *b)
-
-
-def image_size_must_be(rgb: UInt8, intrinsics: CameraIntrinsics, file: Path) -> None:
-    """Refuse an image of another size than its camera makes.
-
-    Raises:
-        BadFrameError: naming both sizes.
-    """
-    if rgb.shape[:2] != (intrinsics.height, intrinsics.width):
-        raise BadFrameError(
-            file,
-            f"the image is {rgb.shape[1]}x{rgb.shape[0]}, the camera's intrinsics say "
-            f"{intrinsics.width}x{intrinsics.height}; resize it or fix the intrinsics",
-        )
 
 
 def check_frame_pose(T_world_camera: Float64, file: Path, line: int | None = None) -> Float64:

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import FrameError, ImportSourceError
 from semantic_mapper.geometry import check_pose, invert_pose, transform
 from semantic_mapper.labels import LabelSet
@@ -130,7 +131,7 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
             )
     pictures.sort(key=lambda picture: (picture.seq, picture.camera_id))  # the two cameras fire together
 
-    def read_depth(picture: PosedPicture) -> Float32:
+    def read_depth(picture: PosedPicture, _: Rectifier) -> Float32:
         assert picture.depth_file is not None
         intrinsics, T_cam0_camera = rectified[picture.camera_id]
         T_camera_scanner = invert_pose(T_cam0_camera) @ T_cam0_scanner

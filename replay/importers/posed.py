@@ -19,7 +19,6 @@ from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
-    LoadedFrame,
     check_frame_pose,
     read_depth,
     read_label,
@@ -28,6 +27,7 @@ from semantic_mapper.replay.importers.base import (
     same_view,
 )
 from semantic_mapper.replay.importers.tables import left_out_notice
+from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
@@ -72,8 +72,23 @@ class PosedPicture:
     camera_id: str = CAMERA_ID
 
 
+@dataclass(frozen=True, slots=True)
+class LoadedFrame:
+    """One frame of a recording.
+
+    Args:
+        frame: Ready for the log.
+        encoded_rgb: Its colour image as the file holds it; None where it had to be changed.
+        label_error: Why it has no label image although there is a file; None where all is well.
+    """
+
+    frame: PosedFrame
+    encoded_rgb: EncodedImage | None
+    label_error: BadFrameError | None = None
+
+
 class PosedPictures:
-    """The pictures of a recording, as ``Recording``.
+    """The pictures of a recording; ``load`` may be called in any order.
 
     Args:
         source: What the log names as its source.
@@ -84,8 +99,10 @@ class PosedPictures:
         metric: Whether lengths are metres.
         hz: About the rate of the pictures.
         labels: Classes of the label images; None = there are none.
+        read_rgb: Reads a picture.
+        read_depth: Reads the depth image of a picture, in metres and in the pixels of its rectified image; None = by
+            ``depth_scale``, where its file is there.
         read_label: Reads a label image of a size (height, width).
-        read_depth: Reads the depth image of a picture in metres; None = by ``depth_scale``.
 
     Raises:
         ImportSourceError: there is no picture.
@@ -102,15 +119,16 @@ class PosedPictures:
         metric: bool = True,
         hz: float = DEFAULT_HZ,
         labels: LabelSet | None = None,
+        read_rgb: Callable[[Path], tuple[UInt8, EncodedImage | None]] = read_rgb,
+        read_depth: Callable[[PosedPicture, Rectifier], Float32] | None = None,
         read_label: Callable[[Path, LabelSet, tuple[int, int]], UInt8] = read_label,
-        read_depth: Callable[[PosedPicture], Float32] | None = None,
     ) -> None:
         if not pictures:
             raise ImportSourceError(f"{source}: holds no posed picture")
         self.notices = list(notices)
         self.depth_scale = depth_scale
         self._with_depth = not options.without_depth
-        self._read_label, self._read_depth = read_label, read_depth or self._depth_of_file
+        self._read_rgb, self._read_depth, self._read_label = read_rgb, read_depth, read_label
         self._pictures, self._stamps_ns = _in_time(_once_each(pictures, self.notices), hz, self.notices)
         self._factor = options.scale or 1.0
         self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
@@ -120,7 +138,7 @@ class PosedPictures:
                 "the scale is unknown: lengths of the log are not metres; give --scale, metres per unit of the poses"
             )
         named = [picture.depth_file for picture in self._pictures if picture.depth_file is not None]
-        missing = [str(file) for file in named if not file.exists()] if self._with_depth else []
+        missing = [str(file) for file in named if not file.exists()] if self._with_depth and read_depth is None else []
         self.notices += left_out_notice("depth image", missing, "missing")
         cameras = {
             picture.camera_id: self._rectifier(picture.view or picture.intrinsics, picture.file).intrinsics
@@ -150,7 +168,7 @@ class PosedPictures:
         pose = picture.pose.copy()
         pose[:3, 3] *= self._factor
         check_frame_pose(pose, picture.file)
-        rgb, encoded = read_rgb(picture.file)
+        rgb, encoded = self._read_rgb(picture.file)
         size = (rgb.shape[0], rgb.shape[1])
         own = _at_size(picture, size)
         lens = self._rectifier(picture.view or own, picture.file)
@@ -166,37 +184,34 @@ class PosedPictures:
             label = None if label is None else _in_view(label, own, picture.view, cv2.INTER_NEAREST)
         elif changed:
             rgb = lens(np.ascontiguousarray(rgb[..., ::-1]))
-        depth, sigma = self._depth(picture, (rgb.shape[0], rgb.shape[1]))
+        depth = sigma = None
+        if picture.depth_file is not None and self._with_depth:
+            if self._read_depth is not None:
+                depth = self._read_depth(picture, lens)
+            elif picture.depth_file.exists():
+                depth = self._depth(picture.depth_file, lens, rgb, picture.confidence_file)
+        if picture.sigma_file is not None and depth is not None:
+            sigma = self._depth(picture.sigma_file, lens, rgb)
         frame = PosedFrame(
             stamp_ns=self._stamps_ns[number],
             seq=number if picture.seq is None else picture.seq,
             camera_id=picture.camera_id,
             rgb=rgb,
-            depth_m=None if depth is None else lens.nearest(depth),
+            depth_m=depth,
             label=None if label is None else lens.nearest(label),
             intrinsics=lens.intrinsics,
             T_world_camera=pose,
-            depth_sigma_m=None if sigma is None else lens.nearest(sigma),
+            depth_sigma_m=sigma,
             label_is_pseudo=picture.pseudo_label and label is not None,
         )
         return LoadedFrame(frame, None if changed else encoded, label_error)
 
-    def _depth(self, picture: PosedPicture, size: tuple[int, int]) -> tuple[Float32 | None, Float32 | None]:
-        """Depth and its spread (H, W) in metres, of the size of the picture; None without depth."""
-        if picture.depth_file is None or not self._with_depth or not picture.depth_file.exists():
-            return None, None
-        depth_m = depth_of_size(self._read_depth(picture), size, picture.depth_file)
-        if picture.sigma_file is None:
-            return depth_m, None
-        return depth_m, depth_of_size(read_depth(picture.sigma_file, self.depth_scale), size, picture.sigma_file)
-
-    def _depth_of_file(self, picture: PosedPicture) -> Float32:
-        assert picture.depth_file is not None
-        depth_m = read_depth(picture.depth_file, self.depth_scale)
-        if picture.confidence_file is not None and picture.confidence_file.exists():
-            size = (depth_m.shape[0], depth_m.shape[1])
-            depth_m[read_plane(picture.confidence_file, "uint8", size, "confidence") == 0] = 0
-        return depth_m
+    def _depth(self, file: Path, lens: Rectifier, rgb: UInt8, confidence: Path | None = None) -> Float32:
+        """Depth, or its spread, (H, W) in metres, in the pixels of the rectified picture."""
+        depth_m = read_depth(file, self.depth_scale)
+        if confidence is not None and confidence.exists():
+            depth_m[read_plane(confidence, "uint8", (depth_m.shape[0], depth_m.shape[1]), "confidence") == 0] = 0
+        return lens.nearest(depth_of_size(depth_m, (rgb.shape[0], rgb.shape[1]), file))
 
     def _rectifier(self, intrinsics: CameraIntrinsics, file: Path) -> Rectifier:
         if intrinsics not in self._rectifiers:

@@ -18,21 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.drivers.calibration import Rectifier
-from semantic_mapper.errors import CodecError, ConfigError, ImportSourceError
+from semantic_mapper.errors import CodecError, ImportSourceError
 from semantic_mapper.geometry import invert_pose, scale_intrinsics, transform, unproject
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
-    CAMERA_ID,
     MATCH_NS,
     BadFrameError,
     DepthScale,
     ImportOptions,
-    LoadedFrame,
-    check_frame_pose,
-    image_size_must_be,
     same_view,
 )
-from semantic_mapper.replay.importers.posed import depth_of_size
+from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, depth_of_size
 from semantic_mapper.replay.importers.ros_bags import (
     CAMERA_INFO,
     LISTED,
@@ -62,8 +58,7 @@ from semantic_mapper.replay.importers.ros_transforms import (
 )
 from semantic_mapper.replay.importers.tum import match_nearest
 from semantic_mapper.transport.codec import EncodedImage
-from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
+from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, UInt8
 
 ROLES = ("image", "depth", "info", "depth_info", "pose")
 DEPTH_SCALE = DepthScale(UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
@@ -77,7 +72,7 @@ _VIEWER = (
 )
 
 
-class RosbagRecording:
+def open_rosbag(src: Path, options: ImportOptions) -> PosedPictures:
     """A bag, opened; one frame for each image of one camera.
 
     Args:
@@ -88,10 +83,14 @@ class RosbagRecording:
         ImportSourceError: damaged, no image, several cameras where none is named, no calibration, or no poses.
         DependencyError: the package ``rosbags`` is not installed.
     """
+    return _BagReader(src, options).pictures()
+
+
+class _BagReader:
+    """Finds out what a bag holds, step by step."""
 
     def __init__(self, src: Path, options: ImportOptions) -> None:
         self.notices: list[str] = []
-        self.depth_scale = DEPTH_SCALE
         self._src, self._options = src, options
         unknown = sorted(set(options.topics) - set(ROLES))
         if unknown:
@@ -106,10 +105,6 @@ class RosbagRecording:
         self._read_all()
         self._frame = self._color.frame or self._calibrations[info][0].frame
         self._measured = self._intrinsics(self._color, info)
-        try:
-            self._rectify = Rectifier(self._measured)
-        except ConfigError as error:
-            raise self._refusal(f"{info}: {error}") from error
         self._T_frame_image = self._image_pose(info)
         if "info" not in options.topics:
             self._refuse_contradictions(info)
@@ -119,83 +114,63 @@ class RosbagRecording:
         self._moving: list[tuple[str, Track]] = []  # what poses are made of that changes over time
         self._pose_at = self._pose_source()
         self._check_times()
-        stamps, depth_stamps = (
-            np.array([stamp for stamp, _ in self._series.get(topic.name, [])] if topic else [], np.int64)
-            for topic in (self._color, self._depth)
+
+    def pictures(self) -> PosedPictures:
+        """The images with poses and depth; each is named by its topic and its number in the bag."""
+        stamps, depth_stamps = self._stamps(self._color), self._stamps(self._depth)
+        order, depth_order = (np.argsort(found, kind="stable") for found in (stamps, depth_stamps))
+        matches = match_nearest(stamps[order], depth_stamps[depth_order], MATCH_NS)
+        pictures: list[PosedPicture] = []
+        for index, match in zip(order.tolist(), matches, strict=True):
+            file, stamp_ns = Path(self._color.name) / str(index), int(stamps[index])
+            pose = self._pose_at(stamp_ns) if 0 <= stamp_ns < MAX_STAMP_NS else None
+            if pose is None:
+                pose = BadFrameError(file, f"there is no pose round its time {stamp_ns / 1e9:.6f} s")
+            depth = None
+            if self._depth is not None and match >= 0:
+                depth = Path(self._depth.name) / str(depth_order[match])
+            pictures.append(PosedPicture(file, self._measured, pose, stamp_ns, depth))
+        return PosedPictures(
+            f"rosbag {self._src.resolve().stem}",
+            pictures,
+            self._options,
+            DEPTH_SCALE,
+            self.notices,
+            hz=_rate(stamps),
+            read_rgb=self._rgb,
+            read_depth=self._depth_m,
         )
-        self._order = np.argsort(stamps, kind="stable")
-        depth_order = np.argsort(depth_stamps, kind="stable")
-        matches = match_nearest(stamps[self._order], depth_stamps[depth_order], MATCH_NS)
-        self._depth_of = [int(depth_order[i]) if i >= 0 else -1 for i in matches]
-        self.info = StreamInfo(
-            source=f"rosbag {src.resolve().stem}",
-            cameras={CAMERA_ID: self._rectify.intrinsics},
-            frame_count=len(stamps),
-            frame_hz=_rate(stamps),
-        )
 
-    def __len__(self) -> int:
-        return len(self._order)
+    def _stamps(self, topic: Topic | None) -> NDArray[np.int64]:
+        """Of the images of a topic, in the order of recording."""
+        return np.array([stamp for stamp, _ in self._series[topic.name]] if topic else [], np.int64)
 
-    def load(self, number: int) -> LoadedFrame:
-        """Read one frame.
-
-        Raises:
-            BadFrameError: it cannot be used.
-        """
-        where, series = Path(self._color.name), self._series[self._color.name]
-        stamp_ns = series[int(self._order[number])][0]
-        if not 0 <= stamp_ns < MAX_STAMP_NS:
-            raise BadFrameError(where, f"its stamp, {stamp_ns} ns, is impossible")
-        if number and series[int(self._order[number - 1])][0] == stamp_ns:
-            raise BadFrameError(where, f"a second image of {stamp_ns / 1e9:.6f} s")
-        pose = self._pose_at(stamp_ns)
-        if pose is None:
-            raise BadFrameError(where, f"there is no pose round its time {stamp_ns / 1e9:.6f} s")
+    def _rgb(self, file: Path) -> tuple[UInt8, EncodedImage | None]:
         try:
-            rgb, encoded = self._rgb(int(self._order[number]))
+            message = self._bag.message(self._color.name, self._series[self._color.name], int(file.name))
+            return (color_image(message), None) if self._color.raw else compressed_color_image(message)
         except CodecError as error:
-            raise BadFrameError(where, f"image of {stamp_ns / 1e9:.6f} s: {error}") from error
-        frame = PosedFrame(
-            stamp_ns=stamp_ns,
-            seq=number,
-            camera_id=CAMERA_ID,
-            rgb=rgb,
-            depth_m=self._depth_m(self._depth_of[number]),
-            label=None,
-            intrinsics=self._rectify.intrinsics,
-            T_world_camera=check_frame_pose(pose, where),
-        )
-        return LoadedFrame(frame, encoded)
+            raise BadFrameError(file, str(error)) from error
 
-    def _rgb(self, index: int) -> tuple[UInt8, EncodedImage | None]:
-        message = self._bag.message(self._color.name, self._series[self._color.name], index)
-        rgb, encoded = (color_image(message), None) if self._color.raw else compressed_color_image(message)
-        image_size_must_be(rgb, self._measured, Path(self._color.name))
-        if self._measured.distorted:
-            return self._rectify(np.ascontiguousarray(rgb[..., ::-1])), None
-        return rgb, encoded
-
-    def _depth_m(self, index: int) -> Float32 | None:
-        if index < 0 or self._depth is None:
-            return None
-        where = Path(self._depth.name)
+    def _depth_m(self, picture: PosedPicture, lens: Rectifier) -> Float32:
+        assert self._depth is not None and picture.depth_file is not None
         try:
-            message = self._bag.message(self._depth.name, self._series[self._depth.name], index)
+            message = self._bag.message(self._depth.name, self._series[self._depth.name], int(picture.depth_file.name))
             depth_m = depth_image(message) if self._depth.raw else compressed_depth_image(message)
         except CodecError as error:
-            raise BadFrameError(where, str(error)) from error
+            raise BadFrameError(picture.depth_file, str(error)) from error
         if self._registration is None:
-            return self._rectify.nearest(depth_of_size(depth_m, (self._measured.height, self._measured.width), where))
+            size = (lens.intrinsics.height, lens.intrinsics.width)
+            return lens.nearest(depth_of_size(depth_m, size, picture.depth_file))
         own, T_color_depth = self._registration
         if depth_m.shape != (own.height, own.width):
             raise BadFrameError(
-                where,
+                picture.depth_file,
                 f"the depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, its calibration says "
                 f"{own.width}x{own.height}; name the one that it has (--topic depth_info=NAME), or import without "
                 "depth (--topic depth=none)",
             )
-        return register_depth(depth_m, own, T_color_depth, self._rectify.intrinsics)
+        return register_depth(depth_m, own, T_color_depth, lens.intrinsics)
 
     def _refusal(self, text: str) -> ImportSourceError:
         return ImportSourceError(f"{self._src}: {text}")

@@ -18,8 +18,6 @@ from semantic_mapper.replay.importers.base import (
     BadFrameError,
     ImportOptions,
     ImportReport,
-    LoadedFrame,
-    Recording,
     Skipped,
     read_bytes,
 )
@@ -27,9 +25,10 @@ from semantic_mapper.replay.importers.folder import open_folder
 from semantic_mapper.replay.importers.kitti360 import open_kitti360
 from semantic_mapper.replay.importers.models import find_opensfm, open_colmap, open_opensfm
 from semantic_mapper.replay.importers.phones import open_polycam, open_record3d
+from semantic_mapper.replay.importers.posed import LoadedFrame, PosedPictures
 from semantic_mapper.replay.importers.rooms import open_replica, open_scannet
 from semantic_mapper.replay.importers.ros_bags import is_bag
-from semantic_mapper.replay.importers.rosbag import RosbagRecording
+from semantic_mapper.replay.importers.rosbag import open_rosbag
 from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import open_tum
 from semantic_mapper.replay.log.format import LogReader, LogWriter, atomic_log
@@ -40,13 +39,13 @@ from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 
-FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
+FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {
     "folder": open_folder,
     "tum": open_tum,
     "scannet": open_scannet,
     "replica": open_replica,
     "kitti360": open_kitti360,
-    "rosbag": RosbagRecording,
+    "rosbag": open_rosbag,
     "polycam": open_polycam,
     "record3d": open_record3d,
     "transforms": open_transforms,
