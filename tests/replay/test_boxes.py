@@ -146,9 +146,7 @@ def test_two_boxes_of_one_id_and_classes_that_are_not_there_are_refused(tmp_path
         with_classes(load_boxes(path), ROOMS, path)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{", "[1]", '{"boxes": 3}', "<a", "<a></a>", '{"boxes": [], "merg": {}}']
-)
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"boxes": 3}', "<a", "<a></a>", '{"boxes": [], "merg": {}}'])
 def test_files_without_boxes_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "boxes.json"
     path.write_text(text)
