@@ -170,8 +170,8 @@ def _load(request: AutolabelRequest, log: Log) -> Mapper:
     model = bundle.checkpoint.model
     if not model.knows_classes or len(bundle.label_set) < 2:
         raise WeightsError(
-            f"{bundle.weights_path}: a field of kind '{model.kind}' knows no classes, or one only, so that it can label "
-            "nothing; give weights that were trained on labels"
+            f"{bundle.weights_path}: a field of kind '{model.kind}' knows no classes, or one only, so that it can "
+            "label nothing; give weights that were trained on labels"
         )
     if request.instances is not None and not isinstance(model, Panoptic):
         raise WeightsError(
