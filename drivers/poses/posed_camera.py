@@ -34,7 +34,7 @@ _log = get_logger(__name__)
 
 
 class PosedCamera:
-    """A ``FrameSource``: the images of a camera, each with its pose.
+    """The images of a camera, each with its pose.
 
     An image that gets none is left out, which shows as a gap in ``seq``. A camera's first frames are held back until
     some of their poses agree with each other, and are given then.
