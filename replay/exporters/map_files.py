@@ -27,8 +27,7 @@ from semantic_mapper.mapping.files.formats import (
 )
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
-from semantic_mapper.mapping.map_scale import require_metres
-from semantic_mapper.mapping.map_types import MapMesh
+from semantic_mapper.mapping.map_types import MapMesh, require_metres
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph

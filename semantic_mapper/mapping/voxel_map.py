@@ -32,8 +32,7 @@ from semantic_mapper.mapping.fusion.fuse import (
     probability_table,
     trusted_depth,
 )
-from semantic_mapper.mapping.map_scale import require_same_scale, scale_name
-from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView, require_same_scale, scale_name
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.changes import (

@@ -178,4 +178,4 @@ def test_what_is_kept_to_refine_poses_is_bounded() -> None:
     pipeline = make_pipeline()
     for number in range(MAX_CAMERAS + 3):
         pipeline.prepare(replace(without_depth(walk(FINE)[:1])[0], camera_id=f"camera {number}"))
-    assert len(pipeline._frame_depth._refiners) == MAX_CAMERAS
+    assert len(pipeline.frame_depth._refiners) == MAX_CAMERAS

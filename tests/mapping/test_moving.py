@@ -19,7 +19,7 @@ from semantic_mapper.mapping.moving import (
     MotionDetector,
     MovingFilter,
     MovingSpace,
-    SlopedViews,
+    SeenView,
     align_pose,
     depth_slopes,
 )
@@ -28,7 +28,6 @@ from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Pose
 from tests.small import tiny_config, tiny_field
 
 CAMERA = CameraIntrinsics(130.0, 130.0, 79.5, 59.5, 160, 120)
-MARGIN = (0.1, 0.03)
 WALL_M, POLE_M, THING_M = 3.0, 2.2, 1.8
 HZ = 10
 NOISE_M = 0.02
@@ -183,7 +182,9 @@ def test_what_is_in_doubt_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def told(number: int, T_world_camera: Float64, thing_m: float | None = None) -> str:
         frame = corner(number, np.eye(4), thing_m)
         frame = replace(frame, T_world_camera=T_world_camera)
-        filter_.note(frame, filter_.find(frame))
+        moving = filter_.find(frame)
+        assert moving is not None
+        filter_.note(frame, moving)
         return filter_.warning
 
     assert [told(n, off_by(0.1, 3.0, rng)) for n in range(20)][-1] == POSES_OFF
@@ -211,10 +212,9 @@ def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPat
     assert len(on.voxel_map.points().xyz) < 0.8 * len(off.voxel_map.points().xyz)
 
 
-def views(depth: Float32) -> SlopedViews:
-    focal, centre = ((CAMERA.fx, CAMERA.fy), (CAMERA.cx, CAMERA.cy))
-    at = np.eye(4)[None]
-    return SlopedViews(at, np.array([focal], np.float32), np.array([centre], np.float32), depth_slopes(depth)[None])
+def views(depth: Float32) -> list[SeenView]:
+    focal, centre = (CAMERA.fx, CAMERA.fy), (CAMERA.cx, CAMERA.cy)
+    return [SeenView("cam", 0, np.eye(4), focal, centre, depth, depth, depth_slopes(depth))]
 
 
 def points(depth: Float32) -> Float32:
@@ -234,7 +234,7 @@ def test_a_pose_that_is_a_little_off_is_put_right() -> None:
     seen = views(depth_at(np.eye(4)))
     for _ in range(5):
         right, wrong = off_by(0.02, 0.5, rng), np.eye(4)
-        aligned = align_pose(points(depth_at(right)), wrong, seen, MARGIN)
+        aligned = align_pose(points(depth_at(right)), wrong, seen)
         left = invert_pose(right) @ aligned.T_world_camera
         assert np.linalg.norm(left[:3, 3]) < 0.01 and np.linalg.norm(left[:3, :3] - np.eye(3)) < 0.005
         assert aligned.misfit < 0.1
@@ -244,13 +244,13 @@ def test_a_pose_that_is_a_little_off_is_put_right() -> None:
 def test_a_pose_that_is_far_off_stays_and_does_not_fit() -> None:
     far = np.eye(4)
     far[2, 3] = -1.0
-    aligned = align_pose(points(depth_at(np.eye(4))), far, views(depth_at(np.eye(4))), MARGIN)
+    aligned = align_pose(points(depth_at(np.eye(4))), far, views(depth_at(np.eye(4))))
     assert aligned.misfit == np.inf and np.array_equal(aligned.T_world_camera, far) and not aligned.moved.any()
 
 
 def test_without_a_surface_to_compare_with_a_pose_is_trusted() -> None:
     nothing = np.zeros((120, 160), np.float32)
-    aligned = align_pose(points(depth_at(np.eye(4))), np.eye(4), views(nothing), MARGIN)
+    aligned = align_pose(points(depth_at(np.eye(4))), np.eye(4), views(nothing))
     assert aligned.misfit == 0 and np.array_equal(aligned.T_world_camera, np.eye(4))
 
 

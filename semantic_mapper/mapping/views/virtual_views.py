@@ -102,20 +102,6 @@ class VirtualView(NamedTuple):
     packed: NDArray[np.int64]
 
 
-class RenderedVirtualView(NamedTuple):
-    """A virtual view that was rendered and fused.
-
-    Args:
-        view: Its viewpoint.
-        source_seqs: Of the keyframes that it was rendered from.
-        blocks: That its votes went to.
-    """
-
-    view: VirtualView
-    source_seqs: tuple[int, ...]
-    blocks: int
-
-
 class ViewpointChooser:
     """Chooses virtual views of one map, each of something else.
 

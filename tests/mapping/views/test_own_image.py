@@ -9,7 +9,7 @@ import torch
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.views.view_renderer import RenderedView, add_own_image
+from semantic_mapper.mapping.rendering import RenderedView, add_own_image
 from tests.small import tiny_config, tiny_field, tiny_frames
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.mapping.views.upsample import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, upsample
+from semantic_mapper.mapping.rendering import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, upsample
 
 
 def channels(probabilities: np.ndarray, rows: np.ndarray) -> np.ndarray:
