@@ -37,7 +37,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.map_types import ALWAYS, CorrectedPoses, CorrectionStatus
-from semantic_mapper.mapping.storage.scratch import ScratchFile
+from semantic_mapper.mapping.storage.block_store import ScratchFile
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 

@@ -31,7 +31,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ConfigError
@@ -390,7 +389,7 @@ _NEIGHBOURS = (
 )
 
 
-def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> NDArray[np.bool_]:
+def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> Bool:
     """Pixels (H, W) of moving cells and those next to them that are as near as what moves there."""
     if not moving.any():
         return np.zeros(depth.shape, np.bool_)

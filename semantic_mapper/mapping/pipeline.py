@@ -38,7 +38,7 @@ from semantic_mapper.mapping.map_types import PoseInMap
 from semantic_mapper.mapping.moving import MovingFilter
 from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer, add_own_image, upsample
-from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualView, add_votes
+from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualView, add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, MapUpdate, PosedFrame, SourceViews, UInt8
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +18,6 @@ from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.places import Place, PlaceStore, moved_place, shared_places
-from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.files.map_file import BlockPart, MapManifest, open_map
 from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
@@ -38,20 +38,26 @@ from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.changes import (
     NONE_CLEARED,
     BlockChanges,
-    ChosenBlocks,
     ClearedBlocks,
     CopiedChanges,
-    choose_blocks,
-    copy_changes,
-    read_changes,
+    Decision,
+    oldest_first,
+    packed_parts,
 )
-from semantic_mapper.mapping.views.ray_casting import cast_view, read_points
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.mapping.surface import (
+    cast_view,
+    join_meshes,
+    open3d_grid,
+    read_points,
+    surface_voxels,
+    triangle_mesh,
+)
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, PosedFrame
 
 # One lock for all maps of a process: growth moves the memory that readers look at, and merging takes two maps at once.
 _KERNEL_LOCK = threading.RLock()
 
-BoolImage = NDArray[np.bool_]
+BoolImage = Bool
 BLOCKS_A_VERSION = 256  # of a map that takes over another one
 POINT_FIELDS = ("xyz", "rgb", "label", "confidence", "measured")
 
@@ -127,7 +133,7 @@ class VoxelMap:
         """Bytes that these take on disk."""
         return self._grid.stored_bytes
 
-    def changed_since(self, version: int) -> NDArray[np.int32]:
+    def changed_since(self, version: int) -> Int32:
         """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order.
 
         After a new ``epoch`` these are all blocks of the map, and those of before are gone.
@@ -149,12 +155,13 @@ class VoxelMap:
             MapError: ``since`` is not a version of this map, or a bad ``limit`` or ``min_weight``.
         """
         with _KERNEL_LOCK:
-            return read_changes(self._grid, self._choose_changes(since, limit, min_weight))
+            return self._choose_changes(since, limit, min_weight).compact()
 
     def copy_changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> CopiedChanges:
         """As ``changes``, but only copied here: another thread makes them compact, which is most of the work."""
         with _KERNEL_LOCK:
-            return copy_changes(self._grid, self._choose_changes(since, limit, min_weight))
+            chosen = self._choose_changes(since, limit, min_weight)
+            return dataclasses.replace(chosen, parts=tuple(chosen.parts))
 
     @property
     def memory_bytes(self) -> int:
@@ -168,7 +175,7 @@ class VoxelMap:
         probabilities: Float32 | None,
         known: BoolImage | None = None,
         *,
-        rows: NDArray[np.int32] | None = None,
+        rows: Int32 | None = None,
         trust: Float32 | None = None,
         measured: bool = True,
     ) -> int:
@@ -217,7 +224,7 @@ class VoxelMap:
             bounds = NO_BOUNDS
             if clears:
                 bounds = self._bounds = depth_bounds(depth, self.config.depth_max_m, self._bounds)
-            cleared: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+            cleared: list[tuple[Int64, Int64]] = []
             for blocks in self.changing(packed):
                 voxels = fuse_blocks(
                     blocks,
@@ -250,7 +257,7 @@ class VoxelMap:
         with _KERNEL_LOCK:
             yield self._grid
 
-    def changing(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
+    def changing(self, packed: Int64) -> Iterator[Int32]:
         """Bring blocks with unique packed keys (B,) into memory for a pass that changes them; hold the lock meanwhile.
 
         Yields:
@@ -347,7 +354,7 @@ class VoxelMap:
             depth_m, rgb, channel, confidence, measured = cast_view(self._grid, camera, intrinsics, self.config)
         return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence, measured)
 
-    def block_state(self, keys: NDArray[np.int32] | None = None) -> dict[str, NDArray[np.generic]]:
+    def block_state(self, keys: Int32 | None = None) -> dict[str, NDArray[np.generic]]:
         """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
 
         Returns:
@@ -484,12 +491,28 @@ class VoxelMap:
             for place in other.places.places:
                 self.places.add(moved_place(place, T_self_other))
 
-    def _choose_changes(self, since: int, limit: int, min_weight: float) -> ChosenBlocks:
+    def _choose_changes(self, since: int, limit: int, min_weight: float) -> CopiedChanges:
+        """The changes; their blocks are read under the lock."""
         _check_min_weight(min_weight)
-        decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
-        chosen = choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
-        cleared = self._cleared_rows.between(since, chosen.version)
-        return chosen._replace(scale_known=self.scale_known, cleared=cleared)
+        if not 0 <= since <= self.version or limit < 0:
+            raise MapError(
+                f"changes since version {since}, limit {limit}: versions of this map go from 0 to {self.version}, and "
+                "a limit is not negative; a mirror of another map restarts from version 0"
+            )
+        packed, changed_at = self._grid.versions_since(since)
+        rows, version = oldest_first(changed_at, limit, self.version)
+        packed = packed[rows]
+        return CopiedChanges(
+            since,
+            version,
+            self.version,
+            self.epoch,
+            unpack_keys(packed),
+            Decision(self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight),
+            packed_parts(self._grid, packed),
+            self.scale_known,
+            self._cleared_rows.between(since, version),
+        )
 
     def _read(
         self, grid: BlockGrid, voxels: Float64

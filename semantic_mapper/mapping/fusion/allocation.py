@@ -10,13 +10,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, Int64
 
 _BANDS = 8  # image bands with a key set of their own: enough to share among cores, few enough to merge at no cost
 _FIRST_CAPACITY = 1 << 13
@@ -61,7 +60,7 @@ def blocks_in_band(
     truncation_m: float,
     depth_max_m: float,
     budget: int = LEAST_FRAME_BUDGET,
-) -> NDArray[np.int64]:
+) -> Int64:
     """Packed keys (B,) of the blocks that rays cross within ``truncation_m`` of their depth, sorted, each once.
 
     Time and memory are bounded: by the pixels times ``MAX_CROSSINGS``, and by ``budget``.
@@ -113,9 +112,7 @@ def _steepest(camera: Camera, shape: tuple[int, ...]) -> float:
     return math.hypot(1.0, x, y)
 
 
-def blocks_in_view(
-    camera: Camera, size: tuple[int, int], keys: NDArray[np.int32], voxel_size_m: float, reach_m: float
-) -> NDArray[np.int64]:
+def blocks_in_view(camera: Camera, size: tuple[int, int], keys: Int32, voxel_size_m: float, reach_m: float) -> Int64:
     """Packed keys of those blocks of ``keys`` (B, 3) that a camera may see up to ``reach_m`` of z, the nearest first.
 
     ``size`` is (height, width) of the image, which may be a small part of one far from the optical axis.
@@ -140,7 +137,7 @@ def blocks_in_view(
 
 def view_bounds(
     camera: Camera, intrinsics: CameraIntrinsics, voxel_size_m: float, reach_m: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Int64, Int64]:
     """Least and greatest block coordinates (3,) that ``blocks_in_view`` may take."""
     side, radius = voxel_size_m * BLOCK_SIDE, _block_radius_m(voxel_size_m)
     z = np.array([-radius, reach_m + radius])

@@ -27,7 +27,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.kernels import kernel, parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
@@ -102,7 +101,7 @@ def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BO
 
 def clear_in_view(
     grid: BlockGrid,
-    band: NDArray[np.int64],
+    band: Int64,
     camera: Camera,
     limits: FusionLimits,
     depth: Float32,
@@ -140,9 +139,7 @@ def clear_in_view(
             yield changing, cleared
 
 
-def _candidates(
-    grid: BlockGrid, band: NDArray[np.int64], camera: Camera, limits: FusionLimits, bounds: DepthBounds
-) -> NDArray[np.int64]:
+def _candidates(grid: BlockGrid, band: Int64, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> Int64:
     """Packed keys (B,), sorted, of blocks outside of the band that hold a surface, in front of some depth."""
     considered = grid.may_hold_surface()
     inside = find_blocks(grid.index, band)
@@ -158,16 +155,14 @@ def _candidates(
     return np.sort(np.concatenate((pack_keys(keys[slots]), stored[before > 0])))
 
 
-def _before_depth(
-    keys: NDArray[np.int32], considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds
-) -> UInt8:
+def _before_depth(keys: Int32, considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> UInt8:
     found = np.empty(len(keys), np.uint8)
     _blocks_before_depth(len(keys), keys, considered, camera, limits.voxel_size, bounds, found)
     return found
 
 
 def _clear(
-    blocks: NDArray[np.int32],
+    blocks: Int32,
     buffers: GridBuffers,
     camera: Camera,
     limits: FusionLimits,

@@ -35,7 +35,7 @@ SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surfa
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
 LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
-ProbabilityTable = tuple[Float32, NDArray[np.int32]]  # probabilities (K, L), row of each pixel (H, W), -1 = unknown
+ProbabilityTable = tuple[Float32, Int32]  # probabilities (K, L), row of each pixel (H, W), -1 = unknown
 
 _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
     "voxel_size_m": (1e-4, 10.0),
@@ -73,12 +73,12 @@ class Votes(NamedTuple):
     """
 
     log_p: Float32
-    rows: NDArray[np.int32]
+    rows: Int32
     weights: Float32
 
 
 def make_votes(
-    probabilities: Float32, rows: NDArray[np.int32], depth: Float32, camera: Camera, depth_max: float
+    probabilities: Float32, rows: Int32, depth: Float32, camera: Camera, depth_max: float
 ) -> tuple[Votes, int]:
     """Votes of a frame, each of weight ``max(cos, 0.2) * min(1, (2 m / z)^2)``, 0 where none is due.
 
@@ -117,8 +117,8 @@ def check_depth(depth_m: Float32, intrinsics: CameraIntrinsics, where: str) -> F
 def probability_table(
     depth: Float32,
     probabilities: Float32,
-    known: NDArray[np.bool_] | None,
-    rows: NDArray[np.int32] | None,
+    known: Bool | None,
+    rows: Int32 | None,
     classes: int,
     where: str,
 ) -> ProbabilityTable:

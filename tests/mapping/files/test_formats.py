@@ -13,6 +13,7 @@ import pytest
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.files.floor_plan import find_up
 from semantic_mapper.mapping.files.formats import (
     colored,
     sure_faces,
@@ -22,7 +23,6 @@ from semantic_mapper.mapping.files.formats import (
     write_obj,
     write_ply,
 )
-from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float64

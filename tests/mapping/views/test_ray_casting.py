@@ -7,7 +7,7 @@ from semantic_mapper.geometry import look_at, scale_intrinsics
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.fusion.fuse import MEASURED
 from semantic_mapper.mapping.storage.block_grid import GridBuffers
-from semantic_mapper.mapping.views.ray_casting import read_points
+from semantic_mapper.mapping.surface import read_points
 from tests.mapping.grids import corners, random_grid
 from tests.mapping.rendered_views import (
     INTRINSICS,

@@ -9,7 +9,7 @@ from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.storage.block_index import unpack_keys
-from semantic_mapper.mapping.views.virtual_views import (
+from semantic_mapper.mapping.virtual_views import (
     MARGIN_M,
     VOTE_WEIGHT,
     ViewpointChooser,

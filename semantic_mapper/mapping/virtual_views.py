@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.geometry import check_pose, invert_pose, look_at, nearest_pixels, scale_intrinsics, transform
 from semantic_mapper.kernels import parallel_kernel
@@ -31,7 +30,7 @@ from semantic_mapper.mapping.keyframes import Keyframe
 from semantic_mapper.mapping.storage.block_grid import GridBuffers
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, Int64
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64
 from semantic_mapper.view_selection import visible_points
 
 VOTE_WEIGHT = 0.3  # of a vote, against one of a frame
@@ -63,7 +62,7 @@ class SurfacePatches(NamedTuple):
             the class is clear, and 0 where there are votes enough.
     """
 
-    packed: NDArray[np.int64]
+    packed: Int64
     xyz: Float64
     need: Float64
 
@@ -99,7 +98,7 @@ class VirtualView(NamedTuple):
 
     T_world_camera: Float64
     gain: float
-    packed: NDArray[np.int64]
+    packed: Int64
 
 
 class ViewpointChooser:
@@ -148,7 +147,7 @@ class ViewpointChooser:
         return best
 
 
-def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> NDArray[np.bool_]:
+def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> Bool:
     """Which points (P, 3) lie in air that a keyframe has looked through, ``MARGIN_M`` before what it saw: (P,)."""
     free = np.zeros(len(points), np.bool_)
     for k in keyframes:
@@ -158,9 +157,7 @@ def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> NDArray[np.
     return free
 
 
-def _worth_a_look(
-    patches: SurfacePatches, keyframes: Sequence[Keyframe], looked_at: NDArray[np.int64]
-) -> SurfacePatches:
+def _worth_a_look(patches: SurfacePatches, keyframes: Sequence[Keyframe], looked_at: Int64) -> SurfacePatches:
     """The neediest patches that enough keyframes see and that were not looked at; need times fraction of views."""
     fresh = np.flatnonzero((patches.need > 0) & ~np.isin(patches.packed, looked_at))
     points = patches.xyz[fresh]
