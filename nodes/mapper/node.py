@@ -339,7 +339,7 @@ class MapperNode:
         if not pipeline.voxel_map.scale_known:
             warnings.append(f"scale: unknown; lengths of the map are not metres: {SCALE_FIX}")
         counters |= pipeline.picture_check.counters
-        warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning, pipeline.moving.warning]
+        warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning]
         return PartStatus(counters, tuple(filter(None, warnings)))
 
 

@@ -47,10 +47,7 @@ _log = get_logger(__name__)
 
 
 class PosePair(NamedTuple):
-    """The pose of one frame before and after, both T_world_camera (4, 4) float64 in the map's world.
-
-    ``world`` is the one that the frame came in; see ``PosedFrame``.
-    """
+    """The pose of one frame before and after, (4, 4) float64 in the map's world, and the world that it came in."""
 
     camera_id: str
     stamp_ns: int
@@ -177,8 +174,7 @@ class MapCorrector:
 
     Args:
         config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
-        voxel_map: In use; becomes the corrected one at the end of a rebuild.
-        keyframes: Move with their frames then.
+        voxel_map, keyframes: In use; move with their frames at the end of a rebuild.
         fuse: Upsamples a frame of the history and integrates it into the map given.
         on_move: Called when a correction begins, and when the map has moved.
 

@@ -37,7 +37,6 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.imaging import FrameViews, is_measured
 from semantic_mapper.labels import MOVING_NAMES, LabelSet
-from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame, UInt8
 
 CELLS = 80  # across the longer side of the image
@@ -65,19 +64,6 @@ _EDGE = 0.1  # change of depth from cell to cell, as a fraction of it, from whic
 LEAST_POINTS, LEAST_FRACTION = 30, 0.2  # on surfaces that views saw: to judge at all; of those compared, to fit
 _NEAREST_M = 0.1
 EDGE_PX = 2  # around what moves, where depth may be between it and what is behind
-
-RECENT = 30  # frames that a warning is about
-MUCH = 0.3  # fraction of the pixels; where half of the frames leave out more, people are warned
-POSES_OFF = (
-    "moving: poses do not fit the depth of the seconds before, so nothing is left out as moving: check their stamps, "
-    "T_world_camera or T_base_camera and the calibration; moving.motion = false ends the search"
-)
-MUCH_LEFT_OUT = (
-    f"moving: more than {MUCH:.0%} of the pixels are left out as moving and not mapped: either something fills the "
-    "picture, or poses drift: check them against the map; moving.motion = false maps what does not move by its class"
-)
-
-_log = get_logger(__name__)
 
 
 class MovingSpace:
@@ -114,12 +100,11 @@ class MovingSpace:
 
 
 class MovingFilter:
-    """Of one map.
+    """Finds what moves, for one map.
 
     Attributes:
         pixels: Left out so far.
         space: Where what moves was within the last second.
-        warning: What is wrong with the last ``RECENT`` frames and how to fix it, for people; empty where all is well.
 
     Raises:
         ConfigError: ``moving.classes``, and none of the classes does.
@@ -136,9 +121,6 @@ class MovingFilter:
                 "weights that know one (`rooms-people` ship), or moving.motion"
             )
         self.pixels = 0
-        self.warning = ""
-        self._recent: deque[tuple[bool, float]] = deque(maxlen=RECENT)  # whether poses fit; fraction that moves
-        self._warned = 0
         self.space = MovingSpace()
 
     @property
@@ -160,20 +142,6 @@ class MovingFilter:
         """Count what was left out of a frame (its depth as it came), and keep for a second where that was."""
         self.pixels += int(moving.sum())
         self.space.add(frame, moving)
-        self._recent.append((self._motion.poses_fit, float(moving.mean())))
-        before, self.warning = self.warning, self._find_warning()
-        if self.warning and self.warning != before:
-            self._warned += 1
-            if is_power_of_two(self._warned):
-                _log.warning("motion_is_uncertain", seq=frame.seq, camera=frame.camera_id, reason=self.warning)
-
-    def _find_warning(self) -> str:
-        fit, fraction = np.array(self._recent).T
-        if len(fit) < RECENT:
-            return ""
-        if fit.mean() < 0.5:
-            return POSES_OFF
-        return MUCH_LEFT_OUT if np.median(fraction) > MUCH else ""
 
     def leave_out(self, views: FrameViews, moving: Bool) -> FrameViews:
         """The frame without depth where it shows what moves, and at its edges: neither surface nor seen through."""
@@ -188,8 +156,6 @@ class MovingFilter:
         """Forget the last seconds: poses of frames to come are in another world."""
         self._motion.clear()
         self.space.clear()
-        self._recent.clear()
-        self.warning = ""
 
 
 class _Cells(NamedTuple):

@@ -54,13 +54,9 @@ class UpFrame(NamedTuple):
 
 
 class SurfaceVoxels(NamedTuple):
-    """Voxels near the surface in some blocks.
+    """Voxels near the surface in some blocks: block (N, 3) and voxel (N,) of each, and what the network takes of them.
 
-    Args:
-        key: (N, 3) int32 block of each.
-        at: (N,) int64 voxel in the block.
-        points: What the network takes of them.
-        core: (N,) bool: so near the surface that they make up the cells.
+    ``core`` (N,) are so near the surface that they make up the cells.
     """
 
     key: Int32
@@ -76,14 +72,9 @@ class SurfaceVoxels(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RefineReport:
-    """What became of the surface.
-
-    Args:
-        before, after: Voxels of the surface by class name; "unknown" last.
-        surface: Voxels of the surface.
-        relabelled: Of them, those with another class than before.
-        filled: Those that had no votes and have a class now.
-        voted: Whether anything had votes.
+    """What became of the surface: its voxels by class name before and after ("unknown" last), and of them all, those
+    with another class than before, and those that had no votes and have a class now. ``voted``: whether anything had
+    votes.
     """
 
     before: dict[str, int]

@@ -41,14 +41,10 @@ LEAST_WEIGHT = 1e-9  # where nothing looks alike, the coarse pixels still count 
 
 
 class RenderedView(NamedTuple):
-    """What a field says of a view.
+    """What a field says of a view: probabilities (h, w, L) float32, where they mean something (h, w), depth (h, w) or
+    0.
 
-    Args:
-        probabilities: (h, w, L) float32.
-        known: (h, w) bool, where they mean something.
-        depth_m: (h, w) float32, 0 where not known.
-        rays: How many were rendered.
-        samples: Of a ray; 0 where the field draws its own.
+    ``rays`` were rendered, with so many ``samples`` each; 0 where the field draws its own.
     """
 
     probabilities: Float32
@@ -60,11 +56,6 @@ class RenderedView(NamedTuple):
 
 class ViewRenderer:
     """Renders views from one field.
-
-    Args:
-        field: Whose samples a ray can be set, where a rate is to be held.
-        config: Fraction of the rays, rate.
-        sampling: Of a ray with a depth prior.
 
     Raises:
         ConfigError: ``config.target_hz`` with a field that has no samples to set.
@@ -133,13 +124,10 @@ class ViewRenderer:
 
 
 def add_own_image(view: RenderedView, field: SemanticField, current: EncodedViews, weight: float) -> RenderedView:
-    """The weighted geometric mean of the class probabilities of both, where the view is known.
+    """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it
+    is known.
 
-    Args:
-        view: Rendered, (h, w).
-        field: The view is returned as it is where this has no opinion of single images.
-        current: The frame's own image, encoded.
-        weight: Of what the image says by itself, 0..1; 0 = the view as it is.
+    The view is returned as it is where the field has no opinion of single images, or ``weight``, 0..1, is 0.
     """
     if weight == 0 or not isinstance(field, ImageClassifier):
         return view
@@ -157,15 +145,10 @@ def add_own_image(view: RenderedView, field: SemanticField, current: EncodedView
 
 
 class RateController:
-    """Trades rays, then samples, for a target rate.
+    """Trades rays, then samples, for a target rate: at most this ``fraction`` of the pixels, and these samples.
 
     What a frame takes is modelled as a part that does not depend on rays, and a cost a ray and sample; both are
     followed from frame to frame. What it chooses depends on the machine, so a map made with it is not reproducible.
-
-    Args:
-        target_hz: Frames a second to hold.
-        fraction: Largest fraction of the pixels that may have rays.
-        sampling: The most samples a ray.
     """
 
     def __init__(self, target_hz: float, fraction: float, sampling: SamplingConfig) -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.fusion.allocation import Camera, blocks_in_view, view_bounds
+from semantic_mapper.mapping.fusion.allocation import Camera, blocks_in_view, blocks_within_reach
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, NEIGHBOURS, BlockGrid, GridBuffers
@@ -102,7 +102,7 @@ def _windows(
         yield whole, np.empty(0, np.int64)
         return
     voxel, reach = config.voxel_size_m, config.depth_max_m + config.truncation_voxels * config.voxel_size_m
-    waiting = [(whole, grid.keys_between(*view_bounds(camera, intrinsics, voxel, reach)))]
+    waiting = [(whole, grid.keys_between(*blocks_within_reach(camera, (whole.height, whole.width), voxel, reach)))]
     while waiting:
         window, keys = waiting.pop()
         moved = camera._replace(cx=camera.cx - window.left, cy=camera.cy - window.top)
@@ -136,12 +136,10 @@ def read_points(
 
 
 def surface_voxels(keys: Int32, blocks: Int32, grid: BlockGrid, min_weight: float) -> Float64:
-    """Zero crossings along voxel edges, (N, 3) float64 in units of voxels, in the order of the blocks.
+    """Zero crossings along voxel edges, (N, 3) float64 in units of voxels, in the order of the blocks to look at.
 
-    Args:
-        keys, blocks: (B, 3) coordinates and (B,) buffer indices of the blocks to look at.
-        grid: The map's storage.
-        min_weight: Both ends of an edge need this TSDF weight.
+    ``keys`` (B, 3) are their coordinates, ``blocks`` (B,) their buffer indices; both ends of an edge need
+    ``min_weight``.
     """
     keys, blocks, buffers = np.ascontiguousarray(keys), np.ascontiguousarray(blocks), grid.buffers()
     starts = np.zeros(len(blocks) + 1, np.int64)

@@ -13,8 +13,6 @@ from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import KITTI360, ROOMS
 from semantic_mapper.mapping.moving import (
-    MUCH_LEFT_OUT,
-    POSES_OFF,
     SETTLED_S,
     MotionDetector,
     MovingFilter,
@@ -115,20 +113,6 @@ def test_poses_that_are_off_are_put_right_or_known_to_be_wrong(sigma_m: float, s
     assert found < 0.01 * 40 * 120 * 160 and (fits == 40 if fit else fits < 10)
 
 
-def test_a_late_frame_keeps_what_newer_ones_saw_and_stamps_that_go_back_do_not() -> None:
-    detector = MotionDetector(6.0)
-    for number in range(9, 12):
-        detector.find(scene(number, None)[0])
-    detector.find(scene(1, None)[0])  # late
-    frame, thing = scene(13, 60)
-    assert (detector.find(frame) & thing).sum() > 0.8 * thing.sum()
-    detector = MotionDetector(6.0)
-    detector.find(scene(100, None)[0])
-    for number in range(3):
-        assert not detector.find(scene(number, 60)[0]).any()
-    assert not detector.find(scene(3, 60)[0]).any(), "the log has begun again, with the thing in it"
-
-
 def pipeline(**moving: bool) -> MappingPipeline:
     config = tiny_config(moving=moving, history={"max_frames": 50}, voxel_map=VOXELS)
     return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
@@ -173,24 +157,6 @@ def test_where_it_moved_is_kept_for_a_second() -> None:
     assert len(space.points)
     space.add(scene(1, None)[0], np.zeros_like(thing))  # stamps that go back start over
     assert not len(space.points)
-
-
-def test_what_is_in_doubt_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semantic_mapper.mapping.moving.RECENT", 10)
-    filter_, rng = MovingFilter(tiny_config(), ROOMS), np.random.default_rng(3)
-
-    def told(number: int, T_world_camera: Float64, thing_m: float | None = None) -> str:
-        frame = corner(number, np.eye(4), thing_m)
-        frame = replace(frame, T_world_camera=T_world_camera)
-        moving = filter_.find(frame)
-        assert moving is not None
-        filter_.note(frame, moving)
-        return filter_.warning
-
-    assert [told(n, off_by(0.1, 3.0, rng)) for n in range(20)][-1] == POSES_OFF
-    filter_.clear()
-    assert not filter_.warning and {told(n, np.eye(4)) for n in range(20, 32)} == {""}
-    assert [told(n, np.eye(4), 0.8) for n in range(32, 46)][-1] == MUCH_LEFT_OUT
 
 
 def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,17 +212,3 @@ def test_a_pose_that_is_far_off_stays_and_does_not_fit() -> None:
     far[2, 3] = -1.0
     aligned = align_pose(points(depth_at(np.eye(4))), far, views(depth_at(np.eye(4))))
     assert aligned.misfit == np.inf and np.array_equal(aligned.T_world_camera, far) and not aligned.moved.any()
-
-
-def test_without_a_surface_to_compare_with_a_pose_is_trusted() -> None:
-    nothing = np.zeros((120, 160), np.float32)
-    aligned = align_pose(points(depth_at(np.eye(4))), np.eye(4), views(nothing))
-    assert aligned.misfit == 0 and np.array_equal(aligned.T_world_camera, np.eye(4))
-
-
-def test_edges_and_holes_are_no_surface() -> None:
-    depth = np.full((8, 8), 2.0, np.float32)
-    depth[:, 4:], depth[2, 1] = 3.0, 0.0
-    known = np.isfinite(depth_slopes(depth)[0])
-    assert known[5, 2] and not known[:, 3:5].any() and not known[1:4, 1].any() and not known[2, :3].any()
-    assert not known[[0, -1]].any() and not known[:, [0, -1]].any()

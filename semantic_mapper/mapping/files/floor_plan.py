@@ -175,9 +175,6 @@ def occupancy_grid(
 def floor_height(height: Float64) -> float:
     """Height of the floor: the middle of the lowest layer that holds a quarter of what the fullest one holds.
 
-    Args:
-        height: (N,) of surface points, metres; N > 0.
-
     Raises:
         MapError: no points.
     """
@@ -196,10 +193,6 @@ def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
 
     The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
     pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.
-
-    Args:
-        path: One of the two files.
-        grid: The plan.
 
     Returns:
         The YAML and the PGM; then those of the costs.

@@ -112,19 +112,13 @@ def _escaped(name: str) -> str:
 def write_obj(
     path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials: bool, scale_known: bool = True
 ) -> tuple[Path, Path]:
-    """Write ``path`` and, next to it, the material library of the same stem (.mtl).
+    """Write ``path`` and, next to it, the material library of the same stem (.mtl); returns both.
 
     OBJ knows neither units nor an up axis: vertices are in the world frame, metres, to the micrometre. Each has its
     colour behind its position (``v x y z r g b``), as most programs read it. A face is of the class that most of its
     corners are of (the first one's where all differ); material ``ID_NAME`` stands for a class, ``ID_unknown`` for none.
-
-    Args:
-        class_materials: Whether materials have the colours of their classes; else they are white, so that programs
-            which multiply both show the colours of the vertices.
-        scale_known: Whether lengths are metres; a comment says where not.
-
-    Returns:
-        The two files.
+    Materials have the colours of their classes with ``class_materials``; else they are white, so that programs which
+    multiply both show the colours of the vertices.
 
     Raises:
         MapError: a file cannot be written.
@@ -167,14 +161,10 @@ _VERTICES, _INDICES = {"target": 34962}, {"target": 34963}  # what a part of the
 
 
 def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, scale_known: bool = True) -> None:
-    """Write a mesh as GLB: a header, one chunk of JSON, one chunk of numbers.
+    """Write a mesh with at least one face (glTF has no empty ones) as GLB: a header, a chunk of JSON, a chunk of
+    numbers.
 
-    Args:
-        path: Of the file.
-        mesh: With at least one face: glTF has no empty meshes.
-        label_set: For ``extras``.
-        up: (3,) unit vector, up in the world.
-        scale_known: Whether lengths are metres; ``extras`` say where not.
+    ``up`` (3,) is a unit vector, up in the world.
 
     Raises:
         MapError: no faces, more than 4 GiB, or the file cannot be written.
@@ -245,10 +235,9 @@ def _linear_color(rgb: UInt8) -> NDArray[np.uint16]:
 def write_npz(path: Path, points: MapPoints, label_set: LabelSet, *, scale_known: bool = True) -> None:
     """Write xyz (N, 3) float32 metres in the world, rgb (N, 3) uint8, label (N,) uint8, confidence (N,) float32.
 
-    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale, "unknown".
-
-    And of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id, label_set
-    (its name).
+    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale,
+    "unknown". Of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id,
+    label_set (its name).
 
     Raises:
         MapError: the file cannot be written.

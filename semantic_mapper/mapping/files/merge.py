@@ -71,8 +71,7 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
     """Add all that ``source`` holds to ``target``; blocks without a measurement are left out.
 
     Args:
-        target: Is changed; of the same voxel size and classes.
-        source: Another grid.
+        target, source: Grids of the same voxel size and classes.
         T_target_source: Where the source lies.
         cap: Of weights and of votes.
         version: That the blocks are marked as changed at.
@@ -180,15 +179,8 @@ def _parts(pairs: Int64) -> Iterator[tuple[Int64, Int64]]:
 def _resample_blocks(
     count: int, keys: Int32, R: Float64, t: Float64, index: BlockIndex, buffers: GridBuffers, moved: BlockValues
 ) -> None:
-    """Interpolate a source at the voxels of other blocks.
-
-    Args:
-        count: B.
-        keys: (B, 3) of the blocks.
-        R, t: (3, 3) and (3,): their point p is the source's ``R @ (p - t)``, in voxels.
-        index, buffers: Of the source.
-        moved: B blocks of zeros, to fill.
-    """
+    """Interpolate a source at the voxels of other blocks (B, 3), whose point p is the source's ``R @ (p - t)`` in
+    voxels."""
     ...
 
 

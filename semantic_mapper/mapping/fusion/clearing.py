@@ -45,21 +45,13 @@ _LEVELS = 6  # squares of up to 64 cells a side
 
 
 class FusionLimits(NamedTuple):
-    """Lengths in metres, and the caps.
-
-    Args:
-        voxel_size: Edge of a voxel.
-        truncation: TSDF truncation.
-        depth_max: Farther depth is ignored.
-        vote_band: Voxels at most this far from the surface take votes.
-        max_weight: Cap of TSDF weight and of votes; beyond it old measurements fade.
-    """
+    """Lengths in metres, and the caps."""
 
     voxel_size: float
-    truncation: float
-    depth_max: float
-    vote_band: float
-    max_weight: float
+    truncation: float  # of the TSDF
+    depth_max: float  # farther depth is ignored
+    vote_band: float  # voxels at most this far from the surface take votes
+    max_weight: float  # cap of TSDF weight and of votes; beyond it old measurements fade
 
 
 class DepthBounds(NamedTuple):
@@ -114,10 +106,8 @@ def clear_in_view(
     Args:
         grid: The map's storage. Blocks on disk come back where the frame may see through them.
         band: (B,) sorted packed keys of the blocks that the frame was fused into.
-        camera: Of the frame.
-        limits: Of the map.
-        depth: (H, W) float32 metres, from a sensor.
-        rgb: (H, W, 3) uint8.
+        camera, limits: Of the frame and the map.
+        depth, rgb: (H, W) float32 metres, from a sensor, and (H, W, 3) uint8.
         bounds: Of ``depth``.
         version: Of the map, for the blocks that change.
 

@@ -71,13 +71,13 @@ class GridBuffers(NamedTuple):
 
 
 class BlockGrid:
-    """Blocks of 8^3 voxels by their key; grows by half when full and never past ``max_blocks``.
+    """Blocks of 8^3 voxels by their key; grows by half when full and never past ``max_blocks``, in memory and on disk.
 
     Args:
         voxel_size_m: Edge of a voxel.
         classes: L, channels of the class evidence.
         initial_blocks: Capacity at start.
-        max_blocks: Blocks at most, in memory and on disk.
+        max_blocks: At most.
         memory_bytes: For blocks in memory; 0 = no limit.
 
     Attributes:

@@ -26,13 +26,7 @@ _KEYS_A_QUERY = 500
 
 
 class BlockValues(NamedTuple):
-    """The voxels of B blocks.
-
-    Args:
-        tsdf, weight, votes: (B, 512) float32.
-        color: (B, 512, 3) float32.
-        evidence: (B, 512, L) float32.
-    """
+    """The voxels of B blocks: (B, 512) float32, colour (B, 512, 3), evidence (B, 512, L)."""
 
     tsdf: Float32
     weight: Float32
@@ -159,12 +153,8 @@ def _parts(keys: Sequence[int]) -> Iterator[Sequence[int]]:
 
 
 class BlockStore:
-    """Blocks on disk by packed key.
-
-    Attributes:
-        keys: (B,) int64, ascending, of the blocks in the store.
-        versions: (B,) int64 when each had last changed.
-        surface: (B,) bool whether each holds a surface.
+    """Blocks on disk by packed key: ``keys`` (B,), ascending; when each had last changed, and whether it holds a
+    surface.
 
     Raises:
         MapError: no file can be made in the system's folder for temporary files.
