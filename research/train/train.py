@@ -134,8 +134,10 @@ class _Run:
         self.field = build_field(config.kind, config.field, ROOMS).to(device)
         check_field(self.field, config)
         trained = config.imagenet or config.start or config.encoder_from
+        self.frozen: list[nn.Module] = []
         if config.backbone_rate == 0 and trained and self.field.image_encoder is not None:
-            self.field.image_encoder.freeze_backbones()
+            self.frozen += self.field.image_encoder.backbones()
+            self.field.image_encoder.freeze(*self.frozen)
         self.loss: nn.Module = _StepLoss(self.field, config)
         if ranks.world > 1:  # parts that a config switches off (an attention, say) get no gradient
             self.loss = DistributedDataParallel(self.loss, find_unused_parameters=True)
@@ -221,8 +223,8 @@ class _Run:
         generator = torch.Generator().manual_seed(seed)
         share = self._images_share()
         if (encoder := self.field.image_encoder) is not None and encoder.depth_net is not None:
-            frozen = config.images.frozen_colours and progress.depth_grown and fraction < share
-            encoder.freeze_colours(frozen)
+            rests = config.images.frozen_colours and progress.depth_grown and fraction < share
+            encoder.freeze(*self.frozen, *([encoder.colour_net] if rests else []))
         later = config.images.later
         on_images = fraction < share or (later > 0 and float(torch.rand(1, generator=generator)) < later)
         batch = self._draw_images(pool, generator) if on_images else self._draw(pool, generator)

@@ -73,7 +73,7 @@ def test_a_backbone_with_statistics_of_its_own_is_calibrated_though_it_has_count
             if isinstance(module, torch.nn.BatchNorm2d):
                 assert module.running_mean is not None
                 module.running_mean.fill_(0.1)  # as published weights bring it, their count is not among them
-    field.freeze_backbones()
+    field.freeze(*field.backbones())
     assert field.uncalibrated, "the other norms are fresh"
     calibrate(field, views(2))
     assert not field.uncalibrated
@@ -177,9 +177,8 @@ def test_blocks_at_the_coarsest_width_are_refused():
 
 def test_a_frozen_backbone_keeps_weights_and_statistics_while_the_rest_learns():
     encoder = ImageEncoder(SMALL, 8)
-    encoder.freeze_backbones()
-    encoder.freeze_colours(True)
-    encoder.freeze_colours(False)  # which must not wake it
+    encoder.freeze(encoder.colour_net, *encoder.backbones())
+    encoder.freeze(*encoder.backbones())
     before = {name: t.clone() for name, t in encoder.state_dict().items()}
     optimiser = torch.optim.AdamW(encoder.parameters(), 0.1, weight_decay=0.1)
     views = wall_sources([pose_at(0.0), pose_at(0.1)])
