@@ -52,6 +52,11 @@ class LearnedField(nn.Module, ABC):
         return self._label_set
 
     @property
+    def classifies_images(self) -> bool:
+        """Whether a field of this kind says anything of single images."""
+        return type(self).source_logits is not LearnedField.source_logits
+
+    @property
     def image_encoder(self) -> ImageEncoder | None:
         """The encoder that all kinds with images share; None for kinds without one."""
         return next((module for module in self.modules() if isinstance(module, ImageEncoder)), None)

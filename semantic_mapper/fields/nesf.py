@@ -246,15 +246,6 @@ class Nesf(nn.Module):
         with torch.no_grad():
             self.net.head.bias[-5], self.net.head.bias[-4] = 1.0, -1.0
 
-    def trust(self, fraction: float) -> None:
-        """Blend the answers about classes with the smoothed votes: 1 = leave them as they are, 0 = smoothed votes."""
-        with torch.no_grad():
-            classes = slice(0, -3)
-            self.net.head.weight[classes] *= fraction
-            self.net.head.bias[classes] *= fraction
-            self.net.head.bias[-5] += 1 - fraction
-            self.net.head.bias[-4] -= 1 - fraction
-
     def extended(self, label_set: LabelSet) -> Nesf:
         """The same network for maps of more classes behind its own: votes for those are smoothed."""
         own, more = len(self.label_set), len(label_set) - len(self.label_set)

@@ -1,8 +1,7 @@
 """Convolutions over the occupied cells of a 3D grid, in plain torch: neighbour tables, gathers, matrix products.
 
 A *submanifold* convolution gives an output where there is an input and nowhere else (Graham et al. 2018), so a surface
-stays a surface however many layers follow. Missing neighbours count as zeros. ``dense`` methods are the reference that
-tests hold the sparse ones to.
+stays a surface however many layers follow. Missing neighbours count as zeros.
 """
 
 from __future__ import annotations
@@ -159,11 +158,6 @@ class SubmanifoldConv(nn.Module):
         convolved: torch.Tensor = _Submanifold.apply(x, self.weight, level.neighbours)  # pyright: ignore[reportAssignmentType]
         return convolved + self.bias
 
-    def dense(self, x: torch.Tensor) -> torch.Tensor:
-        """The same over a full grid (1, in, X, Y, Z) -> (1, out, X, Y, Z)."""
-        kernel = self.weight.view(3, 3, 3, *self.weight.shape[1:]).permute(4, 3, 0, 1, 2)
-        return nn.functional.conv3d(x, kernel, self.bias, padding=1)
-
 
 class Down(nn.Module):
     """2^3 convolution of stride 2: each coarser cell sees the cells in it; weight (8, in, out)."""
@@ -182,11 +176,6 @@ class Down(nn.Module):
             coarse = coarse.index_add(0, level.parent[here], x[here] @ self.weight[corner])
         return coarse + self.bias
 
-    def dense(self, x: torch.Tensor) -> torch.Tensor:
-        """The same over a full grid (1, in, X, Y, Z) of even sizes -> (1, out, X / 2, Y / 2, Z / 2)."""
-        kernel = self.weight.view(2, 2, 2, *self.weight.shape[1:]).permute(4, 3, 0, 1, 2)
-        return nn.functional.conv3d(x, kernel, self.bias, stride=2)
-
 
 class Up(nn.Module):
     """Transposed 2^3 convolution back to the cells that are occupied; weight (8, in, out)."""
@@ -201,11 +190,6 @@ class Up(nn.Module):
         count, wide = len(x), self.weight.shape[2]
         spread = x @ self.weight.permute(1, 0, 2).reshape(x.shape[1], 8 * wide)  # (P, 8 * out)
         return spread.view(count * 8, wide).index_select(0, level.parent * 8 + level.corner) + self.bias
-
-    def dense(self, x: torch.Tensor) -> torch.Tensor:
-        """The same over a full grid (1, in, X, Y, Z) -> (1, out, 2 X, 2 Y, 2 Z)."""
-        kernel = self.weight.view(2, 2, 2, *self.weight.shape[1:]).permute(3, 4, 0, 1, 2)
-        return nn.functional.conv_transpose3d(x, kernel, self.bias, stride=2)
 
 
 def _initial(places: int, channels_in: int, channels_out: int) -> torch.Tensor:

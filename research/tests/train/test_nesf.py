@@ -12,7 +12,7 @@ import torch
 from msgspec.structs import replace
 
 from research.train.map_grids import training_map
-from research.train.nesf import NesfTrainConfig, TrainingMap, VoxelLabels, _crop, train_nesf, withhold
+from research.train.nesf import NesfTrainConfig, TrainingMap, VoxelLabels, _crop, train_nesf, trust, withhold
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.nesf import (
     CELL_M,
@@ -88,7 +88,7 @@ def test_a_network_that_overrules_right_votes_is_trusted_less(noisy: TrainingMap
 def test_an_untrusted_network_leaves_the_smoothed_votes(noisy: TrainingMap) -> None:
     trained = train_nesf(replace(TINY, steps=5), ROOMS, [noisy], [noisy]).model
     cells = pool(noisy.points)
-    trained.trust(0.0)
+    trust(trained, 0.0)
     expected, found = smoothed_votes(ROOMS).model(cells), trained(cells)
     torch.testing.assert_close(found[:, :-3], expected[:, :-3])
 

@@ -112,11 +112,6 @@ def test_named_parts_compute_in_bfloat16_and_hand_back_float32():
     assert rounded.state_dict().keys() == exact.state_dict().keys()
 
 
-def test_a_part_that_the_field_has_not_is_refused_with_those_it_has():
-    with pytest.raises(ConfigError, match="no part 'decoder'; there are encoder, "):
-        compute_in_bfloat16(tiny_field(), ("decoder",), "cpu")
-
-
 def test_more_processes_than_gpus_are_refused():
     with pytest.raises(ConfigError, match="has no GPU"):
         choose_device("cuda", local_rank=64)

@@ -46,8 +46,6 @@ NOTHING = -10.0  # raw density of what is empty: an opacity of 5e-8
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 4, 2
 COLOUR_WIDTH = 64
 FEATURE_START = 0.1  # standard deviation
-DENSITY_START = 2.0  # log density of an untrained network: 7 / m, a third of the light gone after 5 cm
-DENSITY_LIMIT = 8.0  # 3,000 / m: opaque within 1 mm, and no overflow
 OPAQUE = 0.5  # opacity from which on a ray has met something
 
 
@@ -207,15 +205,6 @@ def encode_frequencies(x: torch.Tensor, frequencies: int) -> torch.Tensor:
 def encoded_size(dimensions: int, frequencies: int) -> int:
     """Channels that ``encode_frequencies`` gives."""
     return dimensions * (1 + 2 * frequencies)
-
-
-def density_from(raw: torch.Tensor) -> torch.Tensor:
-    """Network output -> density in 1 / m, positive.
-
-    An exponential where NeRF has a ReLU: scenes are in metres here, and samples may stand a centimetre apart, so
-    densities from 0.1 / m to 1,000 / m have to be in reach of one learning rate.
-    """
-    return torch.exp((raw + DENSITY_START).clamp(max=DENSITY_LIMIT))
 
 
 def relu_layers(c_in: int, width: int, count: int) -> nn.Sequential:
