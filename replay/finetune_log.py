@@ -40,8 +40,8 @@ from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.replay.run_folder import prepare_file
 from semantic_mapper.training.boxes import boxes_in_view
 from semantic_mapper.training.config import FinetuneConfig
+from semantic_mapper.training.finetune import FITTERS, finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.fitters import FITTERS, fitter_of
 from semantic_mapper.training.frame_rays import usable_frames
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
@@ -215,7 +215,7 @@ def _fit(
     def stopped() -> bool:
         return monitor.stopped_by != ""
 
-    checkpoint = fitter_of(kind)(frames, label_set, start, request.config, on_progress, stopped, seen)
+    checkpoint = finetune(frames, label_set, start, request.config, on_progress, stopped, seen, kind)
     learned = "grid_steps" if kind == Panoptic.kind else "steps"  # boxes need no more than geometry
     if monitor.stopped_by and not checkpoint.recipe[learned]:
         raise KeyboardInterrupt

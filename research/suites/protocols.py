@@ -37,8 +37,8 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.baselines import WarpBaseline
+from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews
@@ -202,18 +202,17 @@ def _fit_and_score(
     frames += [as_given(room.given[n], depth=True) for n in keyframes.unlabelled]
     views = stack_sources([view_from_frame(frame, room.label_set, suite.tier.width) for frame in frames])
     field = _start(entry, suite, views, room.label_set)
-    fit = fitter_of(field.kind)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
     device = next(field.parameters()).device
     if suite.scene.seconds > 0:  # what the first step of a process costs more is no part of any budget
         one_step = msgspec.structs.replace(fit_config(suite, 1.0), seconds=0, steps=1, held_out_rays=64)
-        fit(frames, room.label_set, _start(entry, suite, views, room.label_set), one_step)
+        finetune(frames, room.label_set, _start(entry, suite, views, room.label_set), one_step)
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
         start = _start(entry, suite, views, room.label_set)
         progress = _progress(on_fit, spent, share, whole)
-        fitted = fit(frames, room.label_set, start, fit_config(suite, share), progress, stopped)
+        fitted = finetune(frames, room.label_set, start, fit_config(suite, share), progress, stopped)
         if stopped():
             return None
         answers = answer_from_keyframes(room, fitted.model.to(device).eval(), suite, keyframes)

@@ -55,6 +55,10 @@ class FrameRays:
         origin = np.ascontiguousarray(self.T_world_camera[frame, :3, 3])
         return RayBatch(torch.from_numpy(origin), torch.from_numpy(direction), near, far, none)
 
+    def colours(self, pixels: Int64) -> torch.Tensor:
+        """Colours (R, 3) in [0, 1] of pixels (R,)."""
+        return torch.from_numpy(self.rgb[pixels] / np.float32(255))
+
     def pixels_of(self, frame: int) -> Int64:
         """Numbers of all pixels of a frame, row by row."""
         return np.arange(self.first[frame], self.first[frame + 1])

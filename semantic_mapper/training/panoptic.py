@@ -4,11 +4,8 @@ from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,10 +14,8 @@ from torch.nn import functional
 
 from semantic_mapper.config import BoxConfig
 from semantic_mapper.errors import ConfigError, FrameError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.scene.boxes import MAX_INTERVALS
-from semantic_mapper.fields.scene.grid import NOTHING, RaySamples, heaviest, ray_fraction
+from semantic_mapper.fields.scene.grid import NOTHING, RaySamples, ray_fraction
 from semantic_mapper.fields.scene.march import adam_grid
 from semantic_mapper.fields.scene.panoptic import BoxesOnRays, Panoptic, merged_classes
 from semantic_mapper.imaging import resize_label
@@ -28,18 +23,9 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.boxes import fill_boxes, nothing_in_view, shown_boxes
 from semantic_mapper.training.config import FinetuneConfig, PanopticFitConfig
-from semantic_mapper.training.finetune import check_budget
-from semantic_mapper.training.fit import Budget, OnProgress, fit, part_of, time_left
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.grid_fit import (
-    BETA1,
-    BETA2,
-    FEATURE_RATE,
-    TRUNK_RATE,
-    fit_geometry,
-    scene_checkpoint,
-    view_fraction,
-)
+from semantic_mapper.training.fit import Budget, Fitted, descend, fit
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays
+from semantic_mapper.training.grid_fit import BETA1, BETA2, fit_geometry, grid_figures, trunk_optimiser, view_fraction
 from semantic_mapper.types import Bool, Int64, PosedFrame
 
 GRID_UNTIL = 0.35  # fraction of the time for geometry and colours alone
@@ -51,7 +37,6 @@ LEAST = 1e-4  # of the probability that a pseudo label has: below, it has no gra
 POINT_WEIGHT = 0.05  # from which on a sample says what is there
 DEPTH_REACH = 0.05  # 1 / m, of inverse depth: a larger error counts linearly
 SURVEYED = 20000  # rays that say how much of the images boxes cover
-LOOKED_AT = 2000  # of these together: where many boxes overlap, each ray takes a table of pairs
 FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is warned about
 FEW_MATCHED = 0.5  # fraction of the pseudo labels that are possible on their ray, below which the log is warned about
 LEARNED = 10  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
@@ -81,24 +66,15 @@ class Survey:
     """What boxes and pseudo labels have to do with each other.
 
     Args:
-        boxes: That stand still.
-        seen: Of these, boxes that any surveyed ray meets.
-        moving: Boxes that move, and are followed.
-        lost: Boxes that move, and that no frame shows at their times.
+        boxes, seen: How many stand still, and how many of these any surveyed ray meets.
         covered: Fraction of pixels whose ray meets a box.
         matched: Fraction of pixels with a pseudo label whose class is possible on their ray.
-        crowded: Fraction of pixels whose ray meets more boxes than are looked at, ``MAX_INTERVALS``.
-        ambiguous: Fraction of pixels whose surface is in boxes of several classes.
     """
 
     boxes: int
     seen: int
     covered: float
     matched: float
-    crowded: float = 0.0
-    ambiguous: float = math.nan
-    moving: int = 0
-    lost: int = 0
 
 
 def fit_panoptic(
@@ -106,73 +82,70 @@ def fit_panoptic(
     label_set: LabelSet,
     start: LearnedField | None,
     config: FinetuneConfig,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
-    seen_stamps_ns: Iterable[int] = (),
-) -> Checkpoint:
-    """Fit a ``Panoptic``.
+    budget: Budget,
+) -> Fitted:
+    """Fit a ``Panoptic``; stopped before its classes are learned, these are those of the boxes alone.
 
     Args:
         frames: With poses; their label images are the pseudo labels.
         label_set: Of these and of the boxes.
         start: A ``Panoptic`` with the boxes; its weights are not looked at. Without boxes pseudo labels alone teach,
             where ``config`` leaves out the losses that need some.
-        config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
-        on_progress: Called after every step.
-        stopped: Called before every step; once it returns anything true, the field so far is the result. With less than
-            ``LEARNED`` steps of the second part its classes are those of the boxes alone (``fixed``).
-        seen_stamps_ns: Frames whose true labels those who made the pseudo labels have learned from.
+        budget: ``steps``, if not 0, is the number of steps of each of its two parts.
 
     Raises:
-        ConfigError: no boxes, none of them in view, no class in common with the pseudo labels, or no budget.
+        ConfigError: no boxes, none of them in view, or no class in common with the pseudo labels.
         FrameError: no pseudo label, or what ``fit_grid`` refuses.
         WeightsError: ``start`` has other classes.
     """
-    check_budget(config)
     by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
     if not isinstance(start, Panoptic) or (by_boxes and not start.shape.boxes):
         raise ConfigError("a field of kind 'panoptic' needs boxes; give a file of them (--boxes)")
     if start.label_set != label_set:
         raise WeightsError(f"the boxes are of label set '{start.label_set.name}', the labels of '{label_set.name}'")
-    began = time.monotonic()
-    usable = held_out_unlabelled(usable_frames(frames), config.grid.held_out)
-    everything = pseudo_rays(usable, label_set, config.width)
-    boxes, lost = _followed(start, usable, everything.rays)
+    frames = held_out_unlabelled(frames, config.grid.held_out)
+    everything = pseudo_rays(frames, label_set, config.width)
+    boxes, lost = _followed(start, frames, everything.rays)
     if by_boxes and not boxes:
         raise ConfigError(
             f"no box is in view of any frame: {lost} move, and no frame shows them at the times of their stamps. Are "
             "the stamps the log's, in nanoseconds?"
         )
-    survey = replace(survey_boxes(start, everything, config), moving=len(start.moving) - lost, lost=lost)
-    shape = msgspec.structs.replace(start.shape, boxes=boxes)
-    part = msgspec.structs.replace(config, seconds=GRID_UNTIL * config.seconds)
-    progress = part_of(on_progress, 0, GRID_UNTIL)
-    movers = start.moving
+    survey = survey_boxes(start, everything, config)
 
     def shows_movers(seen: Sequence[PosedFrame], rays: FrameRays) -> Bool:
-        return shown_boxes(movers, seen, rays)[0]
+        return shown_boxes(start.moving, seen, rays)[0]
 
-    leave_out = shows_movers if len(movers) else None
-    field, grid = fit_geometry(start.kind, usable, label_set, start, part, progress, stopped, shape, leave_out)
+    field, grid = fit_geometry(
+        frames,
+        label_set,
+        start,
+        msgspec.structs.replace(start.shape, boxes=boxes),
+        Panoptic.kind,
+        config,
+        budget.part(GRID_UNTIL, steps=config.steps or config.grid.steps),
+        shows_movers if len(start.moving) else None,
+    )
     assert isinstance(field, Panoptic)
     data = pseudo_rays(grid.frames, label_set, config.width)
     still = np.flatnonzero(~shows_movers(grid.frames, data.rays))
     data = replace(data, gain=torch.from_numpy(grid.gains), still=still)
-    steps = JointFit(field, data, config).run(
-        time_left(config.seconds, began), part_of(on_progress, GRID_UNTIL, 1.0), stopped
-    )
-    if steps < LEARNED and stopped():
+    steps = JointFit(field, data, config).run(budget.part(1.0))
+    if steps < LEARNED and budget.stopped():
         field.shape = field.config = msgspec.structs.replace(field.shape, classes="fixed")
     fill_boxes(field, grid.frames, data.rays, grid.gains, config.grid.near_m)
-    survey = replace(survey, ambiguous=ambiguous_fraction(field, everything, config))
-    taught = [f for f in usable if f.label is not None and not f.label_is_pseudo]
-    checkpoint = scene_checkpoint(field, grid, config, time.monotonic() - began, seen_stamps_ns, taught)
-    figures: dict[str, Any] = {name: getattr(survey, name) for name in ("boxes", "seen", "moving", "lost")}
-    figures |= {name: round(getattr(survey, name), 4) for name in ("covered", "matched", "crowded", "ambiguous")}
-    figures["labelled_frames"] = sum(f.label is not None for f in usable)
-    figures["frames"] = len(usable)
-    recipe = checkpoint.recipe | {"grid_steps": grid.steps, "steps": steps, "panoptic": figures}
-    return Checkpoint(checkpoint.model, (), recipe)
+    found = {
+        "boxes": survey.boxes,
+        "seen": survey.seen,
+        "covered": round(survey.covered, 4),
+        "matched": round(survey.matched, 4),
+        "moving": len(start.moving) - lost,
+        "lost": lost,
+        "labelled_frames": sum(f.label is not None for f in frames),
+        "frames": len(frames),
+    }
+    figures = grid_figures(grid) | {"grid_steps": grid.steps, "steps": steps, "panoptic": found}
+    return Fitted(field, figures, [f for f in frames if f.label is not None and not f.label_is_pseudo])
 
 
 def held_out_unlabelled(frames: Sequence[PosedFrame], every: int) -> list[PosedFrame]:
@@ -239,23 +212,11 @@ def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> S
         )
     channel = data.channel[torch.from_numpy(pixels)]
     matched = possible(field.on_ray(found), group, channel)[channel >= 0].float().mean().item()
-    crowded = (found.count > MAX_INTERVALS).float().mean().item()
     if matched < FEW_MATCHED:
         _log.warning(
             "few_labels_match", matched=round(matched, 4), reason="most name a class that no box on their ray has"
         )
-    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched, crowded)
-
-
-def ambiguous_fraction(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> float:
-    """Fraction of pixels whose surface is in boxes of more than one class."""
-    several = 0
-    for pixels in np.split(_some_pixels(data, config.seed), SURVEYED // LOOKED_AT):
-        with torch.no_grad():
-            samples = heaviest(field.march(data.rays.rays(pixels, config.grid.near_m)), 1)
-            named = field.boxes_on(samples).named[:, 0].sum(-1)
-        several += int(((named > 1) & (samples.opacity > 0.5)).sum())
-    return several / SURVEYED
+    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched)
 
 
 def possible(on_ray: torch.Tensor, group: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
@@ -304,11 +265,8 @@ class JointFit:
         self.rng = np.random.default_rng(config.seed)
         self.group = merged_classes(field.label_set, field.shape.merge)
         assert field.trunk is not None
-        networks = [p for name, p in field.trunk.named_parameters() if name != "features"]
-        networks += [*field.head.parameters(), *field.classifier.parameters()]
-        groups = [{"params": [field.trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
-        self.optimiser = torch.optim.Adam(groups)
-        self.rates = [FEATURE_RATE, TRUNK_RATE]
+        self.optimiser = trunk_optimiser(field.trunk, field.head, field.classifier)
+        self.rates = [group["lr"] for group in self.optimiser.param_groups]
         field.grid.values.requires_grad_(True)
         values = field.grid.values.detach().numpy()
         self.first, self.second = np.zeros_like(values), np.zeros_like(values)
@@ -317,9 +275,9 @@ class JointFit:
         self.step = 0
         self._empty_cells()
 
-    def run(self, seconds: float, on_progress: OnProgress | None = None, stopped: Callable[[], object] = bool) -> int:
-        """Learn until the budget is used (``seconds`` 0 = only steps count); returns the number of steps."""
-        steps = fit(self.learn, Budget(seconds, self.config.steps), on_progress, stopped)
+    def run(self, budget: Budget) -> int:
+        """Learn until the budget is used; returns the number of steps."""
+        steps = fit(self.learn, budget)
         self._empty_cells()
         self.field.grid.values.requires_grad_(False)
         self.field.eval()
@@ -340,20 +298,17 @@ class JointFit:
         behind = field.grid.sky_colour(batch.direction) * samples.light[:, None]
         colour = (share[..., None] * field.trunk.colour(r, batch.direction)).sum(1) + behind
         gain = self.data.gain[torch.from_numpy(self.data.rays.frame_of(pixels))]
-        truth = torch.from_numpy(self.data.rays.rgb[pixels] / np.float32(255))
-        loss = functional.mse_loss(gain * colour, truth)
+        loss = functional.mse_loss(gain * colour, self.data.rays.colours(pixels))
         loss = loss + DEPTH * self._depth_loss(samples, share, pixels)
         channel = self.data.channel[torch.from_numpy(pixels)]
         boxes = field.boxes_on(samples)
         learned = field.learned(samples, r)
         semantics = semantic_losses(field, samples, boxes, learned, channel, self.group, config.panoptic)
         loss = loss + SEMANTICS * semantics
-        self.optimiser.zero_grad()
         field.grid.values.grad = None
-        loss.backward()
-        self.optimiser.step()
+        total = descend(self.optimiser, loss)
         self._step_density(DENSITY_RATE * left)
-        return float(loss.detach())
+        return total
 
     def _depth_loss(self, samples: RaySamples, share: torch.Tensor, pixels: np.ndarray) -> torch.Tensor:
         """Huber of inverse depth, where depth is known, in units of its reach."""

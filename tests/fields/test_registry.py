@@ -7,7 +7,7 @@ from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, load_chec
 from semantic_mapper.fields.registry import PRESETS, build_field, field_config, field_kinds, field_names
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.training.config import StepConfig
-from semantic_mapper.training.step import step_on_rays
+from semantic_mapper.training.finetune import step_on_rays
 from semantic_mapper.training.views import view_from_frame
 from tests.fields.scene import wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, TINY, tiny

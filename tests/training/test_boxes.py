@@ -19,17 +19,16 @@ from semantic_mapper.fields.scene.panoptic import Panoptic, box_config, primitiv
 from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.fields.source_views import encoded_views
 from semantic_mapper.labels import make_label_set
+from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.panoptic import fit_panoptic
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, PosedFrame
-from tests.training.test_irt import two_planes
 from tests.training.test_panoptic import SMALL
+from tests.training.two_planes import BOX_M, two_planes
 
 SET = make_label_set("deck", ["floor", "table"])
 FLOOR, TABLE = 0, 1
 FRAMES, GAP_NS = 10, 100
-BOX_M = (-2.0, -2.0, -0.5, 2.0, 2.0, 2.0)
 SHIFTS = np.linspace(-1.6, 0.0, FRAMES)  # of the deck, whose middle is at x = 0.8 m without
 
 
@@ -64,7 +63,7 @@ def start(*boxes: Primitive) -> Panoptic:
 
 @cache
 def fitted() -> Checkpoint:
-    return fit_panoptic(scene(), SET, start(deck()), SMALL)
+    return finetune(scene(), SET, start(deck()), SMALL)
 
 
 def seen(
@@ -110,7 +109,7 @@ def test_it_leaves_nothing_in_the_scene_that_stands_still() -> None:
     wrong = (render.depth_m - torch.from_numpy(ground.ravel())).abs() > 0.2
     assert (wrong & render.known).float().mean() < 0.01
     assert (things == 0).all()
-    still = model(fit_panoptic(scene(), SET, start(replace(deck(), stamps=None)), SMALL))
+    still = model(finetune(scene(), SET, start(replace(deck(), stamps=None)), SMALL))
     smeared, _ = seen(still, frame, None)
     wrong = (smeared.depth_m - torch.from_numpy(ground.ravel())).abs() > 0.2
     assert (wrong & smeared.known).float().mean() > 0.05, "as if it stood still"
@@ -152,7 +151,7 @@ def test_measured_depth_says_whether_a_pixel_is_of_the_box() -> None:
 
 def test_without_depth_the_core_of_a_box_is_full() -> None:
     config = msgspec.structs.replace(SMALL, steps=10, grid=msgspec.structs.replace(SMALL.grid, box_m=BOX_M))
-    field = model(fit_panoptic([replace(f, depth_m=None) for f in scene()], SET, start(deck()), config))
+    field = model(finetune([replace(f, depth_m=None) for f in scene()], SET, start(deck()), config))
     frame = view(0.4, 3)
     _, things = seen(field, frame, frame.stamp_ns)
     assert frame.label is not None
@@ -163,8 +162,8 @@ def test_without_depth_the_core_of_a_box_is_full() -> None:
 def test_a_box_that_no_frame_shows_at_its_times_is_left_out() -> None:
     config = msgspec.structs.replace(SMALL, steps=2)
     away = replace(deck(), id=8, stamps=((900_000_000, deck_pose(0)),))
-    checkpoint = fit_panoptic(scene(), SET, start(deck(), away), config)
+    checkpoint = finetune(scene(), SET, start(deck(), away), config)
     assert [b.id for b in model(checkpoint).shape.boxes] == [7]
     assert (checkpoint.recipe["panoptic"]["moving"], checkpoint.recipe["panoptic"]["lost"]) == (1, 1)
     with pytest.raises(ConfigError, match="no frame shows them at the times of their stamps"):
-        fit_panoptic(scene(), SET, start(away), config)
+        finetune(scene(), SET, start(away), config)

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.finetune import pick_views
 from semantic_mapper.training.losses import ray_loss, semantic_loss
-from semantic_mapper.training.step import pick_views
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,

@@ -29,7 +29,7 @@ from research.suites.aerial import (
     thinned,
     training_frames,
 )
-from research.suites.aerial_arms import BRIDGE, IMAGE_ARMS, PATCH, patch_arm
+from research.suites.aerial_arms import BRIDGE, IMAGE_ARMS, PATCH, DimmedUNet, patch_arm
 from research.suites.aerial_claims import CLAIMS, CONSISTENCY, DARK_DROP, MIOU
 from research.suites.aerial_fields import field_arms
 from research.suites.aerial_grids import town_grid
@@ -40,7 +40,7 @@ from research.suites.store import RecordStore
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import unproject
 from semantic_mapper.labels import CARLA
-from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
+from semantic_mapper.training.baselines import UNetConfig
 from semantic_mapper.types import PosedFrame, UInt8
 
 TINY = AerialConfig(
@@ -188,9 +188,7 @@ def test_arms_on_a_grid_beat_one_class(name: str, folder: Path) -> None:
 
 def test_a_dimmed_unet_sees_other_pictures_and_the_default_none() -> None:
     frames = [v.frame for v in aerial_views(200_000, [0], aerial_camera(32))]
-    nets = {
-        darkest: UNetBaseline(CARLA, UNetConfig(steps=2, width=32, darkest=darkest)) for darkest in (1.0, 0.999999, 0.1)
-    }
+    nets = {darkest: DimmedUNet(CARLA, UNetConfig(steps=2, width=32), darkest) for darkest in (1.0, 0.999999, 0.1)}
     for net in nets.values():
         net.fit(frames)
     weights = {darkest: net.net.classifier.weight for darkest, net in nets.items()}
