@@ -20,7 +20,7 @@ from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.options import Count
 from semantic_mapper.replay.run_folder import free_name
-from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
+from semantic_mapper.training.online import Kept, KeyframePool
 from semantic_mapper.transport.codec import decode_as, encode, pack_parts, unpack_parts
 from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, LabelledKeyframe, digest_of
 from semantic_mapper.types import PosedFrame

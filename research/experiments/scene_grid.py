@@ -22,13 +22,13 @@ import numpy as np
 import torch
 
 from research.experiments.grid_scenes import BOX_M, object_frames, objects_scene
+from research.peers.kinds import build_field
 from research.peers.semantic_nerf import config_for_scene
 from research.scenes import VALIDATION_SEEDS, NoiseConfig
 from research.scenes.sequence import room_views
 from semantic_mapper.config import GridFieldConfig, SamplingConfig
 from semantic_mapper.fields.checkpoint import anchor_from_frame
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.imaging import resize_depth

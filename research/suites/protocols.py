@@ -19,6 +19,7 @@ from research.suites.config import (
 from research.suites.predict import predict_view
 from research.suites.records import CurvePoint, RoomRecord, Rows
 from research.suites.rooms import BenchmarkRoom, as_given
+from research.suites.scene_box import scene_config
 from research.suites.scoring import (
     Answer,
     as_rows,
@@ -33,8 +34,8 @@ from research.suites.views import Sources, choose_as_mapper, choose_covering, ch
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.checkpoint import adapt_model
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import LearnedField, build_field
+from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.baselines import WarpBaseline
 from semantic_mapper.training.finetune import finetune
@@ -159,7 +160,7 @@ def _source_count(field: LearnedField, suite: SuiteConfig) -> int:
 
 def _shows_own(field: LearnedField, suite: SuiteConfig) -> bool:
     """Whether the query's own image is a source view."""
-    return field.needs_own_view or field.reads_own_view or (suite.protocol == "generalize" and suite.own_image)
+    return field.needs_own_view or isinstance(field, IRT) or (suite.protocol == "generalize" and suite.own_image)
 
 
 def _answer(
@@ -240,7 +241,7 @@ def _start(entry: Entry, suite: SuiteConfig, views: SourceViews, label_set: Labe
     field = entry.field
     if suite.protocol == "finetune" and entry.file:
         return adapt_model(field, label_set)
-    config = field.scene_config(views, suite.tier.guided.far_m)
+    config = scene_config(field, views, suite.tier.guided.far_m)
     return build_field(field.kind, config, label_set, field.sampling).to(next(field.parameters()).device)
 
 

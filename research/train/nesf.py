@@ -39,10 +39,10 @@ from semantic_mapper.fields.nesf import (
     NesfWeights,
     SurfacePoints,
     near_cells,
+    pack_cells,
     pool,
     smoothed_votes,
 )
-from semantic_mapper.fields.sparse_conv import pack_cells
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.fit import budget_fraction

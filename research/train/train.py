@@ -16,6 +16,7 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
+from research.peers.kinds import build_field
 from research.scenes import SUITE_VERSION
 from research.train.folder_lock import sole_use_of
 from research.train.images import ImageBatch, images_loss
@@ -36,7 +37,6 @@ from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.device import bfloat16_is_fast, choose_device, compute_in_bfloat16
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.fit import budget_fraction, cosine_rate, make_optimiser, set_rates

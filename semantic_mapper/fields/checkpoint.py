@@ -24,8 +24,7 @@ from safetensors.torch import save
 
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import SemanticMapperError, WeightsError
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics

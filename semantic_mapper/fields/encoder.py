@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.source_views import sure_depth
+from semantic_mapper.fields.base import sure_depth
 from semantic_mapper.types import SourceViews
 
 COLOURS = 3

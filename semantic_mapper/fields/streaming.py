@@ -14,15 +14,17 @@ from torch import nn
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.source_views import GEOMETRY_CHANNELS, MIN_DEPTH_M
-from semantic_mapper.fields.sray import HIDDEN, LABEL_UNCERTAINTY, TAU, SRay
-from semantic_mapper.fields.sray_layers import (
+from semantic_mapper.fields.base import GEOMETRY_CHANNELS, MIN_DEPTH_M, EncodedViews
+from semantic_mapper.fields.sray import (
     BACKGROUND_M,
     COLOUR_SCALE,
+    HIDDEN,
+    LABEL_UNCERTAINTY,
     LEAST_VISIBILITY,
     OWN_DENSITY_OFFSET,
     OWN_RADIUS_M,
+    TAU,
+    SRay,
 )
 from semantic_mapper.fields.volume import field_render, sample_guided
 from semantic_mapper.geometry import expect_shape

@@ -20,8 +20,7 @@ from torch import nn
 
 from semantic_mapper.config import GridConfig, GridFieldConfig
 from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.fields.scene.grid import (
     HAZE,
     NOTHING,

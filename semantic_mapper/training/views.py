@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.fields.source_views import UNSURE_SPREAD
+from semantic_mapper.fields.base import UNSURE_SPREAD
 from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
 from semantic_mapper.geometry import camera_matrix, transform, unproject
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
@@ -190,7 +190,7 @@ def guided_rays(
 
     Args:
         noise: Sigma of the depth prior's error as a fraction of z; computed depth has errors of its own.
-        withheld: How often there is no depth prior; ``blind`` = there is none.
+        withheld: How often there is no depth prior; ``blind`` = always.
         samples_without_depth: Of a ray, in steps without a depth prior. One ray in ``thinning`` is rendered in these.
     """
     error = 1 + noise * torch.randn(len(flat_index), generator=generator)

@@ -67,7 +67,7 @@ from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.testing import LogReplays
 from semantic_mapper.training.config import FinetuneConfig, OnlineConfig
 from semantic_mapper.training.finetune import finetune
-from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
+from semantic_mapper.training.online import Kept, KeyframePool
 from semantic_mapper.transport import codec, pose_message, query_messages
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.keys import load_keys

@@ -9,7 +9,7 @@ from semantic_mapper.config import GridConfig, GridFieldConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.scene.grid import (
     NOTHING,
     GridField,

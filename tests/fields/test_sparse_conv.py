@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import conv3d, conv_transpose3d
 
-from semantic_mapper.fields.sparse_conv import Down, SubmanifoldConv, Up, cell_levels
+from semantic_mapper.fields.nesf import Down, SubmanifoldConv, Up, cell_levels
 
 SIZE = (8, 4, 12)
 

@@ -11,8 +11,7 @@ import torch
 
 from semantic_mapper.config import EncoderConfig, SamplingConfig, SRayConfig
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_layers import contextual_space
+from semantic_mapper.fields.sray import SRay, contextual_space
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import sample_guided, sample_inverse_depth
 from semantic_mapper.labels import make_label_set

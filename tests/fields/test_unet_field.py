@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.source_views import own_view
+from semantic_mapper.fields.base import own_view
 from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.types import SourceViews
 from tests.fields.scene import pose_at, wall_rays, wall_sources

@@ -11,7 +11,7 @@ from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, save_checkpoint
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose

@@ -14,10 +14,10 @@ import torch
 
 from semantic_mapper.config import PanopticConfig
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.base import encoded_views
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.scene.panoptic import Panoptic, box_config, primitive_of
 from semantic_mapper.fields.scene.primitives import Primitive
-from semantic_mapper.fields.source_views import encoded_views
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.frame_rays import frame_rays

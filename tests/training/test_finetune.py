@@ -8,7 +8,7 @@ from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields import device
 from semantic_mapper.fields.encoder import calibrate
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.config import FinetuneConfig

@@ -13,7 +13,7 @@ import torch
 
 from semantic_mapper.config import GridConfig
 from semantic_mapper.errors import ConfigError, FrameError
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.labels import ROOMS

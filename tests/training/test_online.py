@@ -11,12 +11,10 @@ import torch
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, PoseError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.learned import encode_alike
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field, encode_alike
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
 from semantic_mapper.training.config import OnlineConfig
-from semantic_mapper.training.keyframe_pool import KeyframePool, KeyframeSplit, key_of
-from semantic_mapper.training.online import learn
+from semantic_mapper.training.online import KeyframePool, KeyframeSplit, key_of, learn
 from semantic_mapper.types import PosedFrame
 from tests.small import settled_field, tiny_field, tiny_frames
 

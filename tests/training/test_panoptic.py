@@ -13,17 +13,16 @@ import torch
 
 from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
+from semantic_mapper.fields.base import encoded_views
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.scene.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
 from semantic_mapper.fields.scene.primitives import Primitive
-from semantic_mapper.fields.source_views import encoded_views
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.training.boxes import boxes_in_view
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig, StepConfig
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.panoptic import held_out_unlabelled, semantic_losses
+from semantic_mapper.training.panoptic import boxes_in_view, held_out_unlabelled, semantic_losses
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, RayBatch
 from tests.training.two_planes import two_planes

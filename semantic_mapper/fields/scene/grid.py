@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from semantic_mapper.config import GridConfig, GridFieldConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.march import (
     BIAS,
@@ -33,7 +33,6 @@ from semantic_mapper.fields.scene.march import (
     gather,
     march,
 )
-from semantic_mapper.fields.source_views import check_views, encoded_views, seen_bounds
 from semantic_mapper.fields.volume import composite_depth, field_render, interval_lengths
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -353,11 +352,6 @@ class GridField(LearnedField):
         """
         check_views(views)
         return encoded_views(views, views.rgb[:, :0])
-
-    def scene_config(self, views: SourceViews, far_m: float) -> GridFieldConfig:
-        """This kind, in the box that holds what the views can see, as finely as this field's is divided."""
-        low, high = seen_bounds(views, far_m)
-        return msgspec.structs.replace(self.config, grid=grid_box(low, high, max(self.config.grid.shape)))
 
     def march(self, rays: RayBatch, kept: int = KEPT, jitter: torch.Tensor | None = None) -> RaySamples:
         """The samples of greatest weight of each ray."""

@@ -17,9 +17,8 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import GridConfig, IRTConfig, SamplingConfig
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import MIN_DEPTH_M, EncodedViews, check_views, encoded_views, own_view
 from semantic_mapper.fields.scene.grid import GridField, RaySamples, heaviest, ray_fraction, relu_layers
-from semantic_mapper.fields.source_views import MIN_DEPTH_M, check_views, encoded_views, own_view
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import RayBatch, SourceViews
 
@@ -76,7 +75,6 @@ class IRT(GridField):
     """
 
     kind = "irt"
-    reads_own_view = True
     class_rows = ("classifier.weight", "classifier.bias")
     points_of_ray: int = POINTS
     texture_net: type[TextureNet] = TextureNet

@@ -19,7 +19,7 @@ from research.peers.semantic_nerf import SemanticNeRF
 from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.imaging import is_measured
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper

@@ -20,8 +20,8 @@ import pytest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.nodes.finetuner import finetune_round, finetuner
-from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
+from semantic_mapper.nodes.finetuner import finetuner
+from semantic_mapper.nodes.finetuner.finetuner import FinetuneRound
 from semantic_mapper.nodes.finetuner.node import run_finetuner
 from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
@@ -30,7 +30,7 @@ from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
 from semantic_mapper.nodes.process import StopRequest, run_when_idle
 from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.keyframe_pool import KeyframeSplit
+from semantic_mapper.training.online import KeyframeSplit
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe, Status, WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
@@ -202,14 +202,14 @@ def test_a_restarted_finetuner_goes_on_with_the_weights_and_keyframes_of_the_one
 def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
     start: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learn, under_way, go_on = finetune_round.learn, threading.Event(), threading.Event()
+    learn, under_way, go_on = finetuner.learn, threading.Event(), threading.Event()
 
     def dies(*arguments: Any) -> Any:
         under_way.set()
         go_on.wait(60)
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory\nmore of it")
 
-    monkeypatch.setattr(finetune_round, "learn", dies)
+    monkeypatch.setattr(finetuner, "learn", dies)
     with a_folder() as folder:
         endpoints = {name: f"ipc://{folder / name}" for name in ("mapper", "finetuner", "labels")}
         with Publisher(endpoints["mapper"]) as mapper:
@@ -223,7 +223,7 @@ def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
                 assert (heard.counters()["kept"], heard.counters()["set_aside"]) == (4, 0)
                 assert heard.last is not None and "RuntimeError: DefaultCPUAllocator" in heard.last.degraded[-1]
                 assert "its keyframes are kept, next try in" in heard.last.degraded[-1]
-            monkeypatch.setattr(finetune_round, "learn", learn)
+            monkeypatch.setattr(finetuner, "learn", learn)
             with finetuning(start, endpoints, 1, out=str(tmp_path / "killed"), retry_s=0.5) as heard:
                 update = heard.update()
                 assert (update.keyframes, update.held_out) == (3, 1) and heard.counters()["failed"] == 1
@@ -259,7 +259,7 @@ def test_a_round_that_gets_no_processor_holds_up_neither_messages_nor_the_end(
         go_on.wait(100)
         raise CancelledError
 
-    monkeypatch.setattr(finetune_round, "learn", starves)
+    monkeypatch.setattr(finetuner, "learn", starves)
     monkeypatch.setattr(finetuner, "GIVE_UP_S", 0.1)
     try:
         with played_mapper(start) as (heard, mapper):
@@ -305,7 +305,7 @@ def test_a_round_rests_as_its_share_says_and_can_be_cancelled(monkeypatch: pytes
         while True:
             on_progress(FitProgress(3, 0.3, 0.0, 0.0, 0.0, best=False))
 
-    monkeypatch.setattr(finetune_round, "learn", steps)
+    monkeypatch.setattr(finetuner, "learn", steps)
     config = OnlineConfig()
     under_way = FinetuneRound(KeyframeSplit((), ()), start_of(), "ab" * 32, config, 0.25, idle=False)
     assert eventually(lambda: bool(rested_s)) and rested_s[0] >= 0.15  # three times what it worked
