@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from research.suites.entries import load_entries
-from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, renew_card, ship, ship_on_base
+from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, ship, ship_on_base
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from tests.small import tiny_field
@@ -111,17 +111,6 @@ def test_figures_of_other_weights_or_of_half_a_run_are_refused(tmp_path: Path) -
         figures_of(path, path)
 
 
-def test_figures_with_depth_and_without_are_asked_for(tmp_path: Path) -> None:
-    half, out = tmp_path / "half.safetensors", tmp_path / "rooms.safetensors"
-    convert(weights(tmp_path), half)
-    off, on = tables(tmp_path, half)
-    other_views = tables(tmp_path, half, views=4)
-    for given in ([], [off], [on, on], [off, on, on], other_views):
-        with pytest.raises(ConfigError, match="two tables"):
-            ship(half, given, out, card(tmp_path))
-    assert not out.exists()
-
-
 @pytest.mark.parametrize("revision", [None, "abc", f"{COMMIT}-dirty"])
 def test_weights_that_no_commit_can_make_again_are_refused_however_far_back(
     tmp_path: Path, revision: str | None
@@ -151,13 +140,6 @@ def test_the_card_lists_the_runs_from_the_first_to_the_last(tmp_path: Path) -> N
     assert lines[start + 2].endswith("| `bbbbbbb` | cpu | 61 |")
     assert lines[start + 3].startswith("| `sray` | rays | colours and depth | 1,500 | last |")
     assert "Nothing was measured." in lines
-
-
-def test_a_card_without_its_marks_is_refused(tmp_path: Path) -> None:
-    page = tmp_path / "card.md"
-    page.write_text(f"{END}\n{BEGIN}\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match="must hold"):
-        renew_card(page, weights(tmp_path))
 
 
 def test_weights_that_others_published_need_no_revision_and_are_named_in_the_card(tmp_path: Path) -> None:
