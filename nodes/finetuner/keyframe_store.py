@@ -73,10 +73,7 @@ class LearningStore:
 
     def put_aside(self) -> None:
         """Rename the folder of another launch, whose keyframes people may have labelled; then begin with nothing.
-
-        Raises:
-            OSError: it cannot be renamed.
-        """
+        Raises OSError: it cannot be renamed."""
         record = self._folder / _RECORD
         if not record.exists() or not any(self._folder.glob(f"*{_SUFFIX}")):
             record.unlink(missing_ok=True)
@@ -88,10 +85,7 @@ class LearningStore:
 
     def keep(self, kept: Sequence[Kept], progress: Progress) -> None:
         """Save what has changed since the last call.
-
-        Raises:
-            OSError: it cannot be written; the last complete state stays.
-        """
+        Raises OSError: it cannot be written; the last complete state stays."""
         files = tuple(
             _KeptFile(digest=self._save(k.frame), held_out=k.held_out, proved_at=k.validated_by, trials=k.trials)
             for k in kept
@@ -110,10 +104,7 @@ class LearningStore:
 
     def restore(self, pool: KeyframePool) -> Progress:
         """Fill a pool with the keyframes of the folder; damaged ones are left out, with a warning.
-
-        Raises:
-            OSError: there are files that cannot be read.
-        """
+        Raises OSError: there are files that cannot be read."""
         record = self._read_record()
         for file in record.keyframes:
             try:

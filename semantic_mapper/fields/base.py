@@ -30,23 +30,14 @@ SAME_CAMERA = 1e-3  # metres between the centres plus the error of a unit depth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedViews:
-    """Per-view maps of m source views, each independent of the others, so that a keyframe is encoded once.
+    """Per-view maps of m source views, each independent of the others, so that a keyframe is encoded once."""
 
-    Args:
-        feature: (m, C, h, w) image features, the F_j of S-Ray Eq. 5.
-        rgb: (m, 3, h, w) in [0, 1], at feature resolution.
-        geometry: (m, 5, h, w) mixture of logistics along each view ray; see ``sray``.
-        K: (m, 3, 3) in pixels of (h, w).
-        T_camera_world: (m, 4, 4).
-        channel: (m, H, W) int16 known labels at the resolution of the images that were encoded, -1 = none.
-    """
-
-    feature: torch.Tensor
-    rgb: torch.Tensor
-    geometry: torch.Tensor
-    K: torch.Tensor
-    T_camera_world: torch.Tensor
-    channel: torch.Tensor
+    feature: torch.Tensor  # (m, C, h, w) image features, the F_j of S-Ray Eq. 5.
+    rgb: torch.Tensor  # (m, 3, h, w) in [0, 1], at feature resolution
+    geometry: torch.Tensor  # (m, 5, h, w) mixture of logistics along each view ray; see ``sray``
+    K: torch.Tensor  # (m, 3, 3) in pixels of (h, w)
+    T_camera_world: torch.Tensor  # (m, 4, 4)
+    channel: torch.Tensor  # (m, H, W) int16 known labels at the resolution of the images that were encoded, -1 = none
 
     def __len__(self) -> int:
         return int(self.feature.shape[0])
@@ -62,11 +53,7 @@ class EncodedViews:
 
 
 def stack_views(views: Sequence[EncodedViews]) -> EncodedViews:
-    """Join encoded views of equal resolution.
-
-    Raises:
-        ShapeError: none or too many views, or different resolutions.
-    """
+    """Join encoded views of equal resolution. Raises ShapeError: none or too many views, or different resolutions."""
     if not 1 <= sum(len(v) for v in views) <= MAX_SOURCE_VIEWS:
         raise ShapeError(f"a render takes 1 to {MAX_SOURCE_VIEWS} source views, got {sum(len(v) for v in views)}")
     sizes = {v.size for v in views}
@@ -109,11 +96,7 @@ class ImageClassifier(Protocol):
 
 
 def check_classes(field: SemanticField, label_set: LabelSet) -> None:
-    """Refuse a field for a map of other classes.
-
-    Raises:
-        WeightsError: naming both.
-    """
+    """Refuse a field for a map of other classes. Raises WeightsError: naming both."""
     if field.label_set != label_set:
         raise WeightsError(
             f"the field renders label set '{field.label_set.name}' ({len(field.label_set)} classes), "
@@ -123,10 +106,7 @@ def check_classes(field: SemanticField, label_set: LabelSet) -> None:
 
 def check_views(views: SourceViews) -> None:
     """Refuse source views whose tensors do not fit together.
-
-    Raises:
-        ShapeError: naming the tensor, with expected and actual shape.
-    """
+    Raises ShapeError: naming the tensor, with expected and actual shape."""
     sizes = expect_shape(views.rgb, "M 3 H W", "source rgb")
     count, height, width = sizes["M"], sizes["H"], sizes["W"]
     expect_shape(views.depth_m, f"{count} {height} {width}", "source depth_m")
@@ -140,10 +120,7 @@ def check_views(views: SourceViews) -> None:
 
 def sure_depth(views: SourceViews, *, computed: bool) -> SourceViews:
     """The views with the depth that a field can go by: what was computed and is not sure becomes a hole.
-
-    Args:
-        computed: Whether the field has learned from computed depth; without, all of it becomes a hole.
-    """
+    ``computed``: whether the field has learned from computed depth; without, all of it becomes a hole."""
     if views.depth_sigma_m is None:
         return views
     worst = UNSURE_SPREAD * views.depth_m if computed else torch.zeros_like(views.depth_m)
@@ -175,10 +152,7 @@ def spread_at(views: SourceViews, height: int, width: int) -> torch.Tensor | Non
 
 def encoded_views(views: SourceViews, feature: torch.Tensor, geometry: torch.Tensor | None = None) -> EncodedViews:
     """Features (m, C, h, w) with the colours and cameras that belong to them, and no known labels.
-
-    Args:
-        geometry: (m, 5, h, w) mixture of logistics; None for fields that have none, which then hold zeros.
-    """
+    ``geometry``: (m, 5, h, w) mixture of logistics; None for fields that have none, which then hold zeros."""
     height, width = feature.shape[-2:]
     if geometry is None:
         geometry = feature.new_zeros(len(feature), GEOMETRY_CHANNELS, height, width)
@@ -194,36 +168,22 @@ def encoded_views(views: SourceViews, feature: torch.Tensor, geometry: torch.Ten
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reprojection:
-    """R rays of N samples seen from m source views.
+    """R rays of N samples seen from m source views."""
 
-    Args:
-        uv: (m, R, N, 2) pixels of the feature maps.
-        z: (m, R, N) depth in each source camera, metres.
-        valid: (m, R, N) bool: in front of the camera and inside its image.
-        view_cosine: (m, R, N) cosine between query ray and source view ray.
-    """
-
-    uv: torch.Tensor
-    z: torch.Tensor
-    valid: torch.Tensor
-    view_cosine: torch.Tensor
+    uv: torch.Tensor  # (m, R, N, 2) pixels of the feature maps
+    z: torch.Tensor  # (m, R, N) depth in each source camera, metres
+    valid: torch.Tensor  # (m, R, N) bool: in front of the camera and inside its image
+    view_cosine: torch.Tensor  # (m, R, N) cosine between query ray and source view ray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gathered:
-    """What the source views hold at the reprojected samples: the contextual space M of Eq. 5 and its companions.
+    """What the source views hold at the reprojected samples: the contextual space M of Eq. 5 and its companions."""
 
-    Args:
-        feature: (m, R, N, C).
-        rgb: (m, R, N, 3).
-        geometry: (m, R, N, G).
-        channel: (m, R, N) int64 known label at the sample, -1 = none.
-    """
-
-    feature: torch.Tensor
-    rgb: torch.Tensor
-    geometry: torch.Tensor
-    channel: torch.Tensor
+    feature: torch.Tensor  # (m, R, N, C)
+    rgb: torch.Tensor  # (m, R, N, 3)
+    geometry: torch.Tensor  # (m, R, N, G)
+    channel: torch.Tensor  # (m, R, N) int64 known label at the sample, -1 = none
 
 
 def reproject(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> Reprojection:

@@ -32,10 +32,7 @@ BFLOAT16_PARTS = ("encoder", "radial", "cross", "semantic")
 
 def choose_device(name: DeviceName, local_rank: int) -> torch.device:
     """``auto`` takes a GPU where there is one; of several, each rank of this machine takes its own.
-
-    Raises:
-        ConfigError: ``cuda`` is requested and there are fewer GPUs than ranks.
-    """
+    Raises ConfigError: ``cuda`` is requested and there are fewer GPUs than ranks."""
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "cpu" or (name == "auto" and count == 0):
         return torch.device("cpu")

@@ -144,10 +144,7 @@ class InvertedResidual(nn.Module):
 
 class EfficientNetLite0(nn.Module):
     """Colours in [0, 1] (B, 3, H, W) -> features at strides 2, 4, ... of ``BACKBONE_WIDTHS`` channels.
-
-    Args:
-        stages: How many of the five; the classifier of the published network and its last block are not built.
-    """
+    ``stages``: how many of the five; the classifier of the published network and its last block are not built."""
 
     def __init__(self, stages: int = len(BACKBONE_STAGES)) -> None:
         super().__init__()

@@ -71,21 +71,13 @@ class NesfConfig(Config, frozen=True):
 
 
 class CellLevel(NamedTuple):
-    """The occupied cells of one resolution.
+    """The occupied cells of one resolution."""
 
-    Args:
-        cells: (N, 3) int64 coordinates, in lexicographic order.
-        neighbours: (N, 27) int64 rows of the cells round each, in the order of ``OFFSETS``; N = not occupied.
-        parent: (N,) int64 row in the next coarser level, which has ``parents`` cells.
-        corner: (N,) int64 which of the parent's eight.
-        parents: Cells of the next coarser level.
-    """
-
-    cells: NDArray[np.int64]
-    neighbours: torch.Tensor
-    parent: torch.Tensor
-    corner: torch.Tensor
-    parents: int
+    cells: NDArray[np.int64]  # (N, 3) coordinates, in lexicographic order
+    neighbours: torch.Tensor  # (N, 27) rows of the cells round each, in the order of ``OFFSETS``; N = not occupied
+    parent: torch.Tensor  # (N,) row in the next coarser level
+    corner: torch.Tensor  # (N,) which of the parent's eight
+    parents: int  # cells of the next coarser level
 
 
 def pack_cells(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -103,10 +95,7 @@ def find_rows(keys: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.
 
 def cell_levels(cells: NDArray[np.int64], count: int) -> tuple[CellLevel, ...]:
     """Tables of ``count`` resolutions, each half the one before.
-
-    Args:
-        cells: (N, 3) of the finest, unique and in lexicographic order; N > 0.
-    """
+    ``cells``: (N, 3) of the finest, unique and in lexicographic order; N > 0."""
     levels: list[CellLevel] = []
     for _ in range(count):
         coarse, parent = _unique_cells(cells >> 1)
@@ -244,23 +233,14 @@ def _initial(places: int, channels_in: int, channels_out: int) -> torch.Tensor:
 
 
 class SurfacePoints(NamedTuple):
-    """Voxels round a map's surface, with up along z.
+    """Voxels round a map's surface, with up along z."""
 
-    Args:
-        xyz: (N, 3) float32 in cells.
-        rise: (N,) float32, normal . up.
-        height_m: (N,) float32 above the floor.
-        rgb: (N, 3) float32 0..1.
-        log_p: (N, L) float32 log-probabilities of the votes; zeros without votes.
-        votes: (N,) float32.
-    """
-
-    xyz: Float32
-    rise: Float32
-    height_m: Float32
-    rgb: Float32
-    log_p: Float32
-    votes: Float32
+    xyz: Float32  # (N, 3) in cells
+    rise: Float32  # (N,) normal . up
+    height_m: Float32  # (N,) above the floor
+    rgb: Float32  # (N, 3) in 0..1
+    log_p: Float32  # (N, L) log-probabilities of the votes; zeros without votes
+    votes: Float32  # (N,)
 
     def rows(self, chosen: NDArray[Any]) -> SurfacePoints:
         """Some of them, by mask or row."""
@@ -360,12 +340,7 @@ class MapUNet(nn.Module):
 
     Against the paper's U-Net it is narrow at the finest level, where nearly all cells are, and one level deeper: it
     sees 1.9 m far at half the cost. Each block normalises the features of a cell on their own, so that what surrounds a
-    tile does not matter.
-
-    Args:
-        channels_in: C.
-        channels_out: K, of a last linear layer, which starts at zero.
-        width: Features at the finest level.
+    tile does not matter. Its last layer starts at zero.
     """
 
     def __init__(self, channels_in: int, channels_out: int, width: int = 16) -> None:
@@ -400,11 +375,7 @@ class MapUNet(nn.Module):
 
 
 class Nesf(nn.Module):
-    """The network, its classes, and the temperature of its answers.
-
-    Args:
-        label_set: L classes, those of the maps it can refine.
-    """
+    """The network, the L classes of the maps that it can refine, and the temperature of its answers."""
 
     def __init__(self, label_set: LabelSet, config: NesfConfig | None = None) -> None:
         super().__init__()
@@ -446,11 +417,7 @@ class Nesf(nn.Module):
         """Logits (N, L) at points, before the temperature, and the way (N, 3) to their objects' centres, metres.
 
         The way is at most some ``FARTHEST_M`` long: it leads to the centre of what is small, and towards it elsewhere.
-
-        Args:
-            answer: Of ``forward``.
-            near: Of the points.
-            log_p: (N, L) what the map says there; zeros without votes.
+        ``log_p`` (N, L) is what the map says there; zeros without votes.
         """
         here = torch.einsum("nkc,nk->nc", _padded(answer)[near.rows], near.weights)
         return log_p * (1 + here[:, -4:-3]) + here[:, :-4], here[:, -3:] * FARTHEST_M
@@ -461,17 +428,11 @@ SMOOTHED = hashlib.sha256(b"smoothed votes").hexdigest()  # in place of a digest
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NesfWeights:
-    """A network with its provenance.
-
-    Args:
-        model: In evaluation mode.
-        recipe: How it was trained, plain data.
-        digest: SHA-256 of the file, empty before it is written.
-    """
+    """A network with its provenance."""
 
     model: Nesf
-    recipe: dict[str, Any] = field(default_factory=dict[str, Any])
-    digest: str = ""
+    recipe: dict[str, Any] = field(default_factory=dict[str, Any])  # how it was trained, plain data
+    digest: str = ""  # SHA-256 of the file, empty before it is written
 
 
 def smoothed_votes(label_set: LabelSet) -> NesfWeights:
@@ -516,11 +477,7 @@ def save_nesf(weights: NesfWeights, path: Path) -> None:
 
 
 def load_nesf(path: Path) -> NesfWeights:
-    """Read weights that ``save_nesf`` wrote.
-
-    Raises:
-        WeightsError: no such file, damaged, or weights of another kind.
-    """
+    """Read weights that ``save_nesf`` wrote. Raises WeightsError: no such file, damaged, or weights of another kind."""
     path = find_checkpoint(path)
     if not path.exists():
         raise WeightsError(

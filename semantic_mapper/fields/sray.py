@@ -179,26 +179,17 @@ class DensityNet(nn.Module):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContextualSpace:
-    """The space M of Eq. 5 with what goes with it, view-first.
+    """The space M of Eq. 5 with what goes with it, view-first."""
 
-    Args:
-        feature: (m, R, N, C).
-        rgb: (m, R, N, 3).
-        cues: (m, R, N, CUES); of tokens at the surface SURFACE_CUES.
-        hit, visibility: (m, R, N) in [0, 1].
-        valid: (m, R, N) bool.
-        delta: (R, N) interval lengths, metres.
-        channel: (m, R, N) int64 known label at the sample, -1 = none.
-    """
-
-    feature: torch.Tensor
-    rgb: torch.Tensor
-    cues: torch.Tensor
+    feature: torch.Tensor  # (m, R, N, C)
+    rgb: torch.Tensor  # (m, R, N, 3)
+    cues: torch.Tensor  # (m, R, N, CUES); of tokens at the surface SURFACE_CUES
+    # (m, R, N) in [0, 1]
     hit: torch.Tensor
     visibility: torch.Tensor
-    valid: torch.Tensor
-    delta: torch.Tensor
-    channel: torch.Tensor
+    valid: torch.Tensor  # (m, R, N) bool
+    delta: torch.Tensor  # (R, N) interval lengths, metres
+    channel: torch.Tensor  # (m, R, N) int64 known label at the sample, -1 = none
 
 
 def contextual_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
@@ -389,10 +380,7 @@ class SRay(LearnedField):
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode each view by itself: features F_j and the depth distribution of every pixel.
-
-        Raises:
-            ShapeError: tensors that do not fit together.
-        """
+        Raises ShapeError: tensors that do not fit together."""
         check_views(views)
         views = sure_depth(views, computed=self.config.encoder.computed_depth)
         feature = self.encoder(views)

@@ -80,10 +80,7 @@ class StreamingSRay:
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, sample_weight_threshold: float = 0.0
     ) -> FieldRender:
         """Render rays at given sample depths z (R, N); see ``SRay.render_samples``.
-
-        Raises:
-            ShapeError: fewer than 2 samples a ray.
-        """
+        Raises ShapeError: fewer than 2 samples a ray."""
         if z.shape[1] < 2:
             raise ShapeError(f"a ray needs at least 2 samples for its intervals to have a length, got {z.shape[1]}")
         count, channels = len(z), self.model.config.feature_dim
@@ -213,10 +210,7 @@ def _settings(model: SRay) -> _Settings:
 
 def _source_maps(sources: EncodedViews, channels: int) -> _SourceMaps:
     """The maps as the kernel takes them: without a copy where they are channels-last.
-
-    Raises:
-        ShapeError: maps that do not fit together, or not the model.
-    """
+    Raises ShapeError: maps that do not fit together, or not the model."""
     sizes = expect_shape(sources.feature, f"M {channels} H W", "source features")
     m, h, w = sizes["M"], sizes["H"], sizes["W"]
     expect_shape(sources.rgb, f"{m} 3 {h} {w}", "source rgb")

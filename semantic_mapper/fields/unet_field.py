@@ -46,10 +46,7 @@ class UNetField(LearnedField):
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Classify each view by itself; ``feature`` of the result holds the logits (m, L, h, w).
-
-        Raises:
-            ShapeError: tensors that do not fit together.
-        """
+        Raises ShapeError: tensors that do not fit together."""
         check_views(views)
         return encoded_views(views, self._logits(views))
 

@@ -142,17 +142,12 @@ def finetune(
 
 @dataclass(slots=True)
 class _Scene:
-    """The views to learn from (held-out blocks ignored), the same to look at (all else ignored), and who sees whom.
-
-    Args:
-        queries: Views with something to learn; the others are source views only.
-        overlap: (n, n) of ``view_overlap``.
-    """
+    """The views to learn from (held-out blocks ignored), the same to look at (all else ignored), and who sees whom."""
 
     train: Sequence[LabelledView]
     held_out: Sequence[LabelledView]
-    queries: Sequence[int]
-    overlap: torch.Tensor
+    queries: Sequence[int]  # views with something to learn; the others are source views only
+    overlap: torch.Tensor  # (n, n) of ``view_overlap``
 
 
 def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator: torch.Generator) -> _Scene:
@@ -358,10 +353,7 @@ def render_as_mapped(
     model: LearnedField, view: LabelledView, flat: torch.Tensor, sources: EncodedViews, sampling: SamplingConfig
 ) -> tuple[FieldRender, torch.Tensor]:
     """Pixels (R,) of a view as a mapper renders them, and their classes (R,).
-
-    Args:
-        sources: The last one is the view itself, whose labels a mapper does not know.
-    """
+    ``sources``: the last one is the view itself, whose labels a mapper does not know."""
     device = next(model.parameters()).device
     prior = view.depth_m.flatten()[flat]
     rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
@@ -379,10 +371,7 @@ def pick_views(
     own_view_fraction: float = OWN_VIEW_FRACTION,
 ) -> tuple[int, list[int]]:
     """Draw a query view of ``queries``, and its source views: the more one sees of the query, the likelier it is.
-
-    Args:
-        overlap: (n, n) of ``view_overlap``, of all views of one scene.
-    """
+    ``overlap``: (n, n) of ``view_overlap``, of all views of one scene."""
     query = queries[int(torch.randint(len(queries), (1,), generator=generator))]
     worth = overlap[query] + LEAST_WORTH
     worth[query] = 0

@@ -118,20 +118,13 @@ class Budget:
 
 @dataclass(slots=True)
 class HeldOut:
-    """How a fit is judged while it runs, and the weights that were best.
+    """How a fit is judged while it runs, and the weights that were best."""
 
-    Args:
-        look: Loss (infinite where nothing is held out) and accuracy of held-out rays.
-        state: A copy of the weights.
-        patience: Looks without a better loss before the fit stops early; 0 = it does not.
-        patient_until: Fraction of the budget before which looks do not count for that.
-        loss, accuracy, step, best: Of the best weights so far.
-    """
-
-    look: Callable[[], tuple[float, float]]
-    state: Callable[[], State]
-    patience: int = 0
-    patient_until: float = 0.0
+    look: Callable[[], tuple[float, float]]  # loss (infinite where nothing is held out) and accuracy of held-out rays
+    state: Callable[[], State]  # a copy of the weights
+    patience: int = 0  # looks without a better loss before the fit stops early; 0 = it does not
+    patient_until: float = 0.0  # fraction of the budget before which looks do not count for that
+    # Of the best weights so far
     loss: float = math.inf
     accuracy: float = math.nan
     step: int = 0

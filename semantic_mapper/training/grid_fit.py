@@ -75,20 +75,15 @@ LeaveOut = Callable[[Sequence[PosedFrame], FrameRays], Bool]  # pixels (P,) that
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridFit:
-    """A fitted grid.
-
-    Args:
-        psnr: Of held-out frames in dB, each with the gain that fits it best if exposure was fitted; NaN where none were
-            rendered: none held out, or stopped.
-        frames: F frames that it was fitted to for ``steps`` steps.
-        gains: (F, 3) their exposure.
-    """
+    """A fitted grid."""
 
     grid: SceneGrid
     steps: int
+    # Of held-out frames in dB, each with the gain that fits it best if exposure was fitted; NaN where none were
+    # rendered: none held out, or stopped
     psnr: float
-    frames: tuple[PosedFrame, ...]
-    gains: Float32
+    frames: tuple[PosedFrame, ...]  # f frames that it was fitted to for ``steps`` steps
+    gains: Float32  # (F, 3) their exposure
 
 
 def fit_grid(

@@ -48,19 +48,12 @@ LOOK_RAYS = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledRays:
-    """All pixels of the labelled frames, F of one size.
+    """All pixels of the labelled frames, F of one size."""
 
-    Args:
-        rays: Of the frames.
-        rgb: (F, 3, H + 2 margin, W + 2 margin) uint8, continued beyond the edges.
-        channel: (F H W,) int64, -1 = not labelled.
-        held_out: (F H W,) bool.
-    """
-
-    rays: FrameRays
-    rgb: torch.Tensor
-    channel: torch.Tensor
-    held_out: torch.Tensor
+    rays: FrameRays  # of the frames
+    rgb: torch.Tensor  # (F, 3, H + 2 margin, W + 2 margin) uint8, continued beyond the edges
+    channel: torch.Tensor  # (F H W,) int64, -1 = not labelled
+    held_out: torch.Tensor  # (F H W,) bool
 
     def patches(self, pixels: torch.Tensor, side: int) -> torch.Tensor:
         """Colours (R, 3, side, side) in [0, 1] round pixels (R,)."""
@@ -122,10 +115,7 @@ def fit_irt(
 
 def labelled_rays(frames: Sequence[PosedFrame], label_set: LabelSet, config: FinetuneConfig) -> LabelledRays:
     """The pixels of labelled frames, some of them held out.
-
-    Raises:
-        FrameError: no labelled frame, frames of several sizes, or fewer than two classes.
-    """
+    Raises FrameError: no labelled frame, frames of several sizes, or fewer than two classes."""
     if not frames:
         raise FrameError("no frame has a label and a usable pose; give labelled keyframes (--keyframes)")
     rays = frame_rays(frames, config.width)

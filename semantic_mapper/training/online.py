@@ -35,34 +35,22 @@ MAX_TRIALS = 3  # rounds without success that a keyframe may take part in before
 
 @dataclass(frozen=True, slots=True)
 class KeyframeSplit:
-    """The keyframes of one round.
+    """The keyframes of one round."""
 
-    Args:
-        train: Labelled keyframes to learn from.
-        held_out: Labelled keyframes that are never learned from.
-        validated: Keys of those with which the weights in use were found better.
-    """
-
-    train: tuple[PosedFrame, ...]
-    held_out: tuple[PosedFrame, ...]
-    validated: frozenset[Key] = frozenset()
+    train: tuple[PosedFrame, ...]  # labelled keyframes to learn from
+    held_out: tuple[PosedFrame, ...]  # labelled keyframes that are never learned from
+    validated: frozenset[Key] = frozenset()  # keys of those with which the weights in use were found better
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
-    """A keyframe of the pool.
+    """A keyframe of the pool."""
 
-    Args:
-        frame: With labels in the classes of the pool.
-        held_out: Whether it is never learned from.
-        validated_by: Version of the first weights that were taken after a round with it; None = none yet.
-        trials: Rounds without success since it came.
-    """
-
-    frame: PosedFrame
-    held_out: bool
+    frame: PosedFrame  # with labels in the classes of the pool
+    held_out: bool  # whether it is never learned from
+    # Version of the first weights that were taken after a round with it; None = none yet
     validated_by: int | None = None
-    trials: int = 0
+    trials: int = 0  # rounds without success since it came
 
 
 class KeyframePool:
@@ -111,10 +99,7 @@ class KeyframePool:
 
     def restore(self, kept: Kept, label_set: LabelSet) -> None:
         """Add a keyframe of an earlier pool with its state there; the oldest first.
-
-        Raises:
-            FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed.
-        """
+        Raises FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed."""
         kept = replace(kept, frame=self._translated(kept.frame, label_set))
         self._received += 1
         self._put(kept)
@@ -196,21 +181,15 @@ def _size(frame: PosedFrame) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnlineResult:
-    """Outcome of a round.
+    """Outcome of a round."""
 
-    Args:
-        checkpoint: The new weights.
-        score, parent_score: mIoU on all held-out keyframes, new and in use, in 0..1.
-        keys: Keyframes that took part.
-        refusal: Why the new weights are not worth offering; empty = they are.
-        worse: Whether they are refused because they do worse: then the labels are to blame. Others may only be too few.
-    """
-
-    checkpoint: Checkpoint
+    checkpoint: Checkpoint  # the new weights
+    # mIoU on all held-out keyframes, new and in use, in 0..1
     score: float
     parent_score: float
-    keys: frozenset[Key]
-    refusal: str = ""
+    keys: frozenset[Key]  # keyframes that took part
+    refusal: str = ""  # why the new weights are not worth offering; empty = they are
+    # Whether they are refused because they do worse: then the labels are to blame. Others may only be too few.
     worse: bool = False
 
 

@@ -65,35 +65,23 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PseudoRays:
-    """All pixels of F frames with their pseudo labels.
+    """All pixels of F frames with their pseudo labels."""
 
-    Args:
-        rays: Of the frames.
-        channel: (P,) int64, -1 = none.
-        gain: (F, 3) exposure of the frames.
-        still: Numbers of the pixels that show what stands still.
-    """
-
-    rays: FrameRays
-    channel: torch.Tensor
-    gain: torch.Tensor
-    still: Int64
+    rays: FrameRays  # of the frames
+    channel: torch.Tensor  # (P,) int64, -1 = none
+    gain: torch.Tensor  # (F, 3) exposure of the frames
+    still: Int64  # numbers of the pixels that show what stands still
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What boxes and pseudo labels have to do with each other.
+    """What boxes and pseudo labels have to do with each other."""
 
-    Args:
-        boxes, seen: How many stand still, and how many of these any surveyed ray meets.
-        covered: Fraction of pixels whose ray meets a box.
-        matched: Fraction of pixels with a pseudo label whose class is possible on their ray.
-    """
-
+    # How many stand still, and how many of these any surveyed ray meets
     boxes: int
     seen: int
-    covered: float
-    matched: float
+    covered: float  # fraction of pixels whose ray meets a box
+    matched: float  # fraction of pixels with a pseudo label whose class is possible on their ray
 
 
 def fit_panoptic(
@@ -181,10 +169,7 @@ def held_out_unlabelled(frames: Sequence[PosedFrame], every: int) -> list[PosedF
 
 def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -> PseudoRays:
     """The pixels of frames with their label images.
-
-    Raises:
-        FrameError: no frame has one, or nothing is known in any of them.
-    """
+    Raises FrameError: no frame has one, or nothing is known in any of them."""
     rays = frame_rays(frames, width)
     if all(f.label is None for f in frames):
         raise FrameError("no frame has a pseudo label; give a folder of them or weights that make some (--pseudo)")
@@ -205,10 +190,7 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
 
 def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> Survey:
     """How many pixels meet boxes.
-
-    Raises:
-        ConfigError: no pixel does, or boxes and pseudo labels have no class in common.
-    """
+    Raises ConfigError: no pixel does, or boxes and pseudo labels have no class in common."""
     if not len(field.primitives):
         return Survey(0, 0, 0.0, 1.0)
     pixels = _some_pixels(data, config.seed)

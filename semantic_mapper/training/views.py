@@ -23,26 +23,17 @@ PROBE = 24  # pixels a row of a view that overlap is found with
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledView:
-    """One posed image at training resolution.
+    """One posed image at training resolution."""
 
-    Args:
-        rgb: (3, H, W) float32 in [0, 1].
-        depth_m: (H, W) float32, 0 = none.
-        channel: (H, W) int64 class channels, -1 = ignore.
-        intrinsics: Of (H, W).
-        T_world_camera: (4, 4) float32.
-        computed_m: (H, W) float32 depth that was computed from pictures, 0 = none: what a field is given in the place
-            of ``depth_m``, which remains what it is to render. None = a field is given ``depth_m``.
-        computed_sigma_m: (H, W) float32 its one-sigma spread.
-    """
-
-    rgb: torch.Tensor
-    depth_m: torch.Tensor
-    channel: torch.Tensor
-    intrinsics: CameraIntrinsics
-    T_world_camera: torch.Tensor
+    rgb: torch.Tensor  # (3, H, W) float32 in [0, 1]
+    depth_m: torch.Tensor  # (H, W) float32, 0 = none
+    channel: torch.Tensor  # (H, W) int64 class channels, -1 = ignore
+    intrinsics: CameraIntrinsics  # of (H, W)
+    T_world_camera: torch.Tensor  # (4, 4) float32
+    # (H, W) float32 depth that was computed from pictures, 0 = none: what a field is given in the place of ``depth_m``,
+    # which remains what it is to render. None = a field is given ``depth_m``.
     computed_m: torch.Tensor | None = None
-    computed_sigma_m: torch.Tensor | None = None
+    computed_sigma_m: torch.Tensor | None = None  # (H, W) float32 its one-sigma spread
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,18 +46,6 @@ def test_weights_lie_strictly_within_the_bounds_of_eq_12(views: int, tau: float)
     assert (w < 1 / (tau * views)).all()
 
 
-def test_bounds_count_only_valid_views():
-    score = torch.randn(6, 200, dtype=torch.float64) * 10
-    valid = torch.rand(6, 200) < 0.5
-    w = constrained_weights(score, valid, 0.1)
-    seen = valid.sum(0)
-    assert (w[~valid] == 0).all()
-    assert (w[:, seen == 0] == 0).all()
-    lower = (0.1 / seen).expand(6, 200)[valid]
-    upper = (1 / (0.1 * seen)).expand(6, 200)[valid]
-    assert (w[valid] > lower).all() and (w[valid] < upper).all()
-
-
 def test_attention_and_view_weights_pass_gradcheck():
     torch.manual_seed(0)
     layer = MultiHeadAttention(4, 2).double()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -15,8 +14,8 @@ import torch
 from semantic_mapper.config import PanopticConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import encoded_views
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.scene.panoptic import Panoptic, box_config, primitive_of
+from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.finetune import finetune
@@ -115,38 +114,12 @@ def test_it_leaves_nothing_in_the_scene_that_stands_still() -> None:
     assert (wrong & smeared.known).float().mean() > 0.05, "as if it stood still"
 
 
-def test_beyond_its_stamps_a_box_is_nowhere() -> None:
-    last, frame = (FRAMES - 1) * GAP_NS, view(0.4, FRAMES - 1)
-    for stamp, there in ((last + 40, True), (last + 60, False), (-40, True), (-60, False), (None, False)):
-        _, things = seen(model(fitted()), frame, stamp)
-        assert bool((things == 7).any()) == there, stamp
-
-
 def test_between_stamps_a_box_is_on_the_way() -> None:
     half = deck().pose_at(GAP_NS // 2)
     assert half is not None
     np.testing.assert_allclose(half[:3, 3], (deck_pose(0) + deck_pose(1))[:3, 3] / 2)
     unsorted = replace(deck(), stamps=tuple(reversed(deck().stamps or ())))
     np.testing.assert_array_equal(unsorted.pose_at(3 * GAP_NS), deck_pose(3))
-
-
-def test_weights_keep_what_is_in_boxes_that_move(tmp_path: Path) -> None:
-    save_checkpoint(fitted(), tmp_path / "w.safetensors")
-    loaded = model(load_checkpoint(tmp_path / "w.safetensors"))
-    assert primitive_of(loaded.shape.boxes[0]).moves
-    frame = view(0.4, 3)
-    (before, things), (after, same) = (seen(f, frame, frame.stamp_ns) for f in (model(fitted()), loaded))
-    assert (things == same).float().mean() > 0.995 and (things == 7).any()
-    assert (before.depth_m - after.depth_m).abs().quantile(0.99) < 0.01, "they are stored as float16"
-
-
-def test_measured_depth_says_whether_a_pixel_is_of_the_box() -> None:
-    frame = view(0.4, 5)
-    assert frame.label is not None and frame.depth_m is not None
-    truth = torch.from_numpy(frame.label.ravel() == SET.ids[TABLE])
-    render, things = seen(model(fitted()), frame, frame.stamp_ns, torch.from_numpy(frame.depth_m.ravel()))
-    assert ((render.logits.argmax(1) == TABLE) == truth).float().mean() > 0.99
-    assert ((things == 7) == truth).float().mean() > 0.99
 
 
 def test_without_depth_the_core_of_a_box_is_full() -> None:

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.training.fit import Budget, FitProgress, HeldOut, budget_fraction, cosine_rate, fit
 
 
@@ -26,6 +27,8 @@ def test_whichever_budget_is_used_up_first_counts_and_zero_means_none() -> None:
     assert budget_fraction(5, 1.0, steps=10, seconds=100) == 0.5
     assert budget_fraction(1, 80.0, steps=10, seconds=100) == 0.8
     assert budget_fraction(9, 80.0, steps=0, seconds=0) == 0.0
+    with pytest.raises(ConfigError, match="needs a budget"):
+        Budget(0, 0)
 
 
 def test_rate_falls_along_half_a_cosine() -> None:

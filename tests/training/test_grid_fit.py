@@ -153,15 +153,6 @@ def test_without_depth_the_box_holds_what_matched_features_show() -> None:
     assert 2e6 < np.prod(box.shape) < 3e6
 
 
-def test_without_depth_and_features_the_box_is_what_cameras_can_see_and_that_is_said() -> None:
-    plain = [replace(frame, rgb=np.full_like(frame.rgb, 128)) for frame in planes()]
-    with structlog.testing.capture_logs() as logs:
-        box = scene_box(plain, GridFitConfig(far_m=12.0))
-    high = [o + (n - 1) * box.voxel_m for o, n in zip(box.origin_m, box.shape, strict=True)]
-    assert all(o < -4 and h > 3 for o, h in zip(box.origin_m, high, strict=True))
-    assert [entry["far_m"] for entry in logs if entry["event"] == "box_guessed"] == [12.0]
-
-
 def test_triangulated_points_lie_on_the_surface() -> None:
     frames = tiny_frames()
     points = sparse_points(frames)

@@ -89,17 +89,6 @@ def test_geometry_colours_and_features_stay_as_they_are_while_classes_are_learne
     assert {"classifier.weight", "image_head.weight", "vote.weight", "points.enter.weight"} <= moved
 
 
-def test_a_ray_never_sees_the_labels_of_its_own_frame_while_it_learns() -> None:
-    field, fit = small_field(1)
-    assert field.carried is not None
-    pixels = fit.pool.draw(64, torch.Generator().manual_seed(0))[0]
-    everything = torch.ones(1, dtype=torch.bool)
-    votes = fit._carried(pixels, fit._samples(pixels, with_depth=True), everything)
-    assert votes is not None and float(votes.abs().max()) == 0
-    seen = field.carried_to(fit._samples(pixels, with_depth=True))
-    assert seen is not None and float(seen[:, -1].median()) > 0.3  # a query does
-
-
 def test_held_out_blocks_choose_the_weights_and_nothing_learns_from_them() -> None:
     _, fit = small_field(2)
     drawn = torch.cat([fit.pool.draw(2048, torch.Generator().manual_seed(i))[0] for i in range(5)])

@@ -162,20 +162,6 @@ def test_labels_that_have_nothing_to_do_with_the_images_are_refused() -> None:
     assert once_more.score > 0.5 and "less than 0.5 gained" in once_more.refusal
 
 
-def test_weights_that_do_worse_where_nobody_has_learned_say_nothing_about_the_labels() -> None:
-    start = learn(pool_of(FRAMES[:4]).split(), start_of(), CONFIG).checkpoint
-    away = np.eye(4)
-    away[0, 3] = 500.0
-    *train, held_out = (permuted(f) for f in FRAMES[4:])
-    elsewhere = dataclasses.replace(held_out, T_world_camera=away @ held_out.T_world_camera, label=FRAMES[7].label)
-    for judged_by, worse in ((dataclasses.replace(held_out, label=FRAMES[7].label), True), (elsewhere, False)):
-        result = learn(KeyframeSplit(tuple(train), (judged_by,)), start, CONFIG)
-        assert result.score < result.parent_score and result.refusal and result.worse == worse
-    blank = dataclasses.replace(held_out, label=np.zeros_like(held_out.label))
-    with pytest.raises(FrameError, match="none of the held-out keyframes has a labelled pixel"):
-        learn(KeyframeSplit(tuple(train), (blank,)), start, without_training())
-
-
 def test_labels_that_contradict_validated_ones_are_refused_although_they_agree_with_each_other() -> None:
     pool = pool_of(FRAMES[:4])
     start = learn(pool.split(), start_of(), CONFIG).checkpoint

@@ -122,29 +122,6 @@ def test_the_recipe_says_what_boxes_cover_and_no_frame_is_held_to_be_seen() -> N
     assert fitted().train_stamps_ns == frozenset()  # pseudo labels are no truth
 
 
-def test_true_labels_count_as_seen() -> None:
-    frames = [replace(f, label_is_pseudo=False) for f in scene()]
-    config = msgspec.structs.replace(SMALL, steps=2)
-    assert finetune(frames, SET, empty_field(DECK), config).train_stamps_ns == frozenset(range(8))
-
-
-def test_weights_keep_boxes(tmp_path: Path) -> None:
-    save_checkpoint(fitted(), tmp_path / "w.safetensors")
-    loaded, field = load_checkpoint(tmp_path / "w.safetensors").model, fitted().model
-    assert isinstance(loaded, Panoptic) and loaded.shape.boxes == (DECK,) and isinstance(field, Panoptic)
-    assert (answers(loaded, scene()[1])[0] == answers(field, scene()[1])[0]).float().mean() > 0.99
-
-
-def test_labels_alone_teach_where_there_are_no_boxes() -> None:
-    losses = msgspec.structs.replace(SMALL.panoptic, fixed=0.0, points=0.0)
-    config = msgspec.structs.replace(SMALL, steps=4, panoptic=losses)
-    checkpoint = finetune(scene(), SET, empty_field(), config)
-    assert isinstance(checkpoint.model, Panoptic)
-    assert {LAMP, FLOOR} & set(answers(checkpoint.model, scene()[0])[0].tolist())
-    figures = checkpoint.recipe["panoptic"]
-    assert (figures["boxes"], figures["covered"], figures["matched"]) == (0, 0.0, 1.0)
-
-
 def gradients(
     field: Panoptic, origin: tuple[float, float, float], channel: int, learned: float = 1.0
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
@@ -174,12 +151,6 @@ def test_a_pseudo_label_off_every_primitive_has_no_gradient(uncovered: str) -> N
     # Of a class without any box: it may be outside, where anything may be.
     for gradient in gradients(empty_field(DECK, uncovered=uncovered), away, LAMP):
         assert gradient is not None and bool((gradient != 0).any()) == (uncovered == "stuff")
-
-
-def test_a_pseudo_label_moves_density_into_its_box() -> None:
-    density, _ = gradients(empty_field(DECK), (0.8, 0.0, 2.0), TABLE, learned=0.0)
-    column = density[28, 20, :, 0]  # x = 0.8, y = 0; vertices from z = -0.5 on, 0.1 apart
-    assert (column[11:15] < 0).all() and (column[18:23] > 0).all()
 
 
 def test_merged_classes_share_a_pseudo_label() -> None:
@@ -221,13 +192,6 @@ def test_near_the_faces_of_a_box_its_class_and_what_needs_no_box_are_possible() 
     assert exact.classes[0].tolist() == [[0.0] * 4, [0.0] * 4, table, table, table]
 
 
-def test_in_the_core_of_a_box_others_have_a_say_where_it_holds_their_centre() -> None:
-    within, above = box(8, "lamp", (0.8, 0.0, 0.75), (0.2, 0.2, 0.2)), box(9, "lamp", (0.8, 0.0, 1.1), (0.3, 0.3, 0.3))
-    # Near the bottom of the upper lamp, near the top of the lower one, and inside of that.
-    found = along_a_ray(empty_field(DECK, within, above), 1.045, 1.13, 1.25)
-    assert found.classes[0].tolist() == [[0, 1, 0, 0], [0, 1, 1, 0], [0, 1, 1, 0]]
-
-
 def test_of_overlapping_boxes_of_a_class_the_nearer_centre_has_the_point() -> None:
     left, right = box(3, "table", (-0.4, 0, 0.5), (1, 1, 1)), box(4, "table", (0.4, 0, 0.5), (1, 1, 1))
     field = empty_field(left, right)
@@ -242,16 +206,6 @@ def test_of_overlapping_boxes_of_a_class_the_nearer_centre_has_the_point() -> No
     rays = RayBatch(origin, down, 0 * x + 0.1, 0 * x + 9, 0 * x)
     assert field.instances(rays, torch.full((5,), TABLE)).tolist() == [3, 3, 4, 4, 0]
     assert field.instances(rays, torch.full((5,), FLOOR)).tolist() == [0] * 5
-
-
-def test_where_nothing_may_be_outside_the_grid_is_empty() -> None:
-    config = msgspec.structs.replace(SMALL, steps=20)
-    floor = box(2, "floor", (0.0, 0.0, -0.1), (8.0, 8.0, 0.5))
-    field = finetune(scene(), SET, empty_field(DECK, floor, uncovered="empty"), config).model
-    assert isinstance(field, Panoptic)
-    solid, opaque = field.solid(), field.grid.alpha() > 1e-3
-    assert solid.any() and not solid.all()
-    assert not (opaque & ~solid).any() and (opaque & solid).any()
 
 
 def test_boxes_that_no_frame_can_see_are_left_out_wherever_they_move() -> None:

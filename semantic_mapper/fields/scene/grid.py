@@ -76,10 +76,7 @@ class SceneGrid(nn.Module):
 
     def rays(self, rays: RayBatch, jitter: torch.Tensor | None = None) -> GridRays:
         """Rays (R,) of the world in voxels.
-
-        Args:
-            jitter: (R,) place of samples in their intervals, 0 to 1; None = the middle.
-        """
+        ``jitter``: (R,) place of samples in their intervals, 0 to 1; None = the middle."""
         origin = (rays.origin - rays.origin.new_tensor(self.config.origin_m)) / self.config.voxel_m
         middle = torch.full_like(rays.near_m, 0.5) if jitter is None else jitter
         direction = rays.direction / self.config.voxel_m
@@ -173,11 +170,7 @@ def grid_box(
 
 
 def check_grid(config: GridConfig) -> None:
-    """Refuse a grid that would take too much memory.
-
-    Raises:
-        ConfigError: more than 16 M voxels.
-    """
+    """Refuse a grid that would take too much memory. Raises ConfigError: more than 16 M voxels."""
     if math.prod(config.shape) > MAX_VOXELS:
         raise ConfigError(f"a grid of {config.shape} has more than {MAX_VOXELS} voxels; raise voxel_m")
 
@@ -252,22 +245,14 @@ class Trunk(nn.Module):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaySamples:
-    """What a kind says the classes of: K samples on each of R rays.
+    """What a kind says the classes of: K samples on each of R rays."""
 
-    Args:
-        rays: The rays in the world.
-        points: (R, K, 3) voxel coordinates.
-        z: (R, K) metres.
-        weight: (R, K) compositing weights, differentiable by the grid's density.
-        light: (R,) what gets through the grid to the sky.
-        mover: (R, K) int64 number of the box that moves whose sample it is, -1 = of the scene; None = all are.
-    """
-
-    rays: RayBatch
-    points: torch.Tensor
-    z: torch.Tensor
-    weight: torch.Tensor
-    light: torch.Tensor
+    rays: RayBatch  # the rays in the world
+    points: torch.Tensor  # (R, K, 3) voxel coordinates
+    z: torch.Tensor  # (R, K) metres
+    weight: torch.Tensor  # (R, K) compositing weights, differentiable by the grid's density
+    light: torch.Tensor  # (R,) what gets through the grid to the sky
+    # (R, K) int64 number of the box that moves whose sample it is, -1 = of the scene; None = all are
     mover: torch.Tensor | None = None
 
     @property
@@ -346,10 +331,7 @@ class GridField(LearnedField):
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """The views' cameras and colours, without features: nothing of them is looked at.
-
-        Raises:
-            ShapeError: tensors that do not fit together.
-        """
+        Raises ShapeError: tensors that do not fit together."""
         check_views(views)
         return encoded_views(views, views.rgb[:, :0])
 

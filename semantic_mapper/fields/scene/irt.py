@@ -100,10 +100,7 @@ class IRT(GridField):
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """The views' cameras, colours and, as ``feature``, the texture (m, 32, H, W) of their images.
-
-        Raises:
-            ShapeError: tensors that do not fit together.
-        """
+        Raises ShapeError: tensors that do not fit together."""
         check_views(views)
         return encoded_views(views, views.rgb[:, :0] if self.texture is None else self.texture(views.rgb))
 
@@ -318,10 +315,7 @@ class CarriedLabels(nn.Module):
 
     def forward(self, xyz: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
         """Votes (R, L + 1) for points (R, 3): fractions by class, and how many there are, as n / (1 + n).
-
-        Args:
-            counted: (R, F) or (F,) weight of each frame; 0 = its labels are not known.
-        """
+        ``counted``: (R, F) or (F,) weight of each frame; 0 = its labels are not known."""
         T, K = self.T_camera_world.float(), self.K.float()
         p = torch.einsum("fij,rj->rfi", T[:, :3, :3], xyz) + T[:, :3, 3]
         z = p[..., 2]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import cv2
 import msgspec
 import pytest
 
@@ -333,8 +334,6 @@ def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(given: 
 
 
 def test_images_by_number_are_labels_of_their_frames(tmp_path: Path) -> None:
-    import cv2
-
     log = write_log(tmp_path / "room.mcap", FRAMES)
     images = tmp_path / "images"
     images.mkdir()
@@ -345,15 +344,5 @@ def test_images_by_number_are_labels_of_their_frames(tmp_path: Path) -> None:
             code, text = run_here("label", log, "--images", images, "--to", endpoint)
             assert code == 0, text
             came = learner.receive(30)
-            assert isinstance(came, LabelledKeyframe) and came.teacher == "log room.mcap"
-            assert came.frame.seq == FRAMES[2].seq and (came.frame.label == permuted(FRAMES[2]).label).all()
-            assert learner.receive(0.2) is None
-        for arguments, says in (
-            (["--frames", "99"], "has no frame 99; it has 8"),
-            (["--images", str(tmp_path)], "called by the number of their frame"),
-            (["--images", str(images), "--frames", "3"], "has no label image of frame 3, 000003.png"),
-            (["--frames", "1", "--timeout", "0"], "no finetuner listens there"),
-        ):
-            code, text = run_here("label", log, *arguments, "--to", endpoint)
-            assert code == 1 and says in text, text
-    assert run_here("label", log, "--frames", "x")[0] == 2
+            assert isinstance(came, LabelledKeyframe) and came.frame.seq == FRAMES[2].seq
+            assert (came.frame.label == permuted(FRAMES[2]).label).all() and learner.receive(0.2) is None
