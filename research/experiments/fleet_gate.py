@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.evaluation.bootstrap import class_sums, miou_of_counts
-from semantic_mapper.nodes.fleet.compare import FleetComparison, GateOptions, compare_stores
+from semantic_mapper.nodes.fleet.compare import FleetComparison, compare_stores
 from semantic_mapper.nodes.fleet.store import Findings, MethodScores, Store, TaskResult
 from semantic_mapper.types import Float64
 
@@ -61,7 +61,6 @@ def result(number: int, counts: Float64) -> TaskResult:
         operation="replay",
         log=name,
         log_digest=name,
-        log_bytes=0,
         tags={},
         weights="",
         settings={},
@@ -110,7 +109,7 @@ def compared(results: Iterator[tuple[TaskResult, TaskResult]]) -> FleetCompariso
     for a, b in results:
         before.commit(a)
         after.commit(b)
-    found = compare_stores(before, after, GateOptions())
+    found = compare_stores(before, after)
     before.remove("results")
     after.remove("results")
     return found
