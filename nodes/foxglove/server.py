@@ -11,25 +11,26 @@ from collections import Counter
 from types import TracebackType
 from typing import Any, Literal, Self
 
+import cv2
 import msgspec
 import numpy as np
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.nodes.bridge.feed import Subject
-from semantic_mapper.nodes.bridge.packing import POINT, moving_mask, pack_points, to_jpeg, to_png
 from semantic_mapper.nodes.foxglove.scene import WORLD, camera_frame, draw_graph, draw_path, stamp, transform
 from semantic_mapper.nodes.foxglove.sdk import channels, foxglove, messages
+from semantic_mapper.nodes.packing import POINT, pack_points
 from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.replay.exporters.camera_path import CameraPath
 from semantic_mapper.transport.messages import Status
-from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame, UInt8
 
 HOST = "127.0.0.1"  # the protocol has neither keys nor passwords: other machines come in by `ssh -L`
 BACKLOG = 32  # messages that may wait for a client; of a map of 400,000 points each has 8 MB
 SETTLE_S = 0.05  # after the SDK has said so, until what is sent reaches who has subscribed
+JPEG_QUALITY = 80
 PATH_PERIOD_S = 1.0  # a long path takes milliseconds to draw
 STATUS_SCHEMA = {
     "type": "object",
@@ -42,6 +43,7 @@ STATUS_SCHEMA = {
         "degraded": {"type": "array", "items": {"type": "string"}},
     },
 }
+Subject = Literal["map", "graph"]
 _TYPES = {"<f4": messages.PackedElementFieldNumericType.Float32, "|u1": messages.PackedElementFieldNumericType.Uint8}
 _MAPS: dict[str, Subject] = {"/map/classes": "map", "/map/colors": "map", "/map/info": "map", "/graph": "graph"}
 
@@ -60,7 +62,7 @@ class _Camera:
 
 
 class FoxgloveServer:
-    """An ``Outlet`` that serves Foxglove; a context manager.
+    """Serves Foxglove; a context manager. Frames and status come from one thread, map and graph from another.
 
     Args:
         port: Of 127.0.0.1; 0 = any that is free.
@@ -111,25 +113,25 @@ class FoxgloveServer:
         self._server.stop()
 
     def requests(self, subject: Subject) -> int:
-        """See ``Outlet``."""
+        """How many have begun to receive this so far, or 0 where nobody receives it now."""
         return self._listener.requests(subject)
 
     def send_labels(self, label_set: LabelSet) -> None:
-        """See ``Outlet``."""
+        """The classes of the map, before anything that has classes."""
         self._labels = label_set
 
     def wants(self, topic: Literal["frame", "map"], camera_id: str) -> bool:
-        """See ``Outlet``."""
+        """Whether anybody receives what messages of a camera on this topic hold: else they are not even decoded."""
         c = self._camera(camera_id)
         wanted = (c.rgb, c.depth, c.calibration, self._tf) if topic == "frame" else (c.semantics, c.moving, self._path)
         return any(channel.has_sinks() for channel in wanted)
 
     def note_pose(self, camera_id: str, T_map_camera: Float64) -> None:
-        """See ``Outlet``."""
+        """Where a camera was in the map, of every frame of which that is known."""
         self._camera(camera_id).path.add(T_map_camera)
 
     def send_frame(self, frame: PosedFrame, T_map_camera: Float64 | None) -> None:
-        """See ``Outlet``."""
+        """One camera image with its pose in the map; None while that is not known."""
         camera, when, name = self._camera(frame.camera_id), frame.stamp_ns, camera_frame(frame.camera_id)
         if T_map_camera is not None and self._tf.has_sinks():
             moved = transform(T_map_camera, name, when)
@@ -137,7 +139,7 @@ class FoxgloveServer:
         if camera.calibration.has_sinks():
             camera.calibration.log(_calibration(frame.intrinsics, name, when), log_time=when)
         if camera.rgb.has_sinks():
-            picture = to_jpeg(frame.rgb)
+            picture = _encoded(".jpg", frame.rgb, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
             camera.rgb.log(_picture(picture, "jpeg", name, when), log_time=when)
         if camera.depth.has_sinks() and frame.depth_m is not None:
             height, width = frame.depth_m.shape
@@ -147,26 +149,27 @@ class FoxgloveServer:
             camera.depth.log(image, log_time=when)
 
     def send_update(self, update: MapUpdate) -> None:
-        """See ``Outlet``."""
+        """What was rendered for a frame."""
         camera, labels, when = self._camera(update.camera_id), self._labels, update.stamp_ns
         name = camera_frame(update.camera_id)
         if labels is not None and camera.semantics.has_sinks():
-            picture = to_png(class_colors(update.label, labels))
+            picture = _png(class_colors(update.label, labels))
             camera.semantics.log(_picture(picture, "png", name, when), log_time=when)
         if camera.moving.has_sinks():
-            camera.moving.log(_picture(to_png(moving_mask(update)), "png", name, when), log_time=when)
+            moving = np.zeros(update.label.shape, np.bool_) if update.moving is None else update.moving
+            camera.moving.log(_picture(_png(moving * np.uint8(255)), "png", name, when), log_time=when)
         paths = {name: camera.path.poses for name, camera in self._cameras.items() if camera.path.poses}
         if paths and self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
             self._path_sent = time.monotonic()
             self._path.log(draw_path(paths, when), log_time=when)
 
     def send_status(self, status: Status) -> None:
-        """See ``Outlet``."""
+        """What a node says of itself."""
         if self._status.has_sinks():
             self._status.log(msgspec.json.encode(status), log_time=status.stamp_ns)
 
     def send_map(self, points: MapPoints, about: dict[str, Any]) -> None:
-        """See ``Outlet``."""
+        """The map as it is now; ``about`` as of ``describe_map``."""
         when = about["stamp_ns"]
         if self._classes.has_sinks() and self._labels is not None:
             self._classes.log(_cloud(points, class_colors(points.label, self._labels), when), log_time=when)
@@ -176,7 +179,7 @@ class FoxgloveServer:
             self._info.log(about, log_time=when)
 
     def send_graph(self, graph: SceneGraph, stamp_ns: int) -> None:
-        """See ``Outlet``."""
+        """Floors, rooms, doors and things as they are now."""
         if self._graph.has_sinks() and self._labels is not None:
             self._graph.log(draw_graph(graph, self._labels, stamp_ns), log_time=stamp_ns)
 
@@ -196,7 +199,7 @@ class _Listener(foxglove.websocket.ServerListener):
         self._last = 0.0  # when somebody joined
 
     def requests(self, subject: Subject) -> int:
-        """See ``Outlet``."""
+        """As of the server."""
         with self._lock:
             settled = time.monotonic() - self._last > SETTLE_S
             return self._joined[subject] if self._there[subject] and settled else 0
@@ -214,6 +217,16 @@ class _Listener(foxglove.websocket.ServerListener):
         if channel.topic in _MAPS:
             with self._lock:
                 self._there[_MAPS[channel.topic]] -= 1
+
+
+def _png(image: UInt8) -> bytes:
+    return _encoded(".png", image, cv2.IMWRITE_PNG_COMPRESSION, 1)  # little, for speed
+
+
+def _encoded(kind: str, image: UInt8, *flags: int) -> bytes:
+    """File of an image (H, W, 3) or of one channel (H, W)."""
+    turned = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    return cv2.imencode(kind, turned, flags)[1].tobytes()
 
 
 def _picture(data: bytes, form: str, frame_id: str, when: int) -> messages.CompressedImage:

@@ -23,9 +23,9 @@ from semantic_mapper.nodes.options import (
     CAMERA_KINDS,
     OPTIONS,
     POSE_KINDS,
-    BridgeOptions,
     CameraOptions,
     FinetunerOptions,
+    FoxgloveOptions,
     LiveCamera,
     MapperOptions,
     NodeOptions,
@@ -98,7 +98,7 @@ class Launch(Limits, frozen=True, kw_only=True):
 
     def listeners(self, name: str) -> int:
         """How many nodes subscribe to the frames of a node."""
-        kinds = MapperOptions | RecorderOptions | BridgeOptions
+        kinds = MapperOptions | RecorderOptions | FoxgloveOptions
         return sum(name in o.inputs() for o in self.options.values() if isinstance(o, kinds))
 
 
@@ -383,7 +383,7 @@ def _check_cameras(options: Mapping[str, NodeOptions], path: Path) -> None:
         ConfigError: two cameras of one name, or frames of what is no camera.
     """
     for name, own in options.items():
-        if not isinstance(own, MapperOptions | RecorderOptions | BridgeOptions):
+        if not isinstance(own, MapperOptions | RecorderOptions | FoxgloveOptions):
             continue
         cameras: dict[str, CameraOptions] = {}
         for source in own.cameras:
@@ -401,7 +401,7 @@ def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
         ConfigError: it would query where none answers.
     """
     for name, own in options.items():
-        if not isinstance(own, BridgeOptions):
+        if not isinstance(own, FoxgloveOptions):
             continue
         mapper = options[own.mapper]
         if not isinstance(mapper, MapperOptions):

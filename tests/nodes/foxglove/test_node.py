@@ -30,7 +30,7 @@ from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.transport.keys import allow, make_keys
-from tests.nodes.bridge.robot import REFRESH_S, WARM_S, Robot, big_frame, bridged_robot
+from tests.nodes.foxglove.robot import REFRESH_S, WARM_S, Robot, big_frame, bridged_robot
 from tests.nodes.support import eventually, free_port
 from tests.queries.scene import LABELS, whole
 from tests.small import tiny_frames

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.nodes.bridge import packing
-from semantic_mapper.nodes.bridge.packing import POINT, pack_points, thinned, thinning
+from semantic_mapper.nodes import packing
+from semantic_mapper.nodes.packing import POINT, pack_points, thinned, thinning
 
 
 def points(count: int) -> MapPoints:
