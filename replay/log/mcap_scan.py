@@ -103,12 +103,6 @@ def scan(fd: int, where: str) -> Scan:
     return _read_index(fd, size) or _walk(fd, len(MAGIC), size)
 
 
-def scan_end(fd: int, length: int) -> Scan:
-    """The same of the last ``length`` bytes, from the first believable chunk in them: quick, however long the file."""
-    size = os.fstat(fd).st_size
-    return _walk(fd, len(MAGIC) if length >= size else _next_chunk(fd, size - length, size), size)
-
-
 def _read_index(fd: int, size: int) -> Scan | None:
     """What the index says; None where it is missing or damaged."""
     end = size - len(MAGIC) - _FOOTER.size
