@@ -18,7 +18,7 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
 from semantic_mapper.nodes.process_folder import is_in_use, own_folders
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.redaction import plain_without_secrets
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 
@@ -49,25 +49,17 @@ class LaunchNote(msgspec.Struct, frozen=True):
 
 
 def leave_launch_note(launch: Launch, folder: Path) -> None:
-    """Write the note of a launch into its folder.
+    """Write the note of a launch into its folder, as it may stand in every recording.
 
     Raises:
         OSError: it cannot be written.
     """
     nodes = tuple(
-        NodeNote(n.name, n.kind, _without_passwords(msgspec.to_builtins(launch.options[n.name]))) for n in launch.nodes
+        NodeNote(n.name, n.kind, plain_without_secrets(msgspec.to_builtins(launch.options[n.name])))
+        for n in launch.nodes
     )
     text = msgspec.json.format(msgspec.json.encode(LaunchNote(launch.name, nodes)), indent=1)
     write_bytes(folder / NOTE, text, sync="none")
-
-
-def _without_passwords(value: Any) -> Any:
-    """Options as they may stand in every recording."""
-    if isinstance(value, dict):
-        return {key: _without_passwords(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_without_passwords(inner) for inner in value]
-    return without_secrets(value) if isinstance(value, str) else value
 
 
 def read_launch_note(folder: Path) -> LaunchNote:
