@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.nodes.labeller.server import LabelServer
-from semantic_mapper.nodes.labeller.session import LabelSession
+from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
 from semantic_mapper.replay.label_folder import make_label_folder
 from semantic_mapper.replay.log.sequence import open_log
 from tests.browser import PROGRAM, Browser
