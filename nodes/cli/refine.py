@@ -78,8 +78,6 @@ def refine(
         output.print(f"no weights ship for label set '{result.label_set}': the votes were smoothed")
     relabelled, filled = (100 * count / max(report.surface, 1) for count in (report.relabelled, report.filled))
     output.print(f"{out}: {relabelled:.1f} % of the surface relabelled, {filled:.1f} % filled")
-    if report.things is not None:
-        output.print(f"{report.things} separated pieces of things; `query {out} instances` leaves out the smallest")
     if json:
         output.json(asdict(report) | {"weights": result.weights, "out": str(out)})
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import false_discovery_control, t
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.bootstrap import miou_of_sums
+from semantic_mapper.evaluation.metrics import miou_of_sums
 from semantic_mapper.nodes.fleet.store import Store, TaskResult
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
