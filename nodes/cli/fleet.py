@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv as csv_files
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,7 +27,7 @@ from semantic_mapper.redaction import without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_SUFFIX, prepare_file
 
 if TYPE_CHECKING:
-    from semantic_mapper.nodes.fleet.compare import Estimate, FleetComparison, LogChange
+    from semantic_mapper.nodes.fleet.compare import Estimate, FleetComparison
 
 EXIT_USAGE = 2
 MAX_SHOWN = 500  # rows that are printed
@@ -92,18 +92,18 @@ def run(
     output.quiet = json
     inputs = find_inputs(logs, MAP_SUFFIX if operation == "refine" else LOG_SUFFIX)  # before what is heavy
     from semantic_mapper.nodes.fleet.operations import OPERATIONS
-    from semantic_mapper.nodes.fleet.run import make_template, run_fleet
+    from semantic_mapper.nodes.fleet.run import make_task, run_fleet
 
     kind = OPERATIONS[operation]
     on_gpu = ["render.device=cuda"] if gpus and issubclass(kind.settings, MapperConfig) else []
-    template = make_template(operation, out, weights, [*on_gpu, *(settings or ())], config)
+    task = make_task(operation, out, weights, [*on_gpu, *(settings or ())], config)
     with (
         StopRequest() as stop,
         connected(address, worker_logs=Settings.verbose),
         frame_progress(f"fleet {operation}", len(inputs), unit="logs") as bar,
     ):
         report = run_fleet(
-            template,
+            task,
             inputs,
             cpus=cpus,
             gpus=gpus,
@@ -291,28 +291,34 @@ def _cell(value: Any) -> str:
 
 
 def _show_comparison(output: Output, found: FleetComparison) -> None:
-    shown = [log for log in found.logs if log.status != "same"][:MAX_LOGS] or list(found.logs[:5])
-    names = ("log", "A", "B", "difference", "95 % interval", "")
-    rows = _rows_table(names, [(log.log, *_change_cells(log)) for log in shown])
     direction = "lower" if found.lower_is_better else "higher"
-    output.print(f"{found.operation}, {found.metric} ({direction} is better)", rows)
-    if len(found.logs) > len(shown):
-        output.print(f"{len(found.logs) - len(shown)} more logs; --json gives all")
+    changed = [log for log in found.logs if log.status != "same"]
+    names = ("log", "A", "B", "difference", "95 % interval", "")
+    rows = [(c.log, c.a, c.b, _difference(c.a, c.b), _interval(c.estimate), c.note) for c in changed[:MAX_LOGS]]
+    rows.append(
+        (
+            "mean over logs",
+            found.mean_a,
+            found.mean_b,
+            _difference(found.mean_a, found.mean_b),
+            _interval(found.overall),
+            "",
+        )
+    )
+    output.print(f"{found.operation}, {found.metric} ({direction} is better)", _rows_table(names, rows))
+    counts = [
+        f"{counted(found.count('worse'), 'log')} worse",
+        f"{found.count('better')} better",
+        f"{found.count('same')} as before",
+    ]
+    output.print(f"{', '.join(counts)}; --json gives all")
     if found.unknown:
         output.print(f"note: {counted(found.unknown, 'log')} without the same stretches in both: judged together only")
-    if found.mean_a is not None and found.mean_b is not None:
-        output.print(
-            f"mean over logs: A {found.mean_a:.4f}, B {found.mean_b:.4f}, difference "
-            f"{found.mean_b - found.mean_a:+.4f}, 95 % interval {_interval(found.overall)}; "
-            f"{counted(found.count('worse'), 'log')} worse, {found.count('better')} better"
-        )
     output.print(f"worse: {'; '.join(found.reasons)}" if found.reasons else "not worse")
 
 
-def _change_cells(log: LogChange) -> Iterable[str]:
-    difference = "-" if log.a is None or log.b is None else f"{log.b - log.a:+.4f}"
-    status = "" if log.status == "same" else log.status
-    return _cell(log.a), _cell(log.b), difference, _interval(log.estimate), f"{status} {log.reason}".strip()
+def _difference(a: float | None, b: float | None) -> str:
+    return "-" if a is None or b is None else f"{b - a:+.4f}"
 
 
 def _interval(estimate: Estimate | None) -> str:

@@ -69,6 +69,11 @@ class LogChange:
     estimate: Estimate | None = None
     reason: str = ""
 
+    @property
+    def note(self) -> str:
+        """What there is to say of it, for people."""
+        return f"{self.status} {self.reason}".strip()
+
 
 @dataclass(frozen=True, slots=True)
 class FleetComparison:

@@ -13,7 +13,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -28,7 +28,7 @@ from semantic_mapper.fields.checkpoint import load_checkpoint, shipped_checkpoin
 from semantic_mapper.fields.nesf import SMOOTHING, load_nesf
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.operations import OPERATIONS, read_settings
-from semantic_mapper.nodes.fleet.store import Failure, Findings, Store, TaskResult, file_digest
+from semantic_mapper.nodes.fleet.store import Failure, Store, TaskResult, file_digest
 from semantic_mapper.nodes.fleet.urls import LogInput, MissingError, full_url, is_url, open_url, reaching
 from semantic_mapper.redaction import without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
@@ -45,7 +45,7 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One log and what to do with it; goes to a worker, which has nothing else.
+    """What to do with each log; goes to the workers, which have nothing else.
 
     Args:
         operation: Of ``OPERATIONS``.
@@ -53,9 +53,9 @@ class Task:
         settings: Plain data of the operation's kind.
         shown_settings: What was set, for people.
         weights: Their file's name, or the name of weights that ship with the package; empty = the default ones.
-        weights_digest: SHA-256 of a file that is in the store; empty = they ship with the package.
+        weights_data: Content of their file; empty = they ship with the package.
+        weights_digest: SHA-256 of it.
         code: Digest of the code that the driver has.
-        log: What it is done with.
     """
 
     operation: str
@@ -63,9 +63,9 @@ class Task:
     settings: Mapping[str, Any]
     shown_settings: Mapping[str, Any]
     weights: str
+    weights_data: bytes
     weights_digest: str
     code: str
-    log: LogInput
 
     def key(self, log: str) -> str:
         """Digest of all that decides the result for a log, which is named by the digest of its content."""
@@ -91,14 +91,14 @@ class RunReport:
 # The driver
 
 
-def make_template(
+def make_task(
     operation: str,
     out: str,
     weights: str | None = None,
     assignments: Sequence[str] = (),
     config: Path | None = None,
 ) -> Task:
-    """The task that all logs share. Weights from a file are put into the store, for workers elsewhere.
+    """What to do with each log.
 
     Args:
         operation: Of ``OPERATIONS``.
@@ -109,16 +109,17 @@ def make_template(
     Raises:
         ConfigError: a setting cannot be used, or no store can be there.
         WeightsError: the weights cannot.
-        StoreError: they cannot be fetched or stored.
+        StoreError: they cannot be fetched.
     """
     settings, given = read_settings(operation, assignments, config)
     store = Store(out, create=True)
-    name, digest = ("", "") if weights is None else _find_weights(operation, store, weights)
-    return Task(operation, store.url, to_plain(settings), given, name, digest, code_digest(), LogInput(""))
+    name, data = ("", b"") if weights is None else _read_weights(operation, weights)
+    digest = hashlib.sha256(data).hexdigest() if data else ""
+    return Task(operation, store.url, to_plain(settings), given, name, data, digest, code_digest())
 
 
 def run_fleet(
-    template: Task,
+    task: Task,
     inputs: Sequence[LogInput],
     *,
     cpus: float = 1.0,
@@ -126,17 +127,17 @@ def run_fleet(
     memory_gb: float = 2.0,
     stopped: Callable[[], object] = bool,
     on_progress: Callable[[RunReport], object] = lambda report: None,
-    function: Callable[[Task], bool] | None = None,
+    function: Callable[[Task, LogInput], bool] | None = None,
 ) -> RunReport:
     """Go through all logs, on the cluster that this process is connected with.
 
     Args:
-        template: Of ``make_template``.
+        task: What to do with each log.
         inputs: The logs.
         cpus, gpus, memory_gb: What Ray reserves for a task.
         stopped: Looked at often; once it is true, tasks that run are ended and the run is over.
         on_progress: Called after each log.
-        function: What a worker does with a task; None = ``run_task``.
+        function: What a worker does with a log; None = ``run_task``.
 
     Raises:
         FleetError: no node has the resources, or a worker has other code.
@@ -158,26 +159,31 @@ def run_fleet(
         max_retries=MAX_RETRIES,
         retry_exceptions=[StoreError],
         scheduling_strategy="SPREAD",
-        name=f"fleet {template.operation}",
+        name=f"fleet {task.operation}",
     )
-    store = Store(template.store)
+    store = Store(task.store)
     failed_before = set(store.names("failures"))
-    tasks = [replace(template, log=log) for log in inputs]
-    random.shuffle(tasks)  # two drivers that share a store seldom meet
-    running: dict[Any, Task] = {remote.remote(task): task for task in tasks}
+    shared = ray.put(task)
+    shuffled = random.sample(inputs, len(inputs))  # two drivers that share a store seldom meet
+    running: dict[Any, LogInput] = {remote.remote(shared, log): log for log in shuffled}
     report = RunReport(len(inputs))
     while running and not stopped():
         ready, _ = ray.wait(list(running), num_returns=len(running), timeout=0.2)
         for reference in ready:
-            _collect(running.pop(reference), reference, store, report, failed_before)
+            key, error = task.key(running[reference].url), _count(reference, report)
+            if error:
+                report.failures.append(_note_failure(store, task, key, running[reference], error))
+            elif f"{key}.json" in failed_before:
+                store.remove(f"failures/{key}.json")
+            del running[reference]
             on_progress(report)
     for reference in running:
         ray.cancel(reference, force=True)
     return report
 
 
-def _collect(task: Task, reference: Any, store: Store, report: RunReport, failed_before: set[str]) -> None:
-    """Count a task that has ended, and note in the store what went wrong.
+def _count(reference: Any, report: RunReport) -> str:
+    """Count a task that has ended; what went wrong, or an empty text.
 
     Raises:
         FleetError: every log would fail like that.
@@ -185,61 +191,58 @@ def _collect(task: Task, reference: Any, store: Store, report: RunReport, failed
     import ray
     from ray.exceptions import RayError, RayTaskError
 
-    key = task.key(task.log.url)
     try:
         done: Any = ray.get(reference)
     except RayTaskError as error:
         if isinstance(error.cause, FleetError):
             raise error.cause from error
-        reason = f"{type(error.cause).__name__}: {error.cause}"
+        return f"{type(error.cause).__name__}: {error.cause}"
     except RayError as error:  # the process died again and again, or its nodes did
-        reason = f"the process of the task died {MAX_RETRIES + 1} times: {type(error).__name__}: {error}"
-    else:
-        report.done += done
-        report.existing += not done
-        if f"{key}.json" in failed_before:
-            store.remove(f"failures/{key}.json")
-        return
+        return f"the process of the task died {MAX_RETRIES + 1} times: {type(error).__name__}: {error}"
+    report.done += done
+    report.existing += not done
+    return ""
+
+
+def _note_failure(store: Store, task: Task, key: str, log: LogInput, error: str) -> Failure:
     failure = Failure(
         key=key,
         operation=task.operation,
-        log=without_secrets(task.log.url),
-        tags=task.log.tags,
+        log=without_secrets(log.url),
+        tags=log.tags,
         version=code_version(),
-        error=without_secrets(" ".join(reason.split()))[:_MAX_ERROR],
+        error=without_secrets(" ".join(error.split()))[:_MAX_ERROR],
         finished_ns=time.time_ns(),
     )
     _log.error("log_failed", log=failure.log, error=failure.error)
     store.note_failure(failure)
-    report.failures.append(failure)
+    return failure
 
 
-def _find_weights(operation: str, store: Store, weights: str) -> tuple[str, str]:
-    """Name, and the digest of a file that is in the store now; empty for weights that ship."""
+def _read_weights(operation: str, weights: str) -> tuple[str, bytes]:
+    """Name and content; no content for weights that ship."""
     refines = operation == "refine"
     is_file = is_url(weights) or Path(weights).is_file()
     if not is_file and ((refines and Path(weights) == SMOOTHING) or shipped_checkpoint(Path(weights)) is not None):
-        return weights, ""
+        return weights, b""
     fs, path = open_url(weights)
-    name = _name_of(path)
+    with reaching(weights):
+        data = fs.cat_file(path)
     with tempfile.TemporaryDirectory() as folder:
-        local = Path(folder) / name
+        local = Path(folder) / _name_of(path)
+        local.write_bytes(data)
         try:
-            with reaching(weights):
-                fs.get_file(path, str(local))
             (load_nesf if refines else load_checkpoint)(local)
         except WeightsError as error:
             raise WeightsError(str(error).replace(str(local), without_secrets(weights))) from error
-        digest = file_digest(local)
-        store.upload(local, f"weights/{digest}/{name}")
-    return name, digest
+    return local.name, data
 
 
 # The worker
 
 
-def run_task(task: Task) -> bool:
-    """Do a task; False where its result was there, or another attempt was quicker.
+def run_task(task: Task, log: LogInput) -> bool:
+    """Do a task with a log; False where its result was there, or another attempt was quicker.
 
     Raises:
         StoreError: the store or the log cannot be reached.
@@ -258,8 +261,8 @@ def run_task(task: Task) -> bool:
         raise StoreError(
             f"{socket.gethostname()}: {error}. Where nodes share no folder of this name, --out must be a bucket"
         ) from error
-    versions = _versions(task.log.url)
-    source = f"sources/{_digest(task.log.url, *versions.values())}"
+    versions = _versions(log.url)
+    source = f"sources/{_digest(log.url, *versions.values())}"
     known = store.find(source) if all(versions.values()) else None  # the log was read before
     if known is not None and store.exists(f"results/{task.key(known.decode())}.json"):
         return False
@@ -275,61 +278,47 @@ def run_task(task: Task) -> bool:
         out.mkdir()
         operation = OPERATIONS[task.operation]
         settings = convert_config(task.settings, operation.settings, "settings of the fleet")
-        log = paths[0] if len(paths) == 1 else paths[0].parent
-        findings = operation.run(log, out, _local_weights(task, store, folder), settings)
-        if _versions(task.log.url) != versions:
+        weights = Path(task.weights) if task.weights else None
+        if task.weights_data:
+            weights = folder / task.weights
+            weights.write_bytes(task.weights_data)
+        findings = operation.run(paths[0] if len(paths) == 1 else paths[0].parent, out, weights, settings)
+        if _versions(log.url) != versions:
             raise LogError(
-                f"{without_secrets(task.log.url)}: has changed while it was read; run it again once it is written"
+                f"{without_secrets(log.url)}: has changed while it was read; run it again once it is written"
             )
-        return _commit(task, store, digest, findings, out, began)
+        place = f"files/{task.key(digest)}/{secrets.token_hex(6)}"
+        result = TaskResult(
+            key=task.key(digest),
+            operation=task.operation,
+            log=without_secrets(log.url),
+            log_digest=digest,
+            tags=log.tags,
+            weights=task.weights,
+            settings=dict(task.shown_settings),
+            version=code_version(),
+            findings=findings,
+            files=_upload(store, out, place),
+            folder=place,
+            seconds=round(time.monotonic() - began, 3),
+            node=socket.gethostname(),
+            finished_ns=time.time_ns(),
+        )
+        return store.commit(result)
 
 
-def _commit(task: Task, store: Store, log_digest: str, findings: Findings, out: Path, began: float) -> bool:
-    """Put files and result into the store; after an error nothing of them stays."""
-    key = task.key(log_digest)
-    folder = f"files/{key}/{secrets.token_hex(6)}"
+def _upload(store: Store, out: Path, place: str) -> dict[str, str]:
+    """Put files of a result into the store, their digests by name; after an error nothing of them stays."""
     files: dict[str, str] = {}
     try:
         for path in sorted(p for p in out.rglob("*") if p.is_file()):
             name = path.relative_to(out).as_posix()
             files[name] = file_digest(path)
-            store.upload(path, f"{folder}/{name}")
+            store.upload(path, f"{place}/{name}")
     except StoreError:
-        store.remove(folder)
+        store.remove(place)
         raise
-    result = TaskResult(
-        key=key,
-        operation=task.operation,
-        log=without_secrets(task.log.url),
-        log_digest=log_digest,
-        tags=task.log.tags,
-        weights=task.weights,
-        settings=dict(task.shown_settings),
-        version=code_version(),
-        findings=findings,
-        files=files,
-        folder=folder,
-        seconds=round(time.monotonic() - began, 3),
-        node=socket.gethostname(),
-        finished_ns=time.time_ns(),
-    )
-    return store.commit(result)
-
-
-def _local_weights(task: Task, store: Store, folder: Path) -> Path | None:
-    """The weights as a local file, or a name of the package's own.
-
-    Raises:
-        StoreError: they are not in the store, or damaged.
-    """
-    if not task.weights_digest:
-        return Path(task.weights) if task.weights else None
-    data = store.find(f"weights/{task.weights_digest}/{task.weights}") or b""
-    if hashlib.sha256(data).hexdigest() != task.weights_digest:
-        raise StoreError(f"{store.shown}: the weights {task.weights} in it are damaged; start the run again")
-    path = folder / task.weights
-    path.write_bytes(data)
-    return path
+    return files
 
 
 def _versions(url: str) -> dict[str, str]:

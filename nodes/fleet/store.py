@@ -10,7 +10,6 @@ Layout:
     results/KEY.json           a result
     files/KEY/ATTEMPT/NAME     its files
     failures/KEY.json          a log that failed, until it is done
-    weights/DIGEST/NAME        weights that were given
     sources/ID                 digest of a log, by its URL, size and version
 """
 

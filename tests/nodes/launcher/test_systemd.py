@@ -42,13 +42,6 @@ def test_what_is_told_is_what_systemd_expects(tmp_path: Path) -> None:
     assert manager.hear() == ["STOPPING=1", "EXTEND_TIMEOUT_USEC=2500000"]
 
 
-def test_abstract_socket() -> None:
-    name = f"semantic-mapper-test-{os.getpid()}"
-    manager = Manager("\0" + name)
-    Notifier.from_environment({"NOTIFY_SOCKET": f"@{name}"}).ready("well")
-    assert manager.hear()[0] == "READY=1"
-
-
 def test_watchdog_is_fed_three_times_a_period_and_only_for_this_process(tmp_path: Path) -> None:
     manager = Manager(str(tmp_path / "notify"))
     given = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
