@@ -27,7 +27,7 @@ from semantic_mapper.redaction import without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_SUFFIX, prepare_file
 
 if TYPE_CHECKING:
-    from semantic_mapper.nodes.fleet.compare import Estimate, FleetComparison
+    from semantic_mapper.nodes.fleet.compare import FleetComparison, LogChange
 
 EXIT_USAGE = 2
 MAX_SHOWN = 500  # rows that are printed
@@ -294,32 +294,16 @@ def _show_comparison(output: Output, found: FleetComparison) -> None:
     direction = "lower" if found.lower_is_better else "higher"
     changed = [log for log in found.logs if log.status != "same"]
     names = ("log", "A", "B", "difference", "95 % interval", "")
-    rows = [(c.log, c.a, c.b, _difference(c.a, c.b), _interval(c.estimate), c.note) for c in changed[:MAX_LOGS]]
-    rows.append(
-        (
-            "mean over logs",
-            found.mean_a,
-            found.mean_b,
-            _difference(found.mean_a, found.mean_b),
-            _interval(found.overall),
-            "",
-        )
-    )
+    rows = [_change_row(change) for change in (*changed[:MAX_LOGS], found.mean)]
     output.print(f"{found.operation}, {found.metric} ({direction} is better)", _rows_table(names, rows))
-    counts = [
-        f"{counted(found.count('worse'), 'log')} worse",
-        f"{found.count('better')} better",
-        f"{found.count('same')} as before",
-    ]
-    output.print(f"{', '.join(counts)}; --json gives all")
-    if found.unknown:
-        output.print(f"note: {counted(found.unknown, 'log')} without the same stretches in both: judged together only")
+    counts = ", ".join(f"{counted(found.count(status), 'log')} {status}" for status in ("worse", "better", "same"))
+    output.print(f"{counts}; --json gives all")
+    if unknown := sum(log.estimate is None and log.b is not None for log in found.logs):
+        output.print(f"note: {counted(unknown, 'log')} without the same stretches in both: judged together only")
     output.print(f"worse: {'; '.join(found.reasons)}" if found.reasons else "not worse")
 
 
-def _difference(a: float | None, b: float | None) -> str:
-    return "-" if a is None or b is None else f"{b - a:+.4f}"
-
-
-def _interval(estimate: Estimate | None) -> str:
-    return "-" if estimate is None else f"{estimate.low:+.4f} .. {estimate.high:+.4f}"
+def _change_row(change: LogChange) -> tuple[Any, ...]:
+    difference = "-" if change.a is None or change.b is None else f"{change.b - change.a:+.4f}"
+    interval = "-" if (found := change.estimate) is None else f"{found.low:+.4f} .. {found.high:+.4f}"
+    return change.log, change.a, change.b, difference, interval, f"{change.status} {change.reason}".strip()

@@ -49,30 +49,38 @@ class Estimate:
     low: float
     high: float
 
+    @classmethod
+    def of(cls, difference: float, error: float, freedom: int) -> Estimate:
+        """With its interval."""
+        reach = float(t.ppf(0.5 + _CONFIDENCE / 2, freedom)) * error
+        return cls(difference, error, freedom, difference - reach, difference + reach)
+
+    def p_below(self, limit: float, sign: float) -> float:
+        """One-sided p-value of "``sign`` times the true difference is not below ``limit``"."""
+        distance = sign * self.difference - limit
+        if self.error == 0:
+            return 0.0 if distance < 0 else 1.0
+        return float(t.cdf(distance / self.error, self.freedom))
+
 
 @dataclass(frozen=True, slots=True)
 class LogChange:
-    """One log in both results.
+    """One log in both results, or the mean over all with a score in both.
 
     Args:
         log: Its URL in A.
-        status: "worse", "better", "same"; "failed", "missing", "unscored": has a score in A only.
         a, b: The metric; None = no score.
         estimate: None where its noise is unknown.
+        status: "worse", "better", "same"; "failed", "missing", "unscored": has a score in A only.
         reason: Why it failed.
     """
 
     log: str
-    status: str
     a: float | None
     b: float | None = None
     estimate: Estimate | None = None
+    status: str = SAME
     reason: str = ""
-
-    @property
-    def note(self) -> str:
-        """What there is to say of it, for people."""
-        return f"{self.status} {self.reason}".strip()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,21 +89,16 @@ class FleetComparison:
 
     Args:
         operation, metric, lower_is_better: What was compared.
-        overall: Mean over logs; None where its noise is unknown.
-        mean_a, mean_b: Over logs with a score in both; None for none.
+        mean: Over logs.
         logs: The worst first.
-        unknown: Logs without the same stretches in both, which are judged together only.
         reasons: Why B is worse; empty = it is not.
     """
 
     operation: str
     metric: str
     lower_is_better: bool
-    overall: Estimate | None
-    mean_a: float | None
-    mean_b: float | None
+    mean: LogChange
     logs: tuple[LogChange, ...]
-    unknown: int
     reasons: tuple[str, ...]
 
     def count(self, status: str) -> int:
@@ -150,25 +153,16 @@ def compare_stores(
         for digest, log in a.logs.items()
         if log.value is not None or digest not in b.logs
     ]
-    changes = list(_judged(changes, log_threshold, sign))
-    overall, means = _overall(changes)
+    mean = _mean(changes)
+    changes = sorted(_judged(changes, log_threshold, sign), key=lambda change: _rank(change, sign))
     reasons: list[str] = []
-    if overall is not None and max(sign * overall.low, sign * overall.high) < -threshold:
+    if mean.estimate is not None and max(sign * mean.estimate.low, sign * mean.estimate.high) < -threshold:
         limit = f" by more than {threshold:g}" if threshold else ""
         reasons.append(f"the mean of {metric} over logs is worse{limit}")
     for status, text in {**_BAD, WORSE: f"lost more than {log_threshold:g}"}.items():
         if count := sum(change.status == status for change in changes):
             reasons.append(f"{counted(count, 'log')} {text}")
-    return FleetComparison(
-        operation,
-        metric,
-        lower_is_better,
-        overall,
-        *means,
-        tuple(sorted(changes, key=lambda change: _rank(change, sign))),
-        sum(change.estimate is None and change.b is not None for change in changes),
-        tuple(reasons),
-    )
+    return FleetComparison(operation, metric, lower_is_better, mean, tuple(changes), tuple(reasons))
 
 
 # One store
@@ -230,19 +224,20 @@ def _score(result: TaskResult, metric: str, value: float | None) -> _Score:
     return found
 
 
-# One log
+# Changes
 
 
 def _change(a: _Score, b: _Score | None, errors: dict[str, str]) -> LogChange:
     """Whether a log with a score in both is worse is left open."""
     if b is None:
-        return LogChange(a.url, FAILED if a.url in errors else MISSING, a.value, reason=errors.get(a.url, ""))
+        status = FAILED if a.url in errors else MISSING
+        return LogChange(a.url, a.value, status=status, reason=errors.get(a.url, ""))
     if b.value is None:
-        return LogChange(a.url, UNSCORED, a.value)
+        return LogChange(a.url, a.value, status=UNSCORED)
     estimate = None
     if a.stretches is not None and b.stretches is not None and a.of == b.of:
         estimate = _bootstrapped(a.stretches, b.stretches)
-    return LogChange(a.url, SAME, a.value, b.value, estimate)
+    return LogChange(a.url, a.value, b.value, estimate)
 
 
 def _bootstrapped(a: Float64, b: Float64) -> Estimate | None:
@@ -254,7 +249,7 @@ def _bootstrapped(a: Float64, b: Float64) -> Estimate | None:
     if len(drawn) < _RESAMPLES // 2:
         return None  # the class is in so few stretches that most draws lack it
     observed = float(_difference(a, b, np.ones((1, count)))[0])
-    return _estimate(observed, float(drawn.std()) * math.sqrt(count / (count - 1)), count - 1)
+    return Estimate.of(observed, float(drawn.std()) * math.sqrt(count / (count - 1)), count - 1)
 
 
 def _difference(a: Float64, b: Float64, times: Float64) -> Float64:
@@ -262,45 +257,28 @@ def _difference(a: Float64, b: Float64, times: Float64) -> Float64:
     return after - before
 
 
-def _estimate(difference: float, error: float, freedom: int) -> Estimate:
-    reach = float(t.ppf(0.5 + _CONFIDENCE / 2, freedom)) * error
-    return Estimate(difference, error, freedom, difference - reach, difference + reach)
-
-
-# All logs
-
-
 def _judged(changes: Sequence[LogChange], threshold: float, sign: float) -> Iterator[LogChange]:
-    """Logs that are surely worse or better by more than the threshold."""
-    known = [(number, change.estimate) for number, change in enumerate(changes) if change.estimate is not None]
+    """With those that are surely worse or better by more than the threshold."""
+    known = {number: change.estimate for number, change in enumerate(changes) if change.estimate is not None}
     status: dict[int, str] = {}
     for name, direction in ((WORSE, sign), (BETTER, -sign)):
-        p_values = [_p_below(estimate, -threshold, direction) for _, estimate in known]
+        p_values = [estimate.p_below(-threshold, direction) for estimate in known.values()]
         sure = false_discovery_control(p_values) <= (1 - _CONFIDENCE) / 2 if known else []
-        status |= {number: name for (number, _), is_sure in zip(known, sure, strict=True) if is_sure}
+        status |= {number: name for number, is_sure in zip(known, sure, strict=True) if is_sure}
     for number, change in enumerate(changes):
         yield replace(change, status=status.get(number, change.status))
 
 
-def _p_below(estimate: Estimate, limit: float, sign: float) -> float:
-    """One-sided p-value of "``sign`` times the true difference is not below ``limit``"."""
-    distance = sign * estimate.difference - limit
-    if estimate.error == 0:
-        return 0.0 if distance < 0 else 1.0
-    return float(t.cdf(distance / estimate.error, estimate.freedom))
-
-
-def _overall(changes: Sequence[LogChange]) -> tuple[Estimate | None, tuple[float | None, float | None]]:
-    """The mean difference over logs, and the means of A and B."""
+def _mean(changes: Sequence[LogChange]) -> LogChange:
     both = [change for change in changes if change.b is not None]
     if not both:
-        return None, (None, None)
+        return LogChange("mean over logs", None)
     a, b = np.array([(change.a, change.b) for change in both], np.float64).T
-    means = float(a.mean()), float(b.mean())
-    if len(both) == 1:
-        return both[0].estimate, means
-    error = float((b - a).std(ddof=1)) / math.sqrt(len(both))
-    return _estimate(means[1] - means[0], error, len(both) - 1), means
+    estimate = both[0].estimate
+    if len(both) > 1:
+        error = float((b - a).std(ddof=1)) / math.sqrt(len(both))
+        estimate = Estimate.of(float((b - a).mean()), error, len(both) - 1)
+    return LogChange("mean over logs", float(a.mean()), float(b.mean()), estimate)
 
 
 def _rank(change: LogChange, sign: float) -> tuple[int, float, str]:

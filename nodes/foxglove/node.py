@@ -22,12 +22,11 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, MapError, NodeError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_scale import FIX
-from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import FoxgloveOptions, NodeJob
 from semantic_mapper.nodes.packing import describe_map, thinned
-from semantic_mapper.nodes.status import StatusReport
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.publishing import StatusReport
+from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot

@@ -27,7 +27,6 @@ from semantic_mapper.nodes.launcher.liveness import (
     ProgressLimit,
     cpu_seconds,
 )
-from semantic_mapper.nodes.launcher.systemd import SYSTEMD_VARIABLES
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT, STOP_SIGNAL
 from semantic_mapper.plain_text import visible
@@ -39,6 +38,7 @@ from semantic_mapper.transport.messages import NodeState
 STOP_S, FINISH_S = 15.0, 300.0
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
+SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")  # for the launcher alone, not for its nodes
 ORPHAN_TIMEOUT_S = 120  # see ``NodeJob.orphan_timeout_s``
 # Of a process that somebody has requested to end, whether or not it was old enough to do so in order.
 TERMINATED = {code: s for s in (signal.SIGTERM, signal.SIGINT) for code in (128 + s, -s)}

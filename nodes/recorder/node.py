@@ -17,7 +17,7 @@ from semantic_mapper.errors import CodecError, LogError, TransportError
 from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import NodeJob, RecorderOptions
-from semantic_mapper.nodes.status import StatusReport
+from semantic_mapper.nodes.publishing import StatusReport
 from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.reader import LogAttachment

@@ -21,7 +21,7 @@ from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions, RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.nodes.recorder.node import run_recorder
 from semantic_mapper.nodes.streams import MAX_MISSED, MissingFrames, Streams
 from semantic_mapper.replay.log.format import LogReader

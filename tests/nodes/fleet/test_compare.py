@@ -40,7 +40,7 @@ def with_findings(result: TaskResult, **changes: Any) -> TaskResult:
 def test_a_rerun_with_the_same_results_is_not_worse(compared: Any) -> None:
     found = compared(logs(6), logs(6), log_threshold=0.0)
     assert not found.reasons and found.count("same") == 6
-    assert (found.overall.low, found.overall.high) == (0, 0)
+    assert (found.mean.estimate.low, found.mean.estimate.high) == (0, 0)
 
 
 def test_reruns_with_noise_are_rarely_worse_and_real_losses_are_found(compared: Any) -> None:
@@ -73,7 +73,7 @@ def test_logs_that_failed_or_are_missing_are_worse_and_say_why(tmp_path: Path) -
     assert found.reasons == ("1 log failed in B", "1 log missing in B")
     assert not compare_stores(b, a).reasons
     nothing = compare_stores(a, store_of(tmp_path / "c"))
-    assert nothing.reasons == ("4 logs missing in B",) and nothing.mean_a is None
+    assert nothing.reasons == ("4 logs missing in B",) and nothing.mean.a is None
 
 
 def test_a_log_without_a_score_in_b_is_worse(compared: Any) -> None:
@@ -90,7 +90,7 @@ def test_the_latest_result_of_a_log_counts(compared: Any) -> None:
 def test_metrics_and_costs_without_stretches_are_judged_over_logs_together(compared: Any) -> None:
     slower = [with_findings(r, costs={"step_ms_p50": 36.0 + n % 2}) for n, r in enumerate(logs(8))]
     found = compared(logs(8), slower, metric="step_ms_p50")
-    assert found.lower_is_better and found.count("worse") == 0 and found.unknown == 8
+    assert found.lower_is_better and found.count("worse") == 0 and not any(log.estimate for log in found.logs)
     assert found.reasons == ("the mean of step_ms_p50 over logs is worse",)
     assert not compared(logs(8), slower, metric="step_ms_p50", threshold=20).reasons
     assert not compared(logs(8), slower, metric="step_ms_p50", lower_is_better=False).reasons
@@ -98,7 +98,7 @@ def test_metrics_and_costs_without_stretches_are_judged_over_logs_together(compa
 
 def test_one_log_is_judged_by_its_stretches(compared: Any) -> None:
     found = compared(logs(1), logs(1, loss=0.1, noise=0.01, noise_seed=1))
-    assert found.reasons and found.overall == found.logs[0].estimate and found.overall.freedom == 11
+    assert found.reasons and found.mean.estimate == found.logs[0].estimate and found.mean.estimate.freedom == 11
     bare = [with_findings(made_up(0, loss=0.1), scores=())]
     assert not compared(logs(1), bare).reasons, "the noise of one log without stretches is unknown"
 

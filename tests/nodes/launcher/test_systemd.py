@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import structlog.testing
 
-from semantic_mapper.nodes.launcher.systemd import Notifier
+from semantic_mapper.nodes.launcher.launcher import Notifier
 from tests.nodes.support import REPLAY_LAUNCH
 
 UNIT = REPLAY_LAUNCH.parent / "systemd" / "semantic-mapper.service"
