@@ -109,7 +109,7 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
         itself where two have the same name.
 
     Raises:
-        ConfigError: fewer than two maps, one of them twice, a store without maps, or no such file.
+        ConfigError: fewer than two maps, a store without maps, or no such file.
         StoreError: a store cannot be reached.
     """
     found: list[tuple[str, str]] = []
@@ -122,13 +122,11 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
         if not is_url(url) and not Path(url).is_file():
             raise ConfigError(f"{argument}: no such map file, and no folder with a {MAP_NAME}")
         found.append((_stem(url.removesuffix(f"/{MAP_NAME}")), url))
-    if len(found) < 2:
-        raise ConfigError("a merge needs two maps or more")
-    urls = [url for _, url in found]
-    if twice := [url for url in urls if urls.count(url) > 1]:
-        raise ConfigError(f"{without_secrets(twice[0])}: is given twice; leave one out")
     stems = [stem for stem, _ in found]
-    return {stem if stems.count(stem) == 1 else without_secrets(url): url for stem, url in found}
+    named = {stem if stems.count(stem) == 1 else without_secrets(url): url for stem, url in found}
+    if len(named) < 2:
+        raise ConfigError("a merge needs two maps or more")
+    return named
 
 
 def read_poses(path: Path) -> dict[str, Float64]:

@@ -28,10 +28,7 @@ from semantic_mapper.replay.evaluate.report import score_table, write_eval_repor
 from semantic_mapper.replay.jobs import (
     OFFLINE,
     AutolabelRequest,
-    EvaluateRequest,
     FinetuneRequest,
-    RefineRequest,
-    ReplayRequest,
     autolabel_log,
     evaluate_log,
     finetune_log,
@@ -125,7 +122,7 @@ def read_settings(
 
 
 def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
-    result = replay_log(ReplayRequest(log, out, weights, _part(settings, MapperConfig), settings.max_frames))
+    result = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
     summary = result.summary
     metrics = {name: dig(summary, f"metrics.{name}") for name in (*_SCORES, "map_miou")}
     metrics |= {f"frames_{name}": count for name, count in summary["frames"].items()}
@@ -144,8 +141,8 @@ def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -
 
 
 def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
-    result = evaluate_log(EvaluateRequest(log, weights, _part(settings, MapperConfig), settings.max_frames))
-    scores = result.scores
+    result = evaluate_log(log, weights, _part(settings, MapperConfig), settings.max_frames)
+    scores = result.plain()
     found: dict[str, Any] = {"replays": {}, "logs": {log.name: scores}}
     write_json(out / "eval.json", found)
     write_eval_report(out / "eval.html", {}, [], {log.name: score_table(log.name, scores)}, found)
@@ -154,11 +151,9 @@ def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> 
     metrics = {key: main.get(key) for key in (*_SCORES, "ece")}
     metrics |= {f"miou {method}": figures.get("miou") for method, figures in methods.items()}
     metrics |= {f"frames_{key}": scores[key] for key in ("scored", "excluded", "refused", "damaged", "pseudo_labelled")}
-    segments = result.evaluation.segments
     return Findings(
         metrics=metrics,
-        scores=tuple(_scores(method, f["per_class"], segments.get(method)) for method, f in methods.items()),
-        events=tuple(("note", note) for note in scores["notes"]),
+        scores=tuple(_scores(method, f["per_class"], result.segments.get(method)) for method, f in methods.items()),
     )
 
 
@@ -204,8 +199,8 @@ def _finetune(log: Path, out: Path, weights: Path | None, settings: FinetuneSett
 
 
 def _refine(log: Path, out: Path, weights: Path | None, settings: RefineSettings) -> Findings:
-    request = RefineRequest(log, out / MAP_NAME, weights, settings.fill, settings.up, settings.by_name)
-    report = refine_map(request).report
+    more = {"fill": settings.fill, "up": settings.up, "by_name": settings.by_name}
+    report = refine_map(log, out / MAP_NAME, weights, **more).report
     return Findings(metrics={name: getattr(report, name) for name in ("surface", "relabelled", "filled")})
 
 

@@ -7,24 +7,21 @@ changes alone, and only while somebody receives it. Nothing here can hold up the
 from __future__ import annotations
 
 import os
-import threading
-import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, NoReturn, Self
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.errors import CodecError, MapError, NodeError, SemanticMapperError
+from semantic_mapper.errors import CodecError, MapError, NodeError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_scale import FIX
+from semantic_mapper.nodes.map_feed import MapFollower, describe_map, thinned
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import FoxgloveOptions, NodeJob
-from semantic_mapper.nodes.packing import describe_map, thinned
 from semantic_mapper.nodes.publishing import StatusReport
 from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker
@@ -65,10 +62,19 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
         _log.info("serving", foxglove_websocket=server.url)
         publisher = stack.enter_context(Publisher(context.endpoint(context.name)))
         client = stack.enter_context(MapClient(query, attempts=1, identity=identity))
-        follower = stack.enter_context(_MapFollower(client, server, options))
+        sender = _MapSender(client, server)
+        follower = stack.enter_context(MapFollower(sender.look, options.refresh_s, PAUSE))
         messages = stack.enter_context(NewestSubscriber(endpoints, ("frame", "map", "status", "end")))
         report = StatusReport(context.name, publisher)
         streams, poses = Streams(len(options.cameras)), MapPoses()
+
+        def tell(state: NodeState) -> None:
+            counters = {"frames": sender.frames, "maps": sender.sent["map"], "graphs": sender.sent["graph"]}
+            counters |= {"rejected": messages.rejected, "overwritten": messages.overwritten}
+            ages = {} if messages.silent_s is None else {"frame": messages.silent_s}
+            degraded = tuple(filter(None, (follower.trouble, sender.no_graph)))
+            server.send_status(report.publish(state, counters, ages, degraded))
+
         context.heartbeat.ready()
         while not context.stop and not streams.ended:
             context.heartbeat.turn()
@@ -76,19 +82,17 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
                 raise NodeError("the map is no longer sent: the thread that does so has ended; its error is above")
             if (parts := messages.receive_parts(POLL_S)) is not None:
                 try:
-                    _hand_on(parts, server, follower, streams, poses)
+                    _hand_on(parts, server, sender, streams, poses)
                 except CodecError as error:  # of what its sender itself could not read
                     _log.warning("message_left_out", reason=str(error))
             if report.due:
-                server.send_status(_tell(report, "running", messages, follower))
+                tell("running")
         messages.close()  # a camera that has ended waits for its listeners to leave
         context.heartbeat.ending()
-        server.send_status(_tell(report, "ended", messages, follower))
+        tell("ended")
 
 
-def _hand_on(
-    parts: list[bytes], server: FoxgloveServer, follower: _MapFollower, streams: Streams, poses: MapPoses
-) -> None:
+def _hand_on(parts: list[bytes], server: FoxgloveServer, sender: _MapSender, streams: Streams, poses: MapPoses) -> None:
     """One message of a node.
 
     Raises:
@@ -97,8 +101,8 @@ def _hand_on(
     envelope = read_envelope(parts)
     match envelope.topic:
         case "frame":
-            follower.stamp_ns = envelope.stamp_ns
-            follower.frames += 1
+            sender.stamp_ns = envelope.stamp_ns
+            sender.frames += 1
             T_map_camera = poses.place(envelope.world, envelope.T_world_camera)
             if T_map_camera is not None:
                 server.note_pose(envelope.source, T_map_camera)
@@ -116,67 +120,28 @@ def _hand_on(
             pass
 
 
-def _tell(report: StatusReport, state: NodeState, messages: NewestSubscriber, follower: _MapFollower) -> Status:
-    counters = {"frames": follower.frames, "maps": follower.sent["map"], "graphs": follower.sent["graph"]}
-    counters |= {"rejected": messages.rejected, "overwritten": messages.overwritten}
-    ages = {} if messages.silent_s is None else {"frame": messages.silent_s}
-    return report.publish(state, counters, ages, tuple(filter(None, (follower.trouble, follower.no_graph))))
-
-
-class _MapFollower:
-    """Sends map and graph on whenever they have changed or somebody new receives them; a thread of its own.
+class _MapSender:
+    """Sends map and graph on whenever they have changed or somebody new receives them.
 
     Args:
         client: Of the mapper; one that is restarted is found again.
-        server, options: See there.
+        server: Where to.
     """
 
-    def __init__(self, client: MapClient, server: FoxgloveServer, options: FoxgloveOptions) -> None:
+    def __init__(self, client: MapClient, server: FoxgloveServer) -> None:
         self.frames, self.stamp_ns = 0, 0  # heard of, and stamp of the newest one
         self.sent: dict[Subject, int] = {"map": 0, "graph": 0}
-        self.trouble = ""  # why the last look failed
         self.no_graph = ""  # why somebody who wants one has none
         self._client = client
         self._server = server
-        self._options = options
         self._labels: LabelSet | None = None
         self._graphs: tuple[MapMirror, GraphTracker] | None = None
         self._shown: dict[Subject, tuple[int, NDArray[np.int64]]] = {}  # to how many, and contents of the blocks
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="map", daemon=True)
 
-    @property
-    def alive(self) -> bool:
-        """Whether it still sends; False before its end only by a bug."""
-        return self._thread.is_alive()
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Once more, for what has come since."""
-        self._ended.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        ended, pause_s = False, 0.0
-        while not ended:
-            ended = self._ended.wait(max(self._options.refresh_s, pause_s))
-            began = time.monotonic()
-            try:
-                self._look()
-                self.trouble, pause_s = "", PAUSE * (time.monotonic() - began)
-            except SemanticMapperError as error:  # a mapper that starts has no map for a while
-                if not (self.trouble or ended):
-                    _log.warning("map_not_sent", reason=str(error))
-                self.trouble, pause_s = str(error), 0.0
-
-    def _look(self) -> None:
+    def look(self) -> None:
+        """Fetch the map and send what is new."""
         requests = {subject: self._server.requests(subject) for subject in self.sent}
-        if self._labels is None and not self._ended.is_set():
+        if self._labels is None:
             self._use_labels(self._client.info().label_set)
         if not requests["graph"]:
             self.no_graph = ""

@@ -22,7 +22,7 @@ import numpy as np
 from semantic_mapper.errors import DependencyError, TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.nodes.packing import POINT, pack_points
+from semantic_mapper.nodes.map_feed import POINT, pack_points
 from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance

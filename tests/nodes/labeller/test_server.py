@@ -100,11 +100,6 @@ def test_nothing_is_there_without_the_token(page: Page, path: str) -> None:
     assert not list(page.out.glob("*.png"))
 
 
-def test_an_address_without_its_last_slash_is_refused_by_name(page: Page) -> None:
-    answer = page.ask(f"/{page.token}")
-    assert answer.status == 404 and b"ends in a slash" in answer.body
-
-
 def test_two_pages_have_two_tokens(log: Path, tmp_path: Path) -> None:
     with open_log(log) as opened:
         session = LabelSession(opened, make_label_folder(tmp_path / "labels", opened, ROOMS), [0])
@@ -197,13 +192,6 @@ def test_lengths_that_do_not_fit_are_refused_before_anything_is_read(page: Page,
     answer = page.ask("frames/1/label", "PUT", b"x", Content_Length=length)
     assert answer.status in (400, 411)
     assert page.ask("session").status == 200
-
-
-def test_other_methods_write_nothing(page: Page) -> None:
-    assert page.ask("frames/1/label", "POST", strokes().tobytes()).status == 501
-    assert page.ask("frames/1/label", "DELETE").status == 501
-    assert page.ask("frames/1/image", "PUT", strokes().tobytes()).status == 405
-    assert not list(page.out.glob("*.png"))
 
 
 def test_a_damaged_label_image_is_named_and_left_alone(page: Page) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from semantic_mapper.drivers.poses.sources import read_pose_config
 from semantic_mapper.drivers.registry import load_driver
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.camera.live import make_source
-from semantic_mapper.nodes.launcher import launch_file
 from semantic_mapper.nodes.launcher.launch_file import find_launch, launch_files, load_launch
 from semantic_mapper.nodes.options import CAMERA_KINDS, POSE_KINDS
 from semantic_mapper.types import CameraIntrinsics
@@ -165,21 +163,6 @@ def test_foxglove_is_one_more_listener_and_queries_the_mapper() -> None:
     for change, says in (("foxglove.mapper=camera", "node 'foxglove' shows the map of 'camera', which is no mapper"),):
         with pytest.raises(ConfigError, match=says):
             load_launch(find_launch(Path("camera")), [*given, change])
-
-
-def test_each_start_has_a_folder_of_its_own_even_where_the_clock_is_set_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Clock(datetime):
-        @classmethod
-        def now(cls, tz: tzinfo | None = None) -> datetime:
-            return datetime(2026, 11, 23, 2, 47, tzinfo=tz)
-
-    monkeypatch.setattr(launch_file, "datetime", Clock)
-    for name in ("20261123T024700Z", "20261123T024700Z-1", "20261123T024700Z-2"):
-        launch = load_launch(file_of(tmp_path, SMALL), ["eye.log=x", f"out={tmp_path}/{{now}}"])
-        assert launch.options["brain"].out == f"{tmp_path}/{name}/map"  # type: ignore[union-attr]
-        (tmp_path / name).mkdir()
 
 
 @pytest.mark.parametrize(

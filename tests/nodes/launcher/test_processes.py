@@ -161,37 +161,6 @@ def test_a_node_that_writes_results_is_killed_where_it_is_stuck_not_where_it_is_
     eye.close()
 
 
-# A node that has lost data, and is requested to stop while it says so.
-LOSES = """
-import time
-from semantic_mapper.nodes import node
-from semantic_mapper.nodes.options import CameraOptions
-
-class SlowLog:
-    def error(self, *_, **__):
-        print("lost", flush=True)
-        time.sleep(1)
-
-node._log = SlowLog()
-node.run_node(CameraOptions, lambda context, options: "3 frames")
-"""
-
-
-def test_a_stop_request_does_not_hide_how_a_node_ends_that_is_ending(
-    log: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interpreter(kind: str, job: int, beats: int, output: int) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-I", "-c", LOSES, f"fd:{job}"]
-        return subprocess.Popen(command, stdout=output, stderr=output, pass_fds=(beats, job))
-
-    monkeypatch.setattr(processes, "_start_interpreter", interpreter)
-    child = NodeProcess("camera", NodeJob(name="eye", options={"log": str(log)}))
-    assert eventually(lambda: "lost" in child.tail, 60), child.tail
-    child.request_stop()
-    assert child.wait(30) and child.has_lost
-    child.close()
-
-
 def test_a_job_is_seen_by_its_node_and_in_no_list_of_processes(tmp_path: Path) -> None:
     long = "x" * 200_000  # more than one argument or a pipe holds
     options = {"log": f"{tmp_path}/{WORD}.mcap"}

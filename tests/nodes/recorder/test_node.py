@@ -19,10 +19,8 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from semantic_mapper.config import convert_config, load_mapper_config
+from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, LogError, TransportError
-from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.nodes.cli.record import _join
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
@@ -31,17 +29,13 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
-from semantic_mapper.replay.jobs import EvaluateRequest, ReplayRequest, evaluate_log, replay_log
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
-from semantic_mapper.replay.run_folder import is_log
 from semantic_mapper.transport.codec import encode, encode_frame
-from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
+from semantic_mapper.transport.messages import EndOfStream, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from tests.nodes.support import Running, error_line, eventually, repeated_frames, run, write_log
 from tests.nodes.test_faults import alone
-from tests.small import INTRINSICS, tiny_frames
 from tests.transport import samples
 
 # A recorder beside the player of a log.
@@ -274,19 +268,3 @@ def test_running_launch_is_recorded_from_outside(tmp_path: Path) -> None:
         assert len(seqs) > 5 and seqs == list(range(seqs[0], seqs[0] + len(seqs)))
         assert f"{out}: {len(seqs)} frames" in done.stdout and "parts" in done.stdout
         assert json.loads(found.attachments()[NOTE].data)["nodes"][0]["name"] == "eye"
-
-
-def test_parts_are_replayed_as_one_log(weights: Path, config: Path, tmp_path: Path) -> None:
-    info = StreamInfo("test room", {"rooms": INTRINSICS}, ROOMS)
-    with_parts = Recording(tmp_path / "a.mcap", info, RecordingRules(split_bytes=60_000), recording="x")
-    for frame in tiny_frames(6):
-        with_parts.write(encode_frame(frame))
-    with_parts.close()
-    first, second, *more = parts_on_disk(tmp_path / "a.mcap").values()
-    settings = load_mapper_config(config)
-    request = ReplayRequest(second, tmp_path / "out", weights, settings, further_parts=(*more, first))
-    summary = replay_log(request).summary
-    assert summary["frames"]["fused"] == 6 == VoxelMap.load(tmp_path / "out" / "map.npz").frames
-    assert is_log(tmp_path) and not is_log(tmp_path / "out")
-    scored = evaluate_log(EvaluateRequest(tmp_path, weights, settings, max_frames=5)).scores
-    assert scored["scored"] + scored["excluded"] + scored["refused"] == 5  # more than one part holds

@@ -1,11 +1,17 @@
-"""Maps in plain forms that other tools read."""
+"""Maps for other tools: fetched again and again, and in plain forms."""
 
 from __future__ import annotations
 
-from typing import Any
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
+import structlog
 
+from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import UInt8
@@ -16,6 +22,57 @@ POINT = np.dtype(
     [(axis, "<f4") for axis in ("x", "y", "z")]
     + [(name, "u1") for name in ("red", "green", "blue", "alpha", "label", "confidence", "measured", "spare")]
 )
+
+_log = structlog.get_logger(__name__)
+
+
+class MapFollower:
+    """Looks at a map again and again, in a thread of its own, and once more at the end; a context manager.
+
+    Args:
+        look: May raise errors of ours: a mapper that starts has no map for a while.
+        refresh_s: Between two looks, at least.
+        pause: After a look, so many times as long as it took, at least.
+
+    Attributes:
+        trouble: Why the last look failed; empty = it did not.
+    """
+
+    def __init__(self, look: Callable[[], None], refresh_s: float, pause: float = 0.0) -> None:
+        self.trouble = ""
+        self._look = look
+        self._refresh_s = refresh_s
+        self._pause = pause
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="map", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still looks; False before its end only by a bug."""
+        return self._thread.is_alive()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        ended, pause_s = False, 0.0
+        while not ended:
+            ended = self._ended.wait(max(self._refresh_s, pause_s))
+            began = time.monotonic()
+            try:
+                self._look()
+                self.trouble, pause_s = "", self._pause * (time.monotonic() - began)
+            except SemanticMapperError as error:
+                if not (self.trouble or ended):
+                    _log.warning("map_not_shown", reason=str(error))
+                self.trouble, pause_s = str(error), 0.0
 
 
 def thinning(count: int) -> int:
