@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, MapError, NodeError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_scale import FIX
+from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.nodes.map_feed import MapFollower, describe_map, thinned
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import FoxgloveOptions, NodeJob
@@ -155,7 +155,7 @@ class _MapSender:
             self._server.send_map(thinned(points), describe_map(snapshot, len(points.xyz), self.stamp_ns))
             self.sent["map"] += 1
         if requests["graph"] and not snapshot.scale_known:
-            self.no_graph = f"no graph: lengths of the map are not metres: {FIX}"
+            self.no_graph = f"no graph: lengths of the map are not metres: {SCALE_FIX}"
         elif self._is_new("graph", requests["graph"], snapshot):
             if self._graphs is None or self._graphs[0] is not mirror:  # of a mapper that was restarted
                 self._graphs = mirror, GraphTracker()

@@ -22,7 +22,6 @@ from semantic_mapper.nodes.launcher.fork_server import ForkServer
 from semantic_mapper.nodes.launcher.launch_file import Launch, NodeEntry
 from semantic_mapper.nodes.launcher.liveness import (
     BUSY_SILENCE_S,
-    HangDetector,
     HeartbeatMonitor,
     ProgressLimit,
     cpu_seconds,
@@ -106,12 +105,15 @@ class NodeProcess:
         kind: A row of the process table.
         job: What it is to do (``heartbeat_fd`` is filled in here).
         server: Forks it, where its kind is preloaded; None = a new interpreter.
+        heartbeat_s: Of the launch file.
 
     Raises:
         OSError: no process, thread, file or memory is to be had; nothing is left behind.
     """
 
-    def __init__(self, kind: str, job: NodeJob, server: ForkServer | None = None) -> None:
+    def __init__(
+        self, kind: str, job: NodeJob, server: ForkServer | None = None, heartbeat_s: float = BUSY_SILENCE_S
+    ) -> None:
         self.name = job.name
         self.kind = kind
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
@@ -126,7 +128,7 @@ class NodeProcess:
             else:
                 self._process = _start_interpreter(kind, given, beats, output)
             ours.callback(self._end)
-            self.heartbeat = HeartbeatMonitor(self._beats)
+            self.heartbeat = HeartbeatMonitor(self._beats, self.pid, heartbeat_s)
             self._reader = threading.Thread(target=self._pass_on, name=f"stderr of {self.name}", daemon=True)
             try:
                 self._reader.start()
@@ -321,7 +323,7 @@ class ManagedProcess:
             elif not self.failure and time.monotonic() >= self._due:
                 self._start()
         elif self.process.exit_code() is None:
-            hang = self._detector.find_hang(stopping=self.process.stop_requested)
+            hang = self.process.heartbeat.find_hang(stopping=self.process.stop_requested)
             if hang:
                 self.process.kill()
                 self.process.wait(KILL_S)
@@ -400,9 +402,8 @@ class ManagedProcess:
         # A restarted node waits for no subscribers: the others are there, and frames do not wait.
         subscribers = 0 if restarts else self._job.subscribers
         job = msgspec.structs.replace(self._job, restarts=restarts, subscribers=subscribers)
-        self.process = process = NodeProcess(self.kind, job, self._server)
+        self.process = process = NodeProcess(self.kind, job, self._server, self._launch.heartbeat_s)
         self._end_limit: ProgressLimit | None = None  # of this process, once its end is awaited
-        self._detector = HangDetector(process.pid, process.heartbeat, self._launch.heartbeat_s)
         return process
 
     def _on_failure(self, process: NodeProcess, why: str, *, last: bool) -> None:

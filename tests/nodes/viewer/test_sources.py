@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 import pytest
 import rerun.chunk
+from rerun import RecordingStream
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.cli.options import Remote
@@ -35,6 +36,7 @@ from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import BlockAges
 from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file, recording_server
+from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
@@ -123,18 +125,19 @@ def test_a_viewer_that_is_killed_leaves_no_server() -> None:
 
 
 def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path, tmp_path: Path) -> None:
-    done: list[int] = []
-    show_log(
-        log,
-        weights,
-        tiny_config(),
-        5,
-        lambda: recording_file(tmp_path / "log.rrd"),
-        0.0,
-        going=lambda: len(done) < 4,
-        on_start=done.append,
-        on_frame=done.append,
-    )
+    done: list[int | None] = []
+
+    class Monitor(JobMonitor):
+        def start(self, total: int | None) -> None:
+            done.append(total)
+
+        def set(self, frames: int, note: str = "") -> None:
+            done.append(frames)
+
+    def begin() -> RecordingStream:
+        return recording_file(tmp_path / "log.rrd")
+
+    show_log(log, weights, tiny_config(), 5, begin, 0.0, lambda: len(done) < 4, Monitor())
     assert done == [5, 1, 2, 3], "asked to end after the third frame"
     rows = logged(tmp_path / "log.rrd")
     camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"
