@@ -21,6 +21,7 @@ STARTING, RUNNING, ENDING = b"s", b"r", b"e"
 TURN, FRAME = b"t", b"f"
 PERIOD_S = 0.2
 START_S = STALL_S = 300.0  # until a node is ready, and for a turn of its main loop (kernels compile)
+ORPHAN_TIMEOUT_S = 120  # without its launcher, a node has so long to write its results; longer than any silence allowed
 BUSY_SILENCE_S = 30.0  # loading packages may hold up all threads, and so may an overloaded machine
 _PR_SET_PDEATHSIG = 1
 _READ_BYTES = 65536
@@ -36,10 +37,10 @@ class HeartbeatWriter:
 
     Args:
         fd: Where to write; -1 = no launcher listens.
-        orphan_timeout_s: Once its launcher is gone, the process has this many seconds to write its results.
+        orphan_timeout_s: See ``ORPHAN_TIMEOUT_S``.
     """
 
-    def __init__(self, fd: int, orphan_timeout_s: int) -> None:
+    def __init__(self, fd: int, orphan_timeout_s: int = ORPHAN_TIMEOUT_S) -> None:
         self._fd = fd
         self._orphan_timeout_s = orphan_timeout_s
         self._phase = STARTING

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 import signal
 import subprocess
@@ -38,7 +37,6 @@ STOP_S, FINISH_S = 15.0, 300.0
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
 SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")  # for the launcher alone, not for its nodes
-ORPHAN_TIMEOUT_S = 120  # see ``NodeJob.orphan_timeout_s``
 # Of a process that somebody has requested to end, whether or not it was old enough to do so in order.
 TERMINATED = {code: s for s in (signal.SIGTERM, signal.SIGINT) for code in (128 + s, -s)}
 # Pauses before restarts: doubled with each failure in the window.
@@ -263,8 +261,6 @@ class ManagedProcess:
             subscribers=launch.listeners(entry.name),
             folder=folder,
             restartable=entry.restart != "never",
-            # The kernel ends what is silent for so long; before, it is the launcher's turn.
-            orphan_timeout_s=math.ceil(max(ORPHAN_TIMEOUT_S, 2 * launch.heartbeat_s, 2 * BUSY_SILENCE_S)),
         )
         self._backoff = RestartBackoff()
         self._due = 0.0  # of the next start, while there is no process
