@@ -21,9 +21,7 @@ STARTING, RUNNING, ENDING = b"s", b"r", b"e"
 TURN, FRAME = b"t", b"f"
 PERIOD_S = 0.2
 START_S = STALL_S = 300.0  # until a node is ready, and for a turn of its main loop (kernels compile)
-ORPHAN_TIMEOUT_S = (
-    120  # that a node has to write its results without its launcher, or may hang
-)
+ORPHAN_TIMEOUT_S = 120  # that a node has to write its results without its launcher, or may hang
 BUSY_SILENCE_S = 30.0  # loading packages may hold up all threads, and so may an overloaded machine
 _PR_SET_PDEATHSIG = 1
 _READ_BYTES = 65536
