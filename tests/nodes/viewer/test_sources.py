@@ -30,6 +30,7 @@ from semantic_mapper.nodes.cli.view import _find_live
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.viewer import server
 from semantic_mapper.nodes.viewer.mapped_log import show_log
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
@@ -108,6 +109,16 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
         done = run("view", source, "--port", "0", "--data-port", "0")
         assert done.returncode == 1 and reason in error_line(done.stderr)
         assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
+
+
+def test_a_viewer_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "rerun"
+    locked = 'if sys.argv[1] != "analytics": sys.exit("the door is locked")'
+    program.write_text(f"#!{sys.executable} -I\nimport sys\n{locked}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(server, "_find_program", lambda: str(program))
+    with pytest.raises(TransportError, match=r"has not started.* the door is locked"), WebViewer(0, 0):
+        pass
 
 
 def test_a_viewer_that_is_killed_leaves_no_server() -> None:
