@@ -220,7 +220,7 @@ class LaunchStatus:
     """Publishes a ``Status`` of each node, and one of the launch itself.
 
     Counters and ages of a node's own status are passed on (a player of logs has none: its launcher counts ``published``
-    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``, ``fds`` and ``threads``, and the ages ``start``
+    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms`` and ``fds``, and the ages ``start``
     (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
 
     Args:
@@ -300,7 +300,7 @@ def node_status(managed: ManagedProcess, own: Status | None) -> Status:
 
 
 def process_stats(pid: int) -> dict[str, int]:
-    """``rss_kb``, ``cpu_ms`` (total), ``fds``, ``threads``; empty where the process has ended."""
+    """``rss_kb``, ``cpu_ms`` (total), ``fds``; empty where the process has ended."""
     try:
         process = psutil.Process(pid)
         with process.oneshot():
@@ -309,7 +309,6 @@ def process_stats(pid: int) -> dict[str, int]:
                 "rss_kb": process.memory_info().rss // 1024,
                 "cpu_ms": round(1000 * (times.user + times.system)),
                 "fds": process.num_fds(),
-                "threads": process.num_threads(),
             }
     except (psutil.Error, OSError):
         return {}
