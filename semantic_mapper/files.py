@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
-from semantic_mapper.redaction import plain_without_secrets
+from semantic_mapper.plain_text import plain_without_secrets
 
 Sync = Literal["none", "file", "folder"]
 

@@ -40,7 +40,7 @@ from semantic_mapper.nodes.fleet.store import (
     file_digest,
 )
 from semantic_mapper.nodes.fleet.urls import MissingError, full_url, is_url, open_url, reaching, shown
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 
 MAX_RETRIES = 3  # of a task whose process died, whose node was lost, or that could not reach log or store
 AHEAD = 2  # tasks handed to Ray for each that has room

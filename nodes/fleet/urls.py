@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from semantic_mapper.errors import ConfigError, DependencyError, FleetError, StoreError
-from semantic_mapper.redaction import CHAIN, HIDDEN, NAMING_SCHEMES, user_length, without_secrets
+from semantic_mapper.plain_text import CHAIN, HIDDEN, NAMING_SCHEMES, user_length, without_secrets
 
 _SCHEME = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*)://(.*)", re.DOTALL)
 # What packages raise for failed requests, besides ``OSError``.
