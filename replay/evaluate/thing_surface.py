@@ -12,7 +12,6 @@ from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.surface import class_surface
@@ -77,7 +76,6 @@ class ThingSurface:
 
     def _nearest(self) -> Any:
         if self._tree is None:
-            check_room_for_scipy()
             from scipy.spatial import KDTree
 
             self._tree = KDTree(self.xyz)

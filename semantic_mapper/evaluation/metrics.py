@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.types import Float32, Float64, UInt8
 
 
@@ -216,7 +215,6 @@ def nearest_points(
             raise ShapeError(f"{name}: expected shape (N, 3), got {xyz.shape}")
     if not len(from_xyz) or not len(at_xyz):
         return np.full(len(at_xyz), len(from_xyz), np.int64)
-    check_room_for_scipy()
     from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
 
     _, nearest = KDTree(from_xyz).query(at_xyz, distance_upper_bound=max_distance_m, workers=-1)

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.types import Float32, Float64, UInt8
 
 SUPERSAMPLING = 2  # pixels drawn a side for each pixel of the picture
@@ -181,7 +180,6 @@ def point_spacing(xyz: Float64) -> float:
     """Typical distance of a point to its fourth neighbour, metres: the pitch of a surface sampled on a grid."""
     if len(xyz) < 5:
         return 0.05
-    check_room_for_scipy()
     from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
 
     asking = xyz[:: max(1, len(xyz) // 500)]

@@ -41,7 +41,6 @@ from semantic_mapper.mapping.map_types import InstanceLayer, instance_layer, pac
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.types import Float32, Float64, Int64
 
 TILE_M = 8.0
@@ -491,7 +490,6 @@ def _neighbours(voxels: Int64) -> tuple[Int64, Int64]:
 
 def _components(count: int, first: Int64, second: Int64) -> Int64:
     """Number of the connected part that each belongs to. SciPy's libraries need 270 MB, and few sessions refine."""
-    check_room_for_scipy()
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
