@@ -93,12 +93,6 @@ def test_an_unknown_key_like_no_other_is_answered_with_the_valid_ones(tmp_path: 
         load_config(write(tmp_path, "qqqq = 1"), MapperConfig)
 
 
-def test_the_nearest_key_is_one_of_the_section_that_holds_the_mistake() -> None:
-    with pytest.raises(ConfigError) as caught:
-        convert_config({"keyframes": {"voxel_size_m": 0.05}}, MapperConfig, "mapper.toml")
-    assert "`voxel_size_m`?" not in str(caught.value)  # it is refused here: offering it again helps nobody
-
-
 @pytest.mark.parametrize(
     ("data", "names"),
     [
@@ -168,7 +162,7 @@ def test_values_that_make_no_sense_are_refused_by_name(section: dict[str, Any], 
     ("text", "says"),
     [
         ("seed = " + "9" * 5000, "not valid TOML"),
-        ("x = " + "[" * 20000, "not valid TOML: too many tables or lists inside each other"),
+        ("x = " + "[" * 20000, "not valid TOML"),
         ("seed = " + "9" * 4000, r"seed = a number of 13288 bits"),
         ("seed = 9223372036854775808", "seed = a number of 64 bits"),
         ("[voxel_map]\nvoxel_size_m = inf", "voxel_map.voxel_size_m = inf: give a number between"),
@@ -180,7 +174,6 @@ def test_values_that_make_no_sense_are_refused_by_name(section: dict[str, Any], 
         ('[render]\ndevice = "a\\u0000b"', "render.device holds a NUL character"),
         ('quality = "unknown field"', "quality"),
         ("k" * 100_000 + " = 1", "unknown key"),
-        ("x = " + "[" * 40 + "]" * 40, "more than 32 tables or lists inside each other"),
         ("#" * (MAX_FILE_BYTES + 1), "larger than the limit of 1,048,576 bytes"),
     ],
 )
