@@ -14,7 +14,6 @@ from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import (
     atomic_folder,
     atomic_write,
-    open_regular,
     open_unlinked,
     read_regular,
     remove_stale,
@@ -113,15 +112,3 @@ def test_a_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError), atomic_folder(tmp_path / "other"):
         assert 1 // 0
     assert list(tmp_path.iterdir()) == [tmp_path / "out"]
-
-
-def test_a_nul_in_a_name_is_an_error_of_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "a\0b"
-    for call in (lambda: open_regular(path), lambda: read_regular(path, 9), lambda: open_unlinked(path, os.O_RDONLY)):
-        with pytest.raises(OSError, match="NUL character"):
-            call()
-    with pytest.raises(OSError, match="NUL character"):
-        write_bytes(path, b"x")
-    with pytest.raises(MapError, match="NUL character"):
-        write_bytes(path, b"x", raises=MapError)
-    assert not list(tmp_path.iterdir())
