@@ -16,6 +16,7 @@ import zmq
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import (
     MAX_KEYFRAME_BYTES,
     EndOfStream,
@@ -91,10 +92,10 @@ def test_nothing_is_lost_between_a_blocking_publisher_and_a_slow_lossless_subscr
 
 
 def test_a_blocking_publisher_names_a_subscriber_that_hangs(endpoint: str) -> None:
-    big = [*encode(EndOfStream("front", "end", 0)), bytes(2**20)]  # fills the kernel's buffers soon
+    big = encode_frame(samples.make_frame(size=(960, 720)), CodecOptions(rgb="raw"))  # fills the kernel's buffers soon
     with (
         Publisher(endpoint, policy="block", hwm=1, linger_ms=0) as publisher,
-        LosslessSubscriber(endpoint, ["end"], hwm=1) as subscriber,
+        LosslessSubscriber(endpoint, ["frame"], hwm=1) as subscriber,
     ):
         subscriber.wait_until_heard(WAIT_S)
 
@@ -339,10 +340,8 @@ def test_closing_wakes_a_receiver_that_waits(endpoint: str) -> None:
 FLOOD = 200
 
 
-@pytest.mark.parametrize(
-    ("kind", "place"), [(LosslessSubscriber, "header"), (LosslessSubscriber, "pixels"), (NewestSubscriber, "pixels")]
-)
-def test_a_reader_without_time_takes_no_more_of_a_flood_than_one(endpoint: str, kind, place: str) -> None:
+@pytest.mark.parametrize("kind", [NewestSubscriber, LosslessSubscriber])
+def test_a_reader_without_time_takes_no_more_of_a_flood_than_one(endpoint: str, kind) -> None:
     with zmq.Context.instance().socket(zmq.XPUB) as other, kind(endpoint, ["frame"]) as subscriber:
         other.setsockopt(zmq.LINGER, 0)
         other.setsockopt(zmq.SNDHWM, 0)
@@ -352,31 +351,12 @@ def test_a_reader_without_time_takes_no_more_of_a_flood_than_one(endpoint: str, 
             other.recv()
         for number in range(FLOOD):
             topic, header, *buffers = encode_frame(samples.make_frame(1, camera_id=f"camera{number}"))
-            if place == "header":
-                header = b"\x80"
             other.send_multipart([topic, header, *(b"\xff" * len(buffer) for buffer in buffers)])
-        if kind is NewestSubscriber:
-            eventually(lambda: len(subscriber._slots) == FLOOD)
-        else:
-            time.sleep(0.3)  # so that many wait
+        eventually(lambda: subscriber.silent_s is not None)
         assert subscriber.receive(0.0) is None and subscriber.rejected <= 1
         other.send_multipart(encode_frame(samples.make_frame(5)))
         frame = subscriber.receive(WAIT_S)
         assert isinstance(frame, PosedFrame) and frame.seq == 5 and subscriber.rejected == FLOOD
-
-
-def test_a_publisher_hears_a_flood_of_subscriptions_little_by_little(endpoint: str) -> None:
-    with Publisher(endpoint) as publisher, zmq.Context.instance().socket(zmq.SUB) as other:
-        other.setsockopt(zmq.LINGER, 0)
-        other.connect(endpoint)
-        with publisher._mutex:  # as in a ``publish`` that has begun: nobody else hears them
-            for number in range(1000):
-                other.subscribe(f"frame/{number}/".encode())
-            time.sleep(0.3)
-            publisher._drain()
-            assert 0 < len(publisher._counts) < 500
-        eventually(lambda: publisher.subscribers("frame", "999") == 1)  # all of them in the end, in order
-        assert len(publisher._counts) == 1000
 
 
 def test_a_reader_whose_thread_has_failed_says_why(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -387,7 +367,7 @@ def test_a_reader_whose_thread_has_failed_says_why(endpoint: str, monkeypatch: p
         subscriber.wait_until_heard(WAIT_S)
         publisher.publish(encode_frame(samples.make_frame(5)))
         eventually(lambda: subscriber.silent_s is not None)
-        monkeypatch.setattr(subscriber._connections, "reconnect", fails)
+        monkeypatch.setattr(subscriber._connections, "follow", fails)
         assert isinstance(subscriber.receive(WAIT_S), PosedFrame), "what had come before"
         for use in (subscriber.receive, subscriber.wait_until_heard):
             with pytest.raises(TransportError, match="Too many open files"):
