@@ -17,7 +17,7 @@ from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_scale import require_metres
-from semantic_mapper.queries.checks import check_direction
+from semantic_mapper.queries.checks import check_up
 from semantic_mapper.queries.instances import LEAST_OVERLAP, Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.occupancy import State, read_states
@@ -136,11 +136,7 @@ class GraphTracker:
     """
 
     def __init__(self, up: ArrayLike | None = None) -> None:
-        self._up: Float64 | None = None
-        if up is not None:
-            self._up = check_direction(up, "up")
-            if self._up.shape != (3,):
-                raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
+        self._up = None if up is None else check_up(up)
         self._things: InstanceTracker | None = None
         self._plans: tuple[_Plan, ...] = ()
         self._next_floor = self._next_room = 1
