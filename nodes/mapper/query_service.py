@@ -30,20 +30,22 @@ from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.status import PartStatus
 from semantic_mapper.queries import questions
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
-from semantic_mapper.queries.questions import NAMES, InstanceArrays, MapInfo, Point, decode_question
-from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import points_in_box
-from semantic_mapper.transport.keys import Keys
-from semantic_mapper.transport.query_messages import (
+from semantic_mapper.queries.questions import (
+    NAMES,
+    InstanceArrays,
+    MapInfo,
     MapState,
+    Point,
     Request,
+    decode_question,
     encode_answer,
     encode_error,
 )
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.surface import cast_rays, points_in_box
+from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.query_sockets import QueryServer
 
 PERIOD_S = 0.1  # between two snapshots, at least

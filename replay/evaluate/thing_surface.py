@@ -13,7 +13,7 @@ from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import CameraIntrinsics, Float64
 

@@ -2,7 +2,7 @@
 
 What encodes and decodes raises nothing but ``CodecError``. Every size is bounded and checked before anything is
 allocated by it. Decoded arrays are fresh and writable. In a log a message is a msgpack array of binaries, which any
-msgpack reader opens. Questions about a map have a codec of their own, ``query_messages``.
+msgpack reader opens. Questions about a map have a codec of their own, ``queries.questions``.
 """
 
 from __future__ import annotations

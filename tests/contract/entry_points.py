@@ -59,7 +59,7 @@ from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.questions import Correction, InstanceArrays, MapInfo, Weights, WeightsEntry
-from semantic_mapper.queries.rays import RayHits
+from semantic_mapper.queries.surface import RayHits
 from semantic_mapper.replay.compare import Tolerances
 from semantic_mapper.replay.corrected_poses import read_corrections
 from semantic_mapper.replay.importers.base import RenameConfig
@@ -68,7 +68,7 @@ from semantic_mapper.testing import LogReplays
 from semantic_mapper.training.config import FinetuneConfig, OnlineConfig
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
-from semantic_mapper.transport import codec, pose_message, query_messages
+from semantic_mapper.transport import codec, pose_message
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.keys import load_keys
 from semantic_mapper.transport.messages import (
@@ -220,25 +220,25 @@ decode_pose, encode_pose = pose_message.decode_pose, pose_message.encode_pose
 label_set_header = LabelSetForm.of
 
 
-QUESTIONS, MapState, decode_question = questions.QUESTIONS, query_messages.MapState, questions.decode_question
+QUESTIONS, MapState, decode_question = questions.QUESTIONS, questions.MapState, questions.decode_question
 
 
 def encode_question(kind: str, request: Any) -> list[bytes]:
     """Parts of a question."""
-    return query_messages.encode_request(kind, request)
+    return questions.encode_request(kind, request)
 
 
 def decode_answer(kind: str, parts: Sequence[bytes]) -> tuple[Any, Any]:
     """What it is about, and the answer; raises what the other side has answered in place of these."""
-    return query_messages.decode_answer(kind, QUESTIONS[kind].answer, parts)
+    return questions.decode_answer(kind, QUESTIONS[kind].answer, parts)
 
 
 def encode_answer(kind: str, state: Any, answer: Any) -> list[bytes]:
     """Parts of an answer."""
-    return query_messages.encode_answer(kind, state, answer)
+    return questions.encode_answer(kind, state, answer)
 
 
-encode_error = query_messages.encode_error
+encode_error = questions.encode_error
 
 
 def keep_learning(store: LearningStore, kept: Sequence[Kept]) -> None:

@@ -16,7 +16,7 @@ from semantic_mapper.labels import NYU40, ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapping.refine import FILL_VOTES, check_refinable, group_things, refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from tests.mapping.grids import decided
 from tests.small import tiny_frames
 

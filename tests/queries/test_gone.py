@@ -14,8 +14,7 @@ from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.storage.changes import NONE_CLEARED, ClearedBlocks
 from semantic_mapper.queries import instances
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from tests.mapping.rendered_views import INTRINSICS, frame, small_map
 from tests.nodes.mapper.test_query_service import answering

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries.graph import GraphTracker, SceneGraph, find_floors
-from semantic_mapper.queries.graph_picture import draw_graph
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.graph import GraphTracker, SceneGraph, draw_graph, find_floors
 from semantic_mapper.queries.rooms import find_walls, part_rooms
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Bool, Float64
 from tests.queries.house import AIR, LABELS, STOREY_M, TRUNCATION, UPRIGHT, VOXEL_M, Box, house_changes, two_rooms
 

@@ -17,7 +17,7 @@ from semantic_mapper.queries.instances import (
     thing_voxels,
     upright_box,
 )
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import UInt8
 from tests.mapping.rendered_views import small_map
 from tests.queries.random_map import random_map, voxel_places

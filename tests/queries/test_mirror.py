@@ -20,11 +20,10 @@ from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries import mirror as mirror_module
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries import snapshot as mirror_module
 from semantic_mapper.queries.nearest import at, nearest
-from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.surface import cast_rays
 from tests.mapping.rendered_views import frame, small_map
 from tests.mapping.storage.test_paging import MEMORY_MB, walk
 from tests.queries.random_map import random_map
@@ -236,7 +235,7 @@ def test_a_mirror_needs_no_open3d() -> None:
         "from tests.queries.scene import LABELS, TABLE, painted\n"
         "from semantic_mapper.queries.surface import points_in_box\n"
         "from semantic_mapper.queries.instances import InstanceTracker\n"
-        "from semantic_mapper.queries.mirror import MapMirror\n"
+        "from semantic_mapper.queries.snapshot import MapMirror\n"
         "snapshot = MapMirror(0.02, 4.0, LABELS).apply(painted(np.full((8, 8), TABLE, np.uint8), 0, 1))\n"
         "print(len(points_in_box(snapshot, (-1, -1, -1), (1, 1, 1)).xyz), len(InstanceTracker().update(snapshot)))\n"
         "print('open3d' in sys.modules)\n"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.geometry import look_at
-from semantic_mapper.queries.rays import cast_rays
+from semantic_mapper.queries.surface import cast_rays
 from tests.mapping.rendered_views import INTRINSICS, ray_directions
 from tests.queries.random_map import random_map
 from tests.queries.scene import BALL, CUP, MIDDLE, RADIUS, whole, whole_map

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from tests.mapping.rendered_views import small_map
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses
 from tests.queries.test_mirror import assert_same, empty_mirror

@@ -12,10 +12,12 @@ from semantic_mapper.errors import CodecError, LabelError, MapError, TransportEr
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.nearest import PointAnswers
-from semantic_mapper.queries.questions import AtRequest, InstanceArrays, decode_question
-from semantic_mapper.transport.query_messages import (
+from semantic_mapper.queries.questions import (
+    AtRequest,
+    InstanceArrays,
     MapState,
     decode_answer,
+    decode_question,
     encode_answer,
     encode_error,
     encode_request,

@@ -11,7 +11,7 @@ from semantic_mapper.mapping.fusion import clearing
 from semantic_mapper.mapping.fusion.clearing import depth_bounds
 from semantic_mapper.mapping.storage.changes import UNOBSERVED
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from tests.mapping.rendered_views import LABELS, frame, small_map
 

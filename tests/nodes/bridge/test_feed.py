@@ -7,7 +7,7 @@ from typing import Any
 from semantic_mapper.nodes.bridge.feed import _MapFollower
 from semantic_mapper.nodes.options import FoxgloveOptions
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from tests.queries.scene import LABELS, whole
 
 

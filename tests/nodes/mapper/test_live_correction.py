@@ -32,11 +32,10 @@ from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.queries.questions import CorrectPosesRequest
+from semantic_mapper.queries.questions import CorrectPosesRequest, encode_request
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
-from semantic_mapper.transport.query_messages import encode_request
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 from tests.mapping.test_correction import drift, drifted, true_poses

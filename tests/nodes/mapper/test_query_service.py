@@ -25,7 +25,6 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import State, distance_field, occupancy
 from semantic_mapper.queries.questions import (
@@ -40,12 +39,11 @@ from semantic_mapper.queries.questions import (
     NearestRequest,
     OccupancyRequest,
     RaysRequest,
+    encode_request,
 )
-from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import points_in_box
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.surface import cast_rays, points_in_box
 from semantic_mapper.transport.keys import Keys
-from semantic_mapper.transport.query_messages import encode_request
 from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_moving import THING_M as PASSES_AT_M
@@ -223,7 +221,7 @@ def test_what_would_keep_others_waiting_is_refused(client: MapClient) -> None:
 
 
 def test_answers_that_are_too_large_are_errors(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semantic_mapper.transport.query_messages.MAX_PART_BYTES", 1000)
+    monkeypatch.setattr("semantic_mapper.queries.questions.MAX_PART_BYTES", 1000)
     with pytest.raises(CodecError, match=r"an array of \d+ bytes, at most 1000"):
         client.points_in_box((-1, -1, -1), (1, 1, 1))
     monkeypatch.undo()
