@@ -96,19 +96,6 @@ def run():
     count_visits(10, visits)
     return visits.sum()
 """
-AT_EXIT = """
-import threading
-import torch
-from kernels import run
-
-def go_on():
-    threading.main_thread().join()
-    print(run())
-
-torch.set_num_threads(2)
-run()
-threading.Thread(target=go_on).start()
-"""
 
 
 @pytest.fixture
@@ -137,10 +124,6 @@ def output(process: subprocess.Popen[str]) -> list[str]:
     return out.split()
 
 
-def test_a_thread_that_outlives_the_main_thread_still_runs_kernels(script: Path) -> None:
-    assert output(start(script, AT_EXIT))[-1:] == ["10"]
-
-
 def test_several_processes_run_kernels_at_once(script: Path) -> None:
     code = "import torch, kernels; torch.set_num_threads(2); print(sum(kernels.run() for _ in range(300)))"
     processes = [start(script, code) for _ in range(3)]
@@ -158,7 +141,7 @@ def test_kernels_leave_torchs_thread_count_as_it_is(script: Path, wanted: int) -
 def test_kernels_without_torch_use_the_threads_that_it_would_and_do_not_load_it(
     script: Path, wanted: str, threads: int | None
 ) -> None:
-    code = "import sys, kernels; from semantic_mapper.kernels import threads as t; kernels.run()\n"
+    code = "import sys, kernels; from semantic_mapper.kernels import binding as t; kernels.run()\n"
     code += "print(t._thread_count(), 'torch' in sys.modules)"
     expected = len(os.sched_getaffinity(0)) if threads is None else threads
     assert output(start(script, code, OMP_NUM_THREADS=wanted)) == [str(expected), "False"]
