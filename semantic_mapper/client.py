@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import uuid
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from msgspec.structs import replace
@@ -237,12 +236,10 @@ class MapClient:
         """Free the socket. Harmless when repeated."""
         self._socket.close()
 
-    def __enter__(self) -> MapClient:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _ask(self, request: Request[AnswerT]) -> AnswerT:

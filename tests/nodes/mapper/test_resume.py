@@ -19,7 +19,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.node import Playback
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.mapper.resume import (
+from semantic_mapper.nodes.mapper.saved_map import (
     continue_map,
     forbid,
     keep_earlier,
