@@ -7,7 +7,7 @@ import pytest
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.geometry import check_pose, transform, unproject
-from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
+from semantic_mapper.imaging import rotate_frame, rotate_intrinsics
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 INTRINSICS = CameraIntrinsics(20.0, 22.0, 9.0, 8.0, 20, 14)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from semantic_mapper.view_selection import select_views
+from semantic_mapper.geometry import select_views
 
 EVEN = np.ones(3)
 NOTHING = np.zeros(3)
