@@ -54,13 +54,6 @@ def test_a_quarter_clockwise_brings_the_left_edge_to_the_top():
     np.testing.assert_array_equal(turned.rgb[0], frame.rgb[::-1, 0])
 
 
-def test_four_quarters_are_none():
-    frame = a_frame()
-    again = rotate_frame(rotate_frame(rotate_frame(frame, 1), 1), 2)
-    assert again.intrinsics == frame.intrinsics and np.array_equal(again.rgb, frame.rgb)
-    np.testing.assert_allclose(again.T_world_camera, frame.T_world_camera, atol=1e-12)
-
-
 def test_a_distorted_image_is_refused():
     with pytest.raises(FrameError, match="rectify"):
         rotate_intrinsics(replace(INTRINSICS, distortion=(0.1, 0.0, 0.0, 0.0)), 1)

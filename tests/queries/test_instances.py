@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.spatial import KDTree
 
 from semantic_mapper.errors import MapError
@@ -25,12 +25,10 @@ from tests.queries.scene import (
     BALL,
     BOX,
     CUP,
-    FLOOR,
     HALF,
     LABELS,
     LAMP,
     TABLE,
-    YAW,
     box_axes,
     integrate,
     painted,
@@ -51,40 +49,6 @@ class Painting:
         version = self.mirror.version
         snapshot = self.mirror.apply(painted(plan, version, version + 1))
         return {tuple(thing.voxels[0][:2].tolist()): thing for thing in self.tracker.update(snapshot)}
-
-
-def test_of_equally_sure_things_the_larger_rank_higher_up_to_a_size() -> None:
-    plan = np.zeros((40, 40), np.uint8)
-    plan[2:5, 2:5], plan[8:20, 2:20], plan[22:40, 2:40] = TABLE, TABLE, TABLE
-    small, large, largest = sorted(Painting().paint(plan).values(), key=lambda thing: len(thing.voxels))
-    assert small.confidence == large.confidence == largest.confidence > 0
-    assert small.rank < large.rank == largest.rank == large.confidence
-
-
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), fraction=st.floats(0.1, 0.9), least=st.integers(1, 9))
-def test_components_are_those_of_scipy(seed: int, fraction: float, least: int) -> None:
-    rng = np.random.default_rng(seed)
-    plan = np.where(rng.random((32, 24)) < fraction, rng.choice([TABLE, CUP, FLOOR], (32, 24)), 0).astype(np.uint8)
-    mirror = MapMirror(0.02, 4.0, LABELS)
-    surface = thing_voxels(mirror.apply(painted(plan, 0, 1)), np.isin(np.arange(256), (TABLE, CUP)))
-    found = find_components(surface, least)
-    x, y = np.divmod(np.repeat(np.arange(12), np.diff(surface.start)), 3)
-    mine = np.full(plan.shape, -1)
-    mine[x * 8 + (surface.voxel & 7), y * 8 + ((surface.voxel >> 3) & 7)] = found.component
-    parts = np.split(found.order, found.ends)
-    assert len(parts.pop()) == 0
-    for number, part in enumerate(parts):
-        np.testing.assert_array_equal(part, np.flatnonzero(found.component == number))
-    pairs = set()
-    for class_id in (TABLE, CUP):
-        theirs, count = ndimage.label(plan == class_id, np.ones((3, 3)))
-        sizes = np.bincount(theirs.ravel(), minlength=count + 1)
-        large = (theirs > 0) & (sizes[theirs] >= least)
-        assert (large == ((mine >= 0) & (plan == class_id))).all()
-        pairs |= {(class_id, a, b) for a, b in zip(theirs[large], mine[large], strict=True)}
-    assert len(pairs) == len({p[:2] for p in pairs}) == len({p[2] for p in pairs})
-    assert sorted(p[2] for p in pairs) == list(range(len(pairs)))
 
 
 def test_table_and_cup_are_found_where_they_stand() -> None:
@@ -145,17 +109,6 @@ def test_a_merge_keeps_the_older_id_and_a_split_the_larger_parts() -> None:
     assert painting.paint(plan)[2, 2].id == 5
 
 
-def test_neighbours_that_trade_a_few_voxels_keep_their_ids() -> None:
-    painting, plan = Painting(), np.zeros((16, 16), np.uint8)
-    plan[:8], plan[8:] = TABLE, CUP
-    before = {thing.class_name: thing.id for thing in painting.paint(plan).values()}
-    for edge in (6, 9, 7, 8):
-        plan[:edge], plan[edge:] = TABLE, CUP
-        assert {thing.class_name: thing.id for thing in painting.paint(plan).values()} == before
-    plan[:] = CUP
-    assert [thing.id for thing in painting.paint(plan).values()] == [min(before.values())]
-
-
 @settings(max_examples=50, deadline=None)
 @given(yaw=st.floats(-7, 7), seed=st.integers(0, 10**6))
 def test_the_box_of_a_turned_box_is_that_box(yaw: float, seed: int) -> None:
@@ -174,14 +127,6 @@ def test_the_box_of_a_turned_box_is_that_box(yaw: float, seed: int) -> None:
     np.testing.assert_allclose(box.center, center, atol=1e-5)
     np.testing.assert_allclose(np.abs(box.R_world_box.T @ R), np.eye(3), atol=1e-5)
     assert np.linalg.det(box.R_world_box) == pytest.approx(1) and box.R_world_box[:, 2] == pytest.approx(up)
-
-
-def test_boxes_of_hardly_any_points() -> None:
-    up = np.array([0.0, 0.0, 1.0])
-    point = upright_box(np.array([[1.0, 2.0, 3.0]]), up)
-    np.testing.assert_allclose((point.center, point.size), ((1, 2, 3), (0, 0, 0)), atol=1e-7)
-    line = np.array([np.cos(YAW), np.sin(YAW), 0.0]) * np.linspace(0, 2, 9)[:, None]
-    np.testing.assert_allclose(upright_box(line, up).size, (2, 0, 0), atol=1e-5)
 
 
 def test_settings_that_mean_nothing_are_refused() -> None:
@@ -215,9 +160,3 @@ def test_components_of_random_blocks_are_those_of_a_graph_of_all_pairs(seed: int
         np.testing.assert_array_equal(part, expected_part)
         assert (found.component[part] == number).all()
     assert (found.component >= 0).sum() == sum(map(len, large))
-
-
-def test_no_surface_has_no_components() -> None:
-    snapshot = MapMirror(0.02, 4.0, LABELS).snapshot()
-    found = find_components(thing_voxels(snapshot, WANTED), 1)
-    assert [len(values) for values in found] == [0, 0, 0]

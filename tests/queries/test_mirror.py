@@ -6,8 +6,6 @@ import dataclasses
 import subprocess
 import sys
 import threading
-import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,6 @@ import pytest
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LabelError, MapError
-from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.changes import BlockChanges
@@ -24,10 +21,9 @@ from semantic_mapper.queries import snapshot as mirror_module
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import cast_rays
-from tests.mapping.rendered_views import frame, small_map
+from tests.mapping.rendered_views import small_map
 from tests.mapping.storage.test_paging import MEMORY_MB, walk
-from tests.queries.random_map import random_map
-from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, seen, whole_map
+from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, whole_map
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -98,13 +94,6 @@ def test_a_paged_map_has_the_same_mirror() -> None:
     assert paged.stored_blocks > 100
     assert_same(mirror.snapshot(), MapMirror.of(free).snapshot())
     assert_same(MapMirror.of(paged).snapshot(), MapMirror.of(free).snapshot())
-
-
-def test_a_saved_map_has_the_same_mirror(tmp_path: Path) -> None:
-    voxel_map = whole_map()
-    voxel_map.save(tmp_path / "map.npz")
-    loaded = type(voxel_map).load(tmp_path / "map.npz")
-    assert_same(MapMirror.of(loaded).snapshot(), MapMirror.of(voxel_map).snapshot())
 
 
 def test_a_snapshot_stays_as_it_was() -> None:
@@ -194,31 +183,6 @@ def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path) -> No
     assert a.instances is not None and (a.instances.packed == np.arange(5)).all() and loaded.is_whole
 
 
-def test_of_an_empty_saved_map_there_is_an_empty_mirror(tmp_path: Path) -> None:
-    small_map(LABELS).save(tmp_path / "map.npz")
-    assert MapMirror.load(tmp_path / "map.npz").snapshot().block_count == 0
-
-
-def test_a_saved_map_is_mirrored_without_its_class_evidence_in_memory(tmp_path: Path) -> None:
-    path = tmp_path / "map.npz"
-    ids = tuple(range(1, 61))
-    many = LabelSet("many", ids, tuple(f"class {n}" for n in ids), ((0, 0, 0),) * len(ids))
-    voxel_map = small_map(many, voxel_size_m=0.006)
-    pose = poses(1)[0]
-    depth, _ = seen(pose)
-    voxel_map.integrate(frame(pose), depth, np.full((*depth.shape, len(many)), 1 / len(many), np.float32), None)
-    voxel_map.save(path)
-
-    def peak_bytes(load: Callable[[], object]) -> int:
-        tracemalloc.start()
-        load()
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return peak
-
-    assert peak_bytes(lambda: MapMirror.load(path)) < 0.75 * peak_bytes(lambda: VoxelMap.load(path))
-
-
 def test_a_damaged_map_has_no_mirror(tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     whole_map().save(path)
@@ -242,13 +206,3 @@ def test_a_mirror_needs_no_open3d() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.stdout.split() == ["64", "1", "False"], done.stderr
-
-
-def test_classes_of_a_block_are_those_of_its_voxels_near_the_surface() -> None:
-    snapshot = random_map(0)
-    voxels = snapshot.voxels
-    for slot in snapshot.slots:
-        near = (voxels.weight[slot] > 0) & (np.abs(voxels.tsdf[slot].astype(int)) <= 60)
-        expected = set(voxels.label[slot][near].tolist()) - {LABELS.ignore_id}
-        bits = [int(word) >> bit & 1 for word in voxels.classes[slot] for bit in range(64)]
-        assert set(np.flatnonzero(bits).tolist()) == expected

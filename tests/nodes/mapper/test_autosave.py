@@ -108,18 +108,6 @@ def test_at_the_end_a_save_under_way_is_given_up(tmp_path: Path, slow_writing: t
     assert describe_map(path).frames == 3
 
 
-def test_a_save_that_fails_is_told_and_tried_again_though_nothing_has_changed(tmp_path: Path) -> None:
-    voxel_map, path = small_map(voxel_size_m=0.02), tmp_path / "gone" / "map.npz"
-    autosave = Autosave(voxel_map, path, ALWAYS)
-    walk(voxel_map, 1)
-    autosave.follow()
-    assert eventually(lambda: "cannot write the map" in autosave.failure)
-    path.parent.mkdir()
-    assert eventually(lambda: autosave.follow() or autosave.saves == 1) and not autosave.failure
-    assert describe_map(path).frames == 1
-    autosave.close()
-
-
 def test_a_save_that_dies_is_reported_and_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     voxel_map, path = small_map(voxel_size_m=0.02), tmp_path / "map.npz"
     autosave = Autosave(voxel_map, path, ALWAYS)

@@ -25,10 +25,9 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.nearest import at, nearest
-from semantic_mapper.queries.occupancy import State, distance_field, occupancy
+from semantic_mapper.queries.nearest import at
+from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.questions import (
-    QUESTIONS,
     AtRequest,
     BoxRequest,
     ChangesRequest,
@@ -110,47 +109,6 @@ def assert_equal_fields(a: object, b: object) -> None:
             continue
         np.testing.assert_array_equal(mine, other, err_msg=name)
         assert np.asarray(mine).dtype == np.asarray(other).dtype, name
-
-
-def test_info(client: MapClient) -> None:
-    info = client.info()
-    assert (info.version, info.epoch, info.blocks) == (14, 0, whole_map().block_count)
-    assert (info.voxel_size_m, info.truncation_voxels) == (whole().voxel_size_m, whole().truncation_voxels)
-    assert info.label_set == LABELS
-
-
-def test_points_and_occupancy(client: MapClient) -> None:
-    assert_equal_fields(client.at(PLACES), at(whole(), PLACES))
-    assert_equal_fields(client.at(PLACES.tolist(), 0.2), at(whole(), PLACES, 0.2))
-    assert client.at(np.empty((0, 3))).label.shape == (0,)
-    np.testing.assert_array_equal(client.occupancy(PLACES), occupancy(whole(), PLACES))
-    assert len(set(client.occupancy(PLACES).tolist())) == 3
-    assert client.version == 14
-
-
-def test_nearest_and_rays(client: MapClient) -> None:
-    hit, local = client.nearest("cup", (1, 1, 1)), nearest(whole(), "cup", (1, 1, 1))
-    assert hit is not None
-    assert_equal_fields(hit, local)
-    assert client.nearest("lamp", (0, 0, 0)) is None
-    assert client.nearest("cup", (1, 1, 1), 1.0) is None
-    with pytest.raises(MapError, match="min_confidence"):
-        client.nearest("cup", (1, 1, 1), -0.5)
-    above = PLACES + np.array([0, 0, 1])
-    mine = client.cast_rays(above, BALL - above, 3)
-    assert_equal_fields(mine, cast_rays(whole(), above, BALL - above, 3))
-    assert (mine.distance_m > 0).any()
-    assert_equal_fields(client.cast_rays((0, 0, 2), (0, 0, -1)), cast_rays(whole(), (0, 0, 2), (0, 0, -1)))
-
-
-def test_boxes_and_fields(client: MapClient) -> None:
-    box = ((-0.5, -0.4, -0.1), (0.4, 0.5, 0.5))
-    mine = client.points_in_box(*box)
-    assert len(mine.xyz) > 500
-    assert_equal_fields(mine, points_in_box(whole(), *box))
-    assert_equal_fields(client.distance_field(*box), distance_field(whole(), *box))
-    mine = client.distance_field(*box, unknown_is_occupied=True)
-    assert_equal_fields(mine, distance_field(whole(), *box, unknown_is_occupied=True))
 
 
 def test_instances_keep_their_ids(client: MapClient) -> None:
@@ -288,18 +246,6 @@ def test_junk_is_answered_with_an_error(client: MapClient, raw: RawClient, parts
     kind, header = raw.ask(parts)
     assert kind == b"error" and msgpack.unpackb(header)["error"] == "CodecError"
     assert client.info().version == 14
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_every_mutated_question_is_answered(client: MapClient, raw: RawClient, data: st.DataObject) -> None:
-    parts = [bytearray(p) for p in data.draw(st.sampled_from(good_questions()))]
-    for _ in range(data.draw(st.integers(1, 3))):
-        part = data.draw(st.sampled_from(parts))
-        where = data.draw(st.integers(0, len(part)))
-        part[where : where + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=4))
-    kind = raw.ask([b"", *map(bytes, parts)])[0]
-    assert kind in {b"error", *(name.encode() for name in QUESTIONS)}
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -579,20 +525,3 @@ def test_the_first_question_waits_for_all_of_a_large_map(endpoint: str, monkeypa
         header = msgpack.unpackb(raw.socket.recv_multipart()[2])
         assert header["map"]["version"] == voxel_map.version and len(copies) > 1
         raw.socket.close()
-
-
-def test_where_the_mapper_is_busy_the_last_snapshot_answers_or_an_error(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(query_service, "CATCH_UP_S", 0.2)
-    monkeypatch.setattr(query_service, "LISTENED_S", 0.0)
-    voxel_map, places = small_map(LABELS), iter(poses(2))
-    integrate(voxel_map, next(places), 0)
-    with QueryService(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
-        for _ in range(2):
-            with pytest.raises(MapError, match="busy, or ending"):
-                client.info()
-        service.hand_over()  # as before its thread writes the map: somebody has asked
-        assert client.info().version == 1
-        integrate(voxel_map, next(places), 1)
-        assert client.info().version == 1
