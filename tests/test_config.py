@@ -91,19 +91,6 @@ def test_a_value_of_another_type_is_refused_by_its_path(data: dict[str, object],
         convert_config(data, MapperConfig, "mapper.toml")
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"absent\.toml: no such file"):
-        load_config(tmp_path / "absent.toml", MapperConfig)
-
-
-@pytest.mark.parametrize("content", [b"seed = ", b"\xff\xfe", b"[a]\n[a]\n"])
-def test_a_file_that_is_not_toml_is_named(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "mapper.toml"
-    path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"mapper\.toml: not valid TOML"):
-        load_config(path, MapperConfig)
-
-
 @pytest.mark.parametrize(
     ("section", "what"),
     [

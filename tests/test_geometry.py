@@ -20,7 +20,6 @@ from semantic_mapper.geometry import (
     scale_intrinsics,
     transform,
     unproject,
-    yaw_transform,
 )
 from semantic_mapper.rays import invert_pose_torch, pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics
@@ -54,11 +53,6 @@ def cameras(draw: st.DrawFn) -> CameraIntrinsics:
 
 
 # Shapes
-
-
-def test_expect_shape_returns_the_named_sizes() -> None:
-    assert expect_shape(torch.zeros(2, 3, 4, 5), "M 3 H W") == {"M": 2, "H": 4, "W": 5}
-    assert expect_shape(np.zeros((4, 4)), "N N") == {"N": 4}
 
 
 @pytest.mark.parametrize(
@@ -146,11 +140,6 @@ def test_unprojected_pixels_project_onto_themselves(camera: CameraIntrinsics, se
     np.testing.assert_allclose(pixels, pixel_grid(camera.width, camera.height).numpy(), atol=1e-6)
 
 
-def test_half_size_by_hand() -> None:
-    small = scale_intrinsics(CameraIntrinsics(100, 100, 31.5, 23.5, 64, 48), 32, 24)
-    assert (small.fx, small.fy, small.cx, small.cy) == (50, 50, 15.5, 11.5)  # the centre stays the centre
-
-
 @given(camera=cameras(), width=st.integers(1, 80), height=st.integers(1, 80))
 def test_scaled_intrinsics_see_the_same_corners_and_scale_back(
     camera: CameraIntrinsics, width: int, height: int
@@ -200,9 +189,3 @@ def test_a_position_that_float32_cannot_resolve_is_refused(far_m: float) -> None
     pose[1, 3] = far_m
     with pytest.raises(PoseError, match="nearer origin"):
         check_pose(pose, "frame 1")
-
-
-def test_a_yaw_turns_x_towards_y_before_it_shifts() -> None:
-    T = yaw_transform(np.array((1.0, 2.0, 3.0)), 90.0)
-    np.testing.assert_allclose(T @ (1, 0, 0, 1), (1, 3, 3, 1), atol=1e-12)
-    check_pose(T, "yaw")

@@ -95,15 +95,5 @@ def test_a_library_of_another_machine_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="other machines have one library")
-@pytest.mark.parametrize(("capability", "first"), [("default", "kernels-x86_64"), ("avx2", "kernels-x86_64-avx2")])
-def test_the_library_is_of_the_processor_that_torch_is_told_of(
-    capability: str, first: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ATEN_CPU_CAPABILITY", capability)
-    assert binding._variants()[0] == first
-    assert binding._variants()[-1] == "kernels-x86_64"
-
-
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="other machines have one library")
 def test_the_library_fits_the_processor_as_torch_sees_it() -> None:
     assert binding.has_avx2() == (torch.backends.cpu.get_cpu_capability() != "DEFAULT")

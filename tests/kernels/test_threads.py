@@ -118,13 +118,6 @@ def output(process: subprocess.Popen[str]) -> list[str]:
     return out.split()
 
 
-@pytest.mark.parametrize("wanted", [1, 2])
-def test_kernels_leave_torchs_thread_count_as_it_is(script: Path, wanted: int) -> None:
-    """OneDNN plans for one count and would run, and sometimes crash, with another."""
-    code = "import torch, kernels; kernels.run(); print(torch.get_num_threads())"
-    assert output(start(script, code, OMP_NUM_THREADS=str(wanted))) == [str(wanted)]
-
-
 @pytest.mark.parametrize(("wanted", "threads"), [("1", 1), ("3", 3), ("4,2", 4), ("", None), ("none", None)])
 def test_kernels_without_torch_use_the_threads_that_it_would_and_do_not_load_it(
     script: Path, wanted: str, threads: int | None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +14,13 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.map_types import InstanceLayer
-from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import snapshot as mirror_module
-from semantic_mapper.queries.nearest import at, nearest
+from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.queries.surface import cast_rays
 from tests.mapping.rendered_views import small_map
 from tests.mapping.storage.test_paging import MEMORY_MB, walk
-from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, whole_map
+from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -135,37 +132,6 @@ def test_damaged_changes_are_refused_and_leave_the_mirror_as_it_was() -> None:
     assert mirror.version == 0 and mirror.snapshot().block_count == 0
 
 
-def test_queries_see_whole_versions_while_another_thread_applies() -> None:
-    """Every version paints all of the surface in one class: an answer that mixes versions would show two."""
-    mirror = empty_mirror()
-    mirror.apply(painted(np.full((32, 32), FLOOR, np.uint8), 0, 1))
-    plans = {c: painted(np.full((32, 32), c, np.uint8), 0, 1) for c in (FLOOR, TABLE)}
-    stop, wrong, asked = threading.Event(), [], [0] * 3
-    places = np.stack(np.meshgrid(np.arange(32), np.arange(32), [3.3]), -1).reshape(-1, 3)[::7] * 0.02
-
-    def ask(who: int) -> None:
-        while not stop.is_set() or asked[who] < 5:
-            snapshot = mirror.snapshot()
-            want = FLOOR if snapshot.version % 2 else TABLE
-            label = at(snapshot, places).label
-            rays = cast_rays(snapshot, places + np.array([0, 0, 0.06]), (0.0, 0.0, -1.0)).label
-            other = nearest(snapshot, "table" if want == FLOOR else "floor", places[5])
-            if (label != want).any() or (rays != want).any() or other is not None:
-                wrong.append(snapshot.version)
-            asked[who] += 1
-
-    threads = [threading.Thread(target=ask, args=(n,)) for n in range(3)]
-    for thread in threads:
-        thread.start()
-    for version in range(2, 400):
-        plan: BlockChanges = plans[FLOOR if version % 2 else TABLE]
-        mirror.apply(dataclasses.replace(plan, since=version - 1, version=version))
-    stop.set()
-    for thread in threads:
-        thread.join()
-    assert not wrong and min(asked) >= 5
-
-
 def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path) -> None:
     voxel_map = VoxelMap(VoxelMapConfig(unknown_below=0.6), LABELS)
     for seq, pose in enumerate(poses(4)):
@@ -181,16 +147,6 @@ def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path) -> No
     assert [getattr(a, name) for name in names] == [getattr(b, name) for name in names]
     np.testing.assert_array_equal(a.versions, b.versions)
     assert a.instances is not None and (a.instances.packed == np.arange(5)).all() and loaded.is_whole
-
-
-def test_a_damaged_map_has_no_mirror(tmp_path: Path) -> None:
-    path = tmp_path / "map.npz"
-    whole_map().save(path)
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(MapError, match=r"map\.npz: chunk .*damaged"):
-        MapMirror.load(path)
 
 
 def test_a_mirror_needs_no_open3d() -> None:

@@ -36,15 +36,6 @@ def test_a_ray_meets_the_ball_where_geometry_says() -> None:
         assert hits.label[0] == CUP and hits.confidence[0] > 0.5
 
 
-def test_rays_that_go_too_short_or_nowhere_miss() -> None:
-    above = BALL + np.array([0, 0, 0.6])
-    assert cast_rays(whole(), above, (0, 0, -1), 0.38).distance_m[0] == 0
-    assert cast_rays(whole(), above, (0, 0, -1), 0.42).distance_m[0] > 0.38
-    up = cast_rays(whole(), above, (0, 0, 1))
-    assert (up.distance_m[0], up.label[0], up.confidence[0]) == (0, 0, 0)
-    assert len(cast_rays(whole(), np.empty((0, 3)), np.empty((0, 3))).label) == 0
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_hits_in_random_blocks_lie_on_a_zero_of_the_interpolated_field(seed: int) -> None:
     snapshot = random_map(seed)

@@ -252,28 +252,6 @@ def test_a_subscription_to_an_unknown_topic_or_address_is_refused(endpoint: str)
             NewestSubscriber(address, topics)
 
 
-def test_many_threads_may_publish_at_once(endpoint: str) -> None:
-    with Publisher(endpoint, policy="block") as publisher, LosslessSubscriber(endpoint, ["frame"]) as subscriber:
-        subscriber.wait_until_heard(WAIT_S)
-
-        def send(camera_id: str) -> None:
-            for seq in range(25):
-                publisher.publish(encode_frame(samples.make_frame(seq, camera_id=camera_id)))
-
-        threads = [threading.Thread(target=send, args=(f"camera{i}",)) for i in range(4)]
-        for thread in threads:
-            thread.start()
-        seen: dict[str, list[int]] = {}
-        for _ in range(100):
-            frame = subscriber.receive(WAIT_S)
-            assert isinstance(frame, PosedFrame)
-            seen.setdefault(frame.camera_id, []).append(frame.seq)
-        for thread in threads:
-            thread.join()
-    assert seen == {f"camera{i}": list(range(25)) for i in range(4)}
-    assert subscriber.rejected == 0
-
-
 def test_closed_sockets_say_so(endpoint: str) -> None:
     publisher = Publisher(endpoint)
     lossless, newest = LosslessSubscriber(endpoint, ["end"]), NewestSubscriber(endpoint, ["end"])
