@@ -10,7 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_scale import length_unit, scale_name
+from semantic_mapper.mapping.map_types import length_unit, scale_name
 from semantic_mapper.plain_text import counted
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
@@ -75,7 +75,7 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
 
 UP = (0.0, 0.0, 1.0)  # of the boxes of instances, where nothing else is given
 NO_FLOOR = "no floor was found: too little level surface, or another way is up (--up)"
-CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned"
+CONNECTED = "connected pieces of one class"
 
 
 def answer_instances(up: Sequence[float], instances: Sequence[Instance], separated_by: str = "") -> dict[str, Any]:

@@ -49,10 +49,10 @@ def read_corrections(path: Path) -> Trajectory:
     Raises:
         ImportSourceError: missing, empty, or with an invalid line.
     """
-    found = read_trajectory(path)
-    if found.left_out:  # a recording can do without a frame; who corrects poses wants all of them
-        raise ImportSourceError(f"{found.left_out[0]} ({len(found.left_out)} lines); fix or remove them")
-    return Trajectory(path, found.stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in found.rows]))
+    stamps_ns, rows, left_out = read_trajectory(path)
+    if left_out:  # a recording can do without a frame; who corrects poses wants all of them
+        raise ImportSourceError(f"{left_out[0]} ({len(left_out)} lines); fix or remove them")
+    return Trajectory(path, stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in rows]))
 
 
 def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
@@ -106,9 +106,9 @@ def correct_session(session: MapSession, trajectory: Trajectory) -> int:
         )
     if len(poses) < given:
         _log.warning("corrections_without_a_frame", left_out=given - len(poses), used=len(poses), frozen=frozen)
-    poses = session.odometry_sessions.in_map(poses, session.pipeline.corrector.world_by_frame())
-    session.pipeline.correct_poses(poses, until_ns=ALWAYS)  # the whole log was recorded in the old world
-    while session.pipeline.advance_correction(_PORTION):
+    poses = session.odometry_sessions.in_map(poses)
+    session.pipeline.corrector.start(poses, until_ns=ALWAYS)  # the whole log was recorded in the old world
+    while session.pipeline.corrector.advance(_PORTION):
         pass
     session.follow_correction()
     return len(poses)

@@ -11,8 +11,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError
-from semantic_mapper.mapping.map_types import CorrectedPoses, MapPoints
-from semantic_mapper.mapping.odometry_sessions import CameraPose
+from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses, MapPoints
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
@@ -191,7 +190,7 @@ class MapClient:
         The mapper begins it once, also where an answer is lost and the request is sent again.
 
         Args:
-            poses, until_ns: As of ``MappingPipeline.correct_poses``, but each pose in the world that its frame came in
+            poses, until_ns: As of ``MapCorrector.start``, but each pose in the world that its frame came in
                 (``PosedFrame.world``), not in the map's; at most 65536 at once.
             within_ns: Poses go to the frames nearest in time, if those are so near, and are left out where none is; 0 =
                 every pose must have the stamp of a frame.

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, MapError, NodeError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_scale import FIX
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.map_types import SCALE_FIX, MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
 from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.node import NodeContext
@@ -255,7 +254,7 @@ class _MapFollower:
             self._outlet.send_map(thinned(points), describe_map(snapshot, len(points.xyz), self.stamp_ns))
             self.sent["map"] += 1
         if requests["graph"] and not snapshot.scale_known:
-            self.no_graph = f"no graph: lengths of the map are not metres: {FIX}"
+            self.no_graph = f"no graph: lengths of the map are not metres: {SCALE_FIX}"
         elif self._is_new("graph", requests["graph"], snapshot):
             if self._graphs is None or self._graphs[0] is not mirror:  # of a mapper that was restarted
                 self._graphs = mirror, GraphTracker()

@@ -13,7 +13,7 @@ from semantic_mapper.nodes.cli.replay import show_replay
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.run_folder import prepare_folder
 
 
@@ -30,14 +30,13 @@ def demo(
     Example: semantic-mapper demo --out runs/demo
     """
     output = Output.guarded()
-    from semantic_mapper.replay.jobs import ReplayRequest, replay_log
+    from semantic_mapper.replay.jobs import replay_log
 
     began = time.monotonic()
     prepare_folder(out)
     with StopRequest() as stop:
-        request = ReplayRequest(demo_log(), out, weights, mapper.load())
         with frame_progress("map", None, stop=stop) as bar:
-            summary = replay_log(request, bar).summary
+            summary = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar).summary
         show_replay(output, summary, out)
         output.print(f"  {demo_log()}  (the log it was made from)")
         ended = "stopped after" if stop else "done in"

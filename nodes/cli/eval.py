@@ -106,20 +106,18 @@ def evaluate(
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
             output.print(f"{name}: {_surface_line(figures)}")
-    from semantic_mapper.replay.jobs import EvaluateRequest, evaluate_log
+    from semantic_mapper.replay.jobs import evaluate_log
 
     settings = mapper.load()
     baseline_s = (BASELINE_SECONDS if seconds is None else seconds) if baselines else 0.0
     tables: dict[str, Table] = {}
     for log in logs:
-        request = EvaluateRequest(log, weights, settings, max_frames, baseline_s, instances)
         with frame_progress("score", None) as bar:
-            scores = evaluate_log(request, bar).scores
+            more = {"baseline_s": baseline_s, "instances": instances, "monitor": bar}
+            scores = evaluate_log(log, weights, settings, max_frames, **more).plain()
         found["logs"][str(log)] = scores
         tables[str(log)] = score_table(log.name, scores)
         output.print(tables[str(log)])
-        for note in scores["notes"]:
-            output.print(note)
     write_json(path, found)
     write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)
     output.print(f"written to {path} and, for a browser, {page}")

@@ -129,9 +129,8 @@ def query(
 
     info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
-    things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
-    in which `refine` has separated things, those. graph: floors, their rooms, which part at doors, the doors between
-    them, and the same things with their rooms.
+    things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes. graph:
+    floors, their rooms, which part at doors, the doors between them, and the same things with their rooms.
 
     correct moves the map of a running mapper to corrected poses (TUM: stamp tx ty tz qx qy qz qw), such as after a
     loop closure. The mapper has to keep its frames (`history.max_frames` in its config). It goes on mapping, and
@@ -195,9 +194,9 @@ def ask_file(source: str, request: Request) -> dict[str, Any]:
             hit = nearest(snapshot, request.class_name, request.point, request.min_confidence)
             return map_answers.answer_nearest(request.class_name, request.point, hit)
         case Question.INSTANCES:
-            by = map_answers.CONNECTED if snapshot.instances is None else map_answers.LEARNED
             up = request.up or _find_up(snapshot)
-            return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot), by)
+            found = InstanceTracker(up=up).update(snapshot)
+            return map_answers.answer_instances(up, found, map_answers.CONNECTED)
         case _:  # the graph
             return _answer_graph(source, GraphTracker(request.up).update(snapshot), request.picture)
 

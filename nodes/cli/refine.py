@@ -62,10 +62,10 @@ def refine(
     path = map_path(source)
     refuse_overwriting(out, path)
     from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED, SMOOTHING
-    from semantic_mapper.replay.jobs import RefineRequest, refine_map
+    from semantic_mapper.replay.jobs import refine_map
 
     with frame_progress("refine", None, unit="tiles") as bar:
-        result = refine_map(RefineRequest(path, out, weights, fill, up, by_name), bar)
+        result = refine_map(path, out, weights, fill=fill, up=up, by_name=by_name, monitor=bar)
     report = result.report
     output.print(_table(report))
     if result.weights != SMOOTHED:
@@ -78,8 +78,6 @@ def refine(
         output.print(f"no weights ship for label set '{result.label_set}': the votes were smoothed")
     relabelled, filled = (100 * count / max(report.surface, 1) for count in (report.relabelled, report.filled))
     output.print(f"{out}: {relabelled:.1f} % of the surface relabelled, {filled:.1f} % filled")
-    if report.things is not None:
-        output.print(f"{report.things} separated pieces of things; `query {out} instances` leaves out the smallest")
     if json:
         output.json(asdict(report) | {"weights": result.weights, "out": str(out)})
 

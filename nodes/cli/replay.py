@@ -71,7 +71,7 @@ def replay(
     output = Output.guarded()
     output.quiet = json
     from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
-    from semantic_mapper.replay.jobs import OFFLINE, ReplayRequest, replay_log
+    from semantic_mapper.replay.jobs import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)
     if not is_log(source[0]):
@@ -85,12 +85,10 @@ def replay(
         source, weights = [log], weights or (None if with_depth else COMPUTED_DEPTH)
     elif film.given() or rotate != "0":
         raise typer.BadParameter("a log is mapped as it is; options of films go with films", param_hint="SOURCE")
-    request = ReplayRequest(
-        source[0], out, weights, config, max_frames, eval_exclude, rerun, corrections, tuple(source[1:])
-    )
+    more = {"exclude": eval_exclude, "rerun": rerun, "corrections": corrections}
     with StopRequest() as stop:
         with frame_progress("replay", None, stop=stop) as bar:
-            summary = replay_log(request, bar).summary
+            summary = replay_log(source, out, weights, config, max_frames, **more, monitor=bar).summary
         show_replay(output, summary, out)
         if json:
             output.json(summary)

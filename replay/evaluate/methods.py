@@ -14,9 +14,8 @@ from torch.nn import functional
 
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import FrameError, LabelError
-from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, confusion_of
+from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, Segments, confusion_of
 from semantic_mapper.evaluation.panoptic import PanopticImage
-from semantic_mapper.evaluation.segments import Segments
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
@@ -24,9 +23,8 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.evaluate.panoptic_truth import SEEN, PanopticTruth
+from semantic_mapper.replay.evaluate.things import SEEN, PanopticTruth, thing_image
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.replay.instance_images import thing_image
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import Float32, PosedFrame, UInt8
@@ -56,7 +54,7 @@ ThingTeller = Callable[[PosedFrame, UInt8], NDArray[np.uint16]]  # ids (H, W) of
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Metrics by method, and how many frames were scored, left out, and refused, or have pseudo labels.
+    """Metrics by method, and how many frames were scored, left out, and refused, have pseudo labels, or are damaged.
 
     In addition to the figures of ``SegmentationMetrics`` a method has ``ece``, ``sure`` (fraction of the pixels above a
     confidence of 0.9), ``sure_right`` (of those), and ``open_set_auroc`` where some labels are of classes that it
@@ -69,12 +67,13 @@ class Evaluation:
     excluded: int
     refused: int
     pseudo_labelled: int = 0
+    damaged: int = 0
+    weights: str = ""
     segments: Mapping[str, Segments] = field(default_factory=dict[str, Segments])  # by method, but for that of the map
 
     def plain(self) -> dict[str, Any]:
         """As plain data, without ``segments``."""
-        names = ("methods", "scored", "excluded", "refused", "pseudo_labelled")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in self.__slots__ if name != "segments"}
 
 
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
@@ -216,7 +215,7 @@ def evaluate_frames(
         methods[SEEN] = {**panoptic.score(voxel_map)}
         for name, figures in panoptic.score_methods().items():
             methods[name] |= figures
-    return Evaluation(methods, scored, excluded, refused, pseudo, segments)
+    return Evaluation(methods, scored, excluded, refused, pseudo, segments=segments)
 
 
 def _panoptic(tell: ThingTeller, frame: PosedFrame, opinion: Opinion) -> PanopticImage:
@@ -226,7 +225,7 @@ def _panoptic(tell: ThingTeller, frame: PosedFrame, opinion: Opinion) -> Panopti
 def _of_confidence(scores: ConfidenceScores) -> dict[str, float | None]:
     sure, right = scores.above(SURE)
     auroc = scores.open_set_auroc
-    return {"ece": scores.calibration.ece, "sure": sure, "sure_right": right, "open_set_auroc": auroc}
+    return {"ece": scores.calibration_error, "sure": sure, "sure_right": right, "open_set_auroc": auroc}
 
 
 def _with_current_view(config: MapperConfig, use: bool) -> MapperConfig:

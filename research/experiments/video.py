@@ -25,6 +25,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from research.plots import draw_paths
 from research.scenes.camera import camera_path
 from research.scenes.config import CameraPathConfig, NoiseConfig
 from research.scenes.render import render_view
@@ -32,9 +33,9 @@ from research.scenes.room import make_room
 from research.scenes.shots import sequence_shots
 from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import interpolate_pose, transform
-from semantic_mapper.plots import draw_paths, write_picture
+from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.importers import ImportOptions
-from semantic_mapper.replay.importers.folder import FolderRecording
+from semantic_mapper.replay.importers.folder import open_folder
 from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.reconstruct import PACKING, FilmOptions, import_film
@@ -58,7 +59,7 @@ class Walk:
 
 def recorded_walk(folder: Path) -> Walk:
     """The pictures of a sequence folder."""
-    recording = FolderRecording(folder, ImportOptions())
+    recording = open_folder(folder, ImportOptions())
     frames = [recording.load(n).frame for n in range(len(recording))]
     k = frames[0].intrinsics
     poses = np.stack([f.T_world_camera for f in frames])

@@ -1,22 +1,28 @@
-"""What a voxel map gives out: plain data, and which thing each voxel of a refined map belongs to."""
+"""What a map gives out, and whether its lengths are metres: plain data.
+
+A map of poses from pictures alone has a unit of its own (``VoxelMap.scale_known``). Snapshots, answers and files of it
+say so. What asks for metres, or states them, asks here first (``require_metres``); pictures, classes and counts go on.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.types import Bool, Float32, Float64, UInt8
 
-_COORDINATE_BITS, _HALF_RANGE = (
-    21,
-    1 << 20,
-)  # of a packed coordinate: blocks lie within +-2^17
 # By stamp_ns, or by (camera_id, stamp_ns) where cameras share stamps: T_world_camera (4, 4).
 CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
 ALWAYS = 2**63 - 1  # later than any stamp
+SCALE_FIX = (
+    "give a scale when the film or recording is imported (--distance, --square-mm, --camera-height or --scale), or to "
+    "visual odometry (scale, distance_m or camera_height_m), and map it again"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +57,29 @@ class CorrectionStatus:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CameraPose:
+    """Where a frame was taken.
+
+    Args:
+        camera_id, stamp_ns: Of the frame.
+        T_map_camera: (4, 4) float64; None while its place in the map is not known.
+        reason: Why it is not; empty otherwise.
+    """
+
+    camera_id: str
+    stamp_ns: int
+    T_map_camera: Float64 | None
+    reason: str = ""
+
+
+class PoseInMap:
+    """Where the last frame was taken, ``last``, for any thread; None before the first."""
+
+    def __init__(self) -> None:
+        self.last: CameraPose | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MapPoints:
     """N points of the fused surface.
 
@@ -72,15 +101,9 @@ class MapPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapMesh:
-    """The fused surface as V vertices and F triangles.
+    """The fused surface as V vertices (V, 3), float32 metres in the world, and F faces (F, 3), int32 vertex indices.
 
-    Args:
-        vertices: (V, 3) float32 metres in the world.
-        faces: (F, 3) int32 vertex indices.
-        rgb: (V, 3) uint8.
-        label: (V,) uint8 class ids, the ignore id where unknown; see ``MapPoints``.
-        confidence: (V,) float32, 0 where nothing voted.
-        measured: (V,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
+    The rest is that of the vertices, as of ``MapPoints``.
     """
 
     vertices: Float32
@@ -98,9 +121,7 @@ class MapView:
     Args:
         depth_m: (H, W) float32 z-depth, 0 where the ray meets no surface.
         rgb: (H, W, 3) uint8.
-        label: (H, W) uint8 class ids, the ignore id at misses and where unknown; see ``MapPoints``.
-        confidence: (H, W) float32, 0 at misses and where nothing voted.
-        measured: (H, W) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
+        label, confidence, measured: (H, W) as of ``MapPoints``; ignore id, 0 and False at misses.
     """
 
     depth_m: Float32
@@ -116,41 +137,36 @@ def computed_fraction(surface: MapPoints | MapMesh) -> float:
     return 0.0 if measured is None or not len(measured) else float(1 - measured.mean())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class InstanceLayer:
-    """Voxels that belong to things; others belong to none.
+def require_metres(scale_known: bool, what: str) -> None:
+    """Refuse what takes or gives metres where the map, or log, has none; ``what`` begins the error.
 
-    Args:
-        packed: (N,) int64 ascending, of ``pack_voxels``.
-        number: (N,) int32 from 0, the same for all voxels of a thing; those of a thing have one class.
+    Raises:
+        MapError: lengths are not metres.
     """
-
-    packed: NDArray[np.int64]
-    number: NDArray[np.int32]
-
-    def at(self, voxels: NDArray[np.integer]) -> NDArray[np.int64]:
-        """The things (M,) that voxels (M, 3) belong to; -1 = none."""
-        wanted = pack_voxels(voxels)
-        if not len(self.packed):
-            return np.full(len(wanted), -1, np.int64)
-        row = np.minimum(np.searchsorted(self.packed, wanted), len(self.packed) - 1)
-        return np.where(self.packed[row] == wanted, self.number[row], -1).astype(np.int64)
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether voxels ascend, and things count from 0."""
-        return bool((np.diff(self.packed) > 0).all()) and int(self.number.min(initial=0)) >= 0
+    if not scale_known:
+        raise MapError(f"{what}: needs metres, but the scale is unknown; {SCALE_FIX}")
 
 
-def instance_layer(voxels: NDArray[np.integer], number: NDArray[np.integer]) -> InstanceLayer:
-    """Of unique voxels (N, 3) and the things (N,) they belong to; -1 = none."""
-    kept = number >= 0
-    packed = pack_voxels(voxels[kept])
-    order = np.argsort(packed)
-    return InstanceLayer(packed[order], number[kept][order].astype(np.int32))
+def require_same_scale(one_known: bool, other_known: bool, what: str) -> None:
+    """Refuse what puts lengths of two maps side by side where only one of them is in metres.
+
+    Raises:
+        MapError: it is so.
+    """
+    if one_known != other_known:
+        raise MapError(f"{what}: one map is in metres, the scale of the other is unknown; {SCALE_FIX}")
 
 
-def pack_voxels(voxels: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Keys (N,) of voxel coordinates (N, 3) within +-2^20."""
-    shifted = voxels.astype(np.int64) + _HALF_RANGE
-    return (shifted[:, 0] << (2 * _COORDINATE_BITS)) | (shifted[:, 1] << _COORDINATE_BITS) | shifted[:, 2]
+def scale_name(scale_known: bool) -> Literal["metres", "unknown"]:
+    """What files and answers say."""
+    return "metres" if scale_known else "unknown"
+
+
+def voxel_size_text(size: float, scale_known: bool) -> str:
+    """Edge of a voxel, for people."""
+    return f"{size * 100:g} cm" if scale_known else f"{size:g} {length_unit(scale_known)}"
+
+
+def length_unit(scale_known: bool) -> str:
+    """Unit of lengths, for people."""
+    return "m" if scale_known else "units (scale unknown)"

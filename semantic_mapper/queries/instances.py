@@ -17,7 +17,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES
-from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
@@ -179,7 +179,7 @@ class InstanceTracker:
         wanted[list(snapshot.label_set.thing_ids(self._stuff))] = True
         with self._lock:
             voxels = thing_voxels(snapshot, wanted)
-            found = _find_things(snapshot, voxels, self._min_voxels)
+            found = find_components(voxels, self._min_voxels)
             sizes = np.diff(found.ends, prepend=0)
             ids = np.zeros(len(sizes), np.int64)
             if self._last:
@@ -260,16 +260,6 @@ class InstanceTracker:
             self._whole[thing.id] = self._going.get(thing.id) or _Whole(thing, snapshot.version, most)
 
 
-def _find_things(snapshot: MapSnapshot, voxels: ThingVoxels, min_voxels: int) -> Components:
-    """Connected pieces of one class; or, of a map that says itself which voxels belong to which thing, those things."""
-    if snapshot.instances is None:
-        return find_components(voxels, min_voxels)
-    keys = unpack_keys(voxels.packed[voxels.row]).astype(np.int64)
-    number = snapshot.instances.at(keys * 8 + _within(voxels.voxel))
-    # A thing has one class; a voxel that reads as another since it is too unsure of its own belongs to none.
-    return components_of(np.where(number >= 0, number * 256 + voxels.label, -1), min_voxels)
-
-
 def _within(voxel: Int32) -> Int32:
     """Coordinates (N, 3) in their blocks of voxels (N,)."""
     return np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
@@ -316,23 +306,9 @@ def find_components(voxels: ThingVoxels, min_voxels: int) -> Components:
     used = np.diff(voxels.start) > 0
     node, first = np.full((int(used.sum()), 512), -1, np.int32), np.empty(len(voxels.voxel), np.int64)
     connect_voxels(voxels.packed, voxels.start, voxels.voxel, voxels.label, np.cumsum(used) - 1, node, first)
-    return _kept(first, min_voxels)
-
-
-def components_of(number: NDArray[np.int64], min_voxels: int) -> Components:
-    """Surface voxels (N,) of the same number, whether they touch or not; -1 belongs to none."""
-    _, index, inverse = np.unique(number, return_index=True, return_inverse=True)
-    return _kept(index[inverse.reshape(-1)], min_voxels, number >= 0)
-
-
-def _kept(first: NDArray[np.int64], min_voxels: int, wanted: NDArray[np.bool_] | None = None) -> Components:
-    """The components that are large enough, given the first voxel (N,) of each voxel's; of ``wanted`` (N,) ones."""
-    count = len(first)
-    sizes = np.bincount(first, minlength=count)  # at the first voxel of each component
-    if wanted is not None:
-        sizes = sizes * wanted
+    sizes = np.bincount(first, minlength=len(first))  # at the first voxel of each component
     large = np.flatnonzero(sizes >= min_voxels)
-    number = np.full(count, -1, np.int64)
+    number = np.full(len(first), -1, np.int64)
     number[large] = np.arange(len(large))
     component = number[first]
     kept = np.flatnonzero(component >= 0)

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from semantic_mapper import errors
 from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_types import CorrectionStatus, MapPoints
-from semantic_mapper.mapping.odometry_sessions import CameraPose
+from semantic_mapper.mapping.map_types import CameraPose, CorrectionStatus, MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
@@ -335,7 +334,7 @@ class CorrectPosesRequest(Request[Correction], frozen=True, kw_only=True):
     about_map: ClassVar[bool] = False
     id: Word
     cameras: Annotated[tuple[Word, ...], Meta(min_length=1, max_length=256)]  # ("",) = whichever took the frame
-    until_ns: Stamp | None = None  # see ``MappingPipeline.correct_poses``
+    until_ns: Stamp | None = None  # see ``MapCorrector.start``
     within_ns: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 0  # how far from a stamp its frame may be
     stamps_ns: Int64  # (N,)
     camera: UInt8  # (N,) index of ``cameras``

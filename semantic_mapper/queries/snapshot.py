@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import (
     KEY_LIMIT,
     BlockIndex,
@@ -84,7 +83,6 @@ class MapSnapshot:
         index: The same as a table for compiled code.
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
         scale_known: Whether lengths are metres.
-        instances: Which voxels belong to which thing; None = not known.
         cleared: Which blocks lost surface that frames saw through, and when; the latest.
         moving: (M, 3) int64 voxels where something moves that is left out of the map; see ``with_moving``.
     """
@@ -101,7 +99,6 @@ class MapSnapshot:
     index: BlockIndex
     voxels: BlockVoxels
     scale_known: bool = True
-    instances: InstanceLayer | None = None
     cleared: ClearedBlocks = NONE_CLEARED
     moving: Int64 = field(default_factory=lambda: np.empty((0, 3), np.int64))
 
@@ -194,7 +191,7 @@ class MapMirror:
     def of(cls, voxel_map: VoxelMap) -> MapMirror:
         """Mirror of a live or loaded map as it is now; further ``changes`` since its version may be applied."""
         mirror = cls(voxel_map.config.voxel_size_m, voxel_map.config.truncation_voxels, voxel_map.label_set)
-        mirror.apply(voxel_map.changes(0), voxel_map.instances)
+        mirror.apply(voxel_map.changes(0))
         return mirror
 
     @classmethod
@@ -207,7 +204,7 @@ class MapMirror:
         with open_map(path) as reader:
             config = reader.manifest.config
             mirror = cls(config.voxel_size_m, config.truncation_voxels, reader.manifest.label_set)
-            mirror.apply(reader.changes(), reader.instances())
+            mirror.apply(reader.changes())
         return mirror
 
     @property
@@ -224,8 +221,8 @@ class MapMirror:
         """The present state; stays as it is whatever is applied later."""
         return self._snapshot
 
-    def apply(self, changes: BlockChanges, instances: InstanceLayer | None = None) -> MapSnapshot:
-        """Take over changes and return the present state, with the ``instances`` of the map as it is then.
+    def apply(self, changes: BlockChanges) -> MapSnapshot:
+        """Take over changes and return the present state.
 
         After a new epoch, that is the last one of the old epoch until changes have come up to the map's newest version.
 
@@ -266,7 +263,6 @@ class MapMirror:
                 index=index,
                 voxels=pool,
                 scale_known=changes.scale_known,
-                instances=instances,
                 cleared=old.cleared.followed_by(changes.cleared.between(old.version, changes.version)),
             )
             if changes.epoch == self._snapshot.epoch or changes.version >= changes.newest:

@@ -5,8 +5,7 @@ measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise
 thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far
 as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth edges and grazing views are
 safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). A pixel without depth,
-or farther than ``depth_max``, clears nothing: black and shiny things return nothing. (``clear_without_return`` is for
-sensors that return something wherever there is something.) Nor does a pixel as near to the
+or farther than ``depth_max``, clears nothing: black and shiny things return nothing. Nor does a pixel as near to the
 edge of the image as a pose may be off, nor computed or rendered depth: where pictures are matched wrongly, that lies
 far behind, frame after frame.
 
@@ -28,7 +27,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.kernels import kernel, parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
@@ -47,21 +45,13 @@ _LEVELS = 6  # squares of up to 64 cells a side
 
 
 class FusionLimits(NamedTuple):
-    """Lengths in metres, and the caps.
-
-    Args:
-        voxel_size: Edge of a voxel.
-        truncation: TSDF truncation.
-        depth_max: Farther depth is ignored.
-        vote_band: Voxels at most this far from the surface take votes.
-        max_weight: Cap of TSDF weight and of votes; beyond it old measurements fade.
-    """
+    """Lengths in metres, and the caps."""
 
     voxel_size: float
-    truncation: float
-    depth_max: float
-    vote_band: float
-    max_weight: float
+    truncation: float  # of the TSDF
+    depth_max: float  # farther depth is ignored
+    vote_band: float  # voxels at most this far from the surface take votes
+    max_weight: float  # cap of TSDF weight and of votes; beyond it old measurements fade
 
 
 class DepthBounds(NamedTuple):
@@ -103,7 +93,7 @@ def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BO
 
 def clear_in_view(
     grid: BlockGrid,
-    band: NDArray[np.int64],
+    band: Int64,
     camera: Camera,
     limits: FusionLimits,
     depth: Float32,
@@ -116,10 +106,8 @@ def clear_in_view(
     Args:
         grid: The map's storage. Blocks on disk come back where the frame may see through them.
         band: (B,) sorted packed keys of the blocks that the frame was fused into.
-        camera: Of the frame.
-        limits: Of the map.
-        depth: (H, W) float32 metres, from a sensor.
-        rgb: (H, W, 3) uint8.
+        camera, limits: Of the frame and the map.
+        depth, rgb: (H, W) float32 metres, from a sensor, and (H, W, 3) uint8.
         bounds: Of ``depth``.
         version: Of the map, for the blocks that change.
 
@@ -141,25 +129,7 @@ def clear_in_view(
             yield changing, cleared
 
 
-def clear_without_return(
-    grid: BlockGrid, camera: Camera, limits: FusionLimits, depth: Float32, rgb: UInt8, range_m: float, version: int
-) -> Iterator[tuple[Int64, Int64]]:
-    """As ``clear_in_view``, but what pixels without depth see through, up to ``range_m``; in all blocks.
-
-    A frame without any depth clears nothing: its sensor has failed.
-    """
-    empty = ~(depth > 0)  # NaN, too
-    if empty.all() or not empty.any():
-        return
-    bounds = depth_bounds(np.where(empty, np.float32(range_m), depth), np.inf)
-    free = np.where(empty, np.float32(range_m), np.float32(0))
-    reach, no_band = limits._replace(depth_max=range_m), np.empty(0, np.int64)
-    yield from clear_in_view(grid, no_band, camera, reach, free, rgb, bounds, version)
-
-
-def _candidates(
-    grid: BlockGrid, band: NDArray[np.int64], camera: Camera, limits: FusionLimits, bounds: DepthBounds
-) -> NDArray[np.int64]:
+def _candidates(grid: BlockGrid, band: Int64, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> Int64:
     """Packed keys (B,), sorted, of blocks outside of the band that hold a surface, in front of some depth."""
     considered = grid.may_hold_surface()
     inside = find_blocks(grid.index, band)
@@ -175,16 +145,14 @@ def _candidates(
     return np.sort(np.concatenate((pack_keys(keys[slots]), stored[before > 0])))
 
 
-def _before_depth(
-    keys: NDArray[np.int32], considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds
-) -> UInt8:
+def _before_depth(keys: Int32, considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> UInt8:
     found = np.empty(len(keys), np.uint8)
     _blocks_before_depth(len(keys), keys, considered, camera, limits.voxel_size, bounds, found)
     return found
 
 
 def _clear(
-    blocks: NDArray[np.int32],
+    blocks: Int32,
     buffers: GridBuffers,
     camera: Camera,
     limits: FusionLimits,

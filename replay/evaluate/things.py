@@ -1,0 +1,254 @@
+"""Things of a map and of other methods against frames whose objects are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from semantic_mapper.errors import LabelError, LogError
+from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
+from semantic_mapper.fields.scene.panoptic import Panoptic
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.imaging import resize_label, working_intrinsics
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapView
+from semantic_mapper.mapping.storage.block_index import pack_keys
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.rays import pixel_grid, pixel_rays
+from semantic_mapper.replay.evaluate.truth import TRUTH_WIDTH
+from semantic_mapper.replay.importers.base import BadFrameError, read_plane
+from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
+
+RAYS = 4096  # rendered at once
+AT_SURFACE = 2.0  # voxels that a pixel of the map's surface is from a surface voxel at most
+SEEN = "map seen from frames"  # the method whose figures are those of the finished map, cast into its frames
+MAX_FRAMES = 100  # that are kept; beyond that every second one goes
+
+
+class InstanceFolder:
+    """Images of object numbers of a log's frames: ``NNNNNN.png`` or ``CAMERA/NNNNNN.png``, uint8 or uint16, 0 = none.
+
+    NNNNNN is the number of the frame in the log, from 0.
+
+    Args:
+        path: Of the folder.
+        log: Whose frames they are of.
+
+    Raises:
+        LabelError: it holds none.
+    """
+
+    def __init__(self, path: Path, log: Log) -> None:
+        self.path = path
+        parts = enumerate(log.frame_parts())
+        self._number = {(envelope.source, envelope.stamp_ns): number for number, (envelope, _) in parts}
+        if not any(path.glob("*.png")) and not any(path.glob("*/*.png")):
+            raise LabelError(
+                f"{path}: has no images of objects; they are called by the number of their frame in the log, 000012.png"
+            )
+
+    def read(self, frame: PosedFrame) -> NDArray[np.integer[Any]] | None:
+        """Object numbers (H, W) of a frame; None where there is no image of it.
+
+        Raises:
+            LogError: it is damaged, or of another size.
+        """
+        name = f"{self._number[frame.camera_id, frame.stamp_ns]:06d}.png"
+        file = next((f for f in (self.path / frame.camera_id / name, self.path / name) if f.exists()), None)
+        if file is None:
+            return None
+        try:
+            return read_plane(file, "any", (frame.intrinsics.height, frame.intrinsics.width), "instance")
+        except BadFrameError as error:
+            raise LogError(str(error)) from error
+
+
+class ThingSurface:
+    """The N surface voxels of a map as it is now.
+
+    Args:
+        voxel_map: Whose.
+        up: As of ``InstanceTracker``.
+
+    Attributes:
+        xyz: (N, 3) float64 surface points, world metres.
+        number: (N,) which of ``things`` each belongs to; -1 = none.
+        things: As queries find them.
+
+    Raises:
+        MapError: lengths of the map are not metres.
+    """
+
+    def __init__(self, voxel_map: VoxelMap, *, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
+        snapshot = MapMirror.of(voxel_map).snapshot()
+        every = surface_voxels(snapshot)
+        keys = (every.row.astype(np.int64) << 9) | every.voxel  # ascending
+        self.things = InstanceTracker(up=up).update(snapshot)
+        self.number: NDArray[np.int64] = np.full(len(keys), -1, np.int64)
+        for index, thing in enumerate(self.things):
+            block = np.searchsorted(snapshot.packed, pack_keys(thing.voxels >> 3))
+            x, y, z = (thing.voxels & 7).T
+            self.number[np.searchsorted(keys, (block << 9) | (z * 64 + y * 8 + x))] = index
+        self.xyz: Float64 = every.point * snapshot.voxel_size_m
+        self._reach_m = AT_SURFACE * snapshot.voxel_size_m
+        self._label_set = voxel_map.label_set
+        self._tree: Any = None
+
+    def panoptic(self, cast: MapView, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> PanopticImage:
+        """Classes and things that a view of the map shows.
+
+        Args:
+            cast: What ``ray_cast`` returns for the pose and the intrinsics.
+            T_world_camera: (4, 4) float64.
+            intrinsics: Of the view.
+
+        Returns:
+            Class ids (H, W), those of the view but where there is a thing; and numbers of things from 1, 0 = none.
+        """
+        label, instance = cast.label.copy(), np.zeros(cast.label.shape, np.int64)
+        hit = cast.depth_m > 0
+        if self.things and hit.any():
+            at = transform(T_world_camera, unproject(cast.depth_m, intrinsics)[hit])
+            _, near = self._nearest().query(at, distance_upper_bound=self._reach_m)
+            number = np.append(self.number, -1)[near]
+            class_of = np.array([thing.class_id for thing in self.things], np.uint8)
+            instance[hit] = number + 1
+            label[hit] = np.where(number >= 0, class_of[number], label[hit])
+        return PanopticImage(label, instance)
+
+    def _nearest(self) -> Any:
+        if self._tree is None:
+            from scipy.spatial import KDTree
+
+            self._tree = KDTree(self.xyz)
+        return self._tree
+
+
+class _View(NamedTuple):
+    T_world_camera: Float64
+    intrinsics: CameraIntrinsics
+    truth: PanopticImage
+    found: Mapping[str, PanopticImage]
+
+
+class PanopticTruth:
+    """True classes and objects of some frames.
+
+    Args:
+        folder: Has the objects.
+        stream_labels: Of the frames. Segments that are found of other classes are as if nothing had been found.
+        label_set: Of the map, and of the true classes that are added.
+    """
+
+    def __init__(self, folder: InstanceFolder, stream_labels: LabelSet, label_set: LabelSet) -> None:
+        self._folder = folder
+        self._label_set = label_set
+        shared = [i for i, name in zip(label_set.ids, label_set.names, strict=True) if name in stream_labels.names]
+        self._shared = np.full(256, label_set.ignore_id, np.uint8)
+        self._shared[shared] = shared
+        self._views: list[_View] = []
+        self._stride = 1
+        self._seen = 0
+
+    def add(self, frame: PosedFrame, truth: UInt8, found: Mapping[str, Callable[[], PanopticImage]] = {}) -> None:
+        """Remember a frame whose objects are known, at reduced size.
+
+        Args:
+            frame: Of the log.
+            truth: (H, W) ids of the map.
+            found: By method, what it says of the frame (H, W), ids of the map; called where objects are known.
+
+        Raises:
+            LogError: see ``InstanceFolder.read``.
+        """
+        instance = self._folder.read(frame) if self._seen % self._stride == 0 else None
+        self._seen += 1
+        if instance is None:
+            return
+        k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
+        said = {name: _resized(ask(), k) for name, ask in found.items()}
+        self._views.append(_View(frame.T_world_camera, k, _resized(PanopticImage(truth, instance), k), said))
+        if len(self._views) > MAX_FRAMES:
+            self._views = self._views[::2]
+            self._stride *= 2
+
+    def score_methods(self) -> Mapping[str, Mapping[str, Any]]:
+        """The figures of ``PanopticMetrics`` by method of ``add``, of the frames that ``score`` looks at.
+
+        Raises:
+            LabelError: no frame was added.
+        """
+        views = self._known_views()
+        counts = {name: PanopticCounts(self._label_set) for name in views[0].found}
+        for view in views:
+            for name, found in view.found.items():
+                counts[name].update(view.truth, self._of_shared(found), name)
+        return {name: _figures(of) | {"panoptic_frames": len(views)} for name, of in counts.items()}
+
+    def score(self, voxel_map: VoxelMap) -> Mapping[str, Any]:
+        """The figures of ``SegmentationMetrics`` and of ``PanopticMetrics``, whose classes are ``pq_per_class``.
+
+        Raises:
+            LabelError: no frame was added.
+            MapError: lengths of the map are not metres.
+        """
+        views = self._known_views()
+        things = ThingSurface(voxel_map)
+        matrix, counts = ConfusionMatrix(self._label_set), PanopticCounts(self._label_set)
+        for view in views:
+            cast = voxel_map.ray_cast(view.T_world_camera, view.intrinsics)
+            found = things.panoptic(cast, view.T_world_camera, view.intrinsics)
+            matrix.update(view.truth.label, found.label, SEEN)
+            counts.update(view.truth, self._of_shared(found), SEEN)
+        return asdict(matrix.metrics()) | _figures(counts) | {"panoptic_frames": len(views)}
+
+    def _known_views(self) -> list[_View]:
+        if not self._views:
+            raise LabelError(f"{self._folder.path}: has no image of any frame that is scored")
+        return self._views
+
+    def _of_shared(self, found: PanopticImage) -> PanopticImage:
+        return found._replace(label=self._shared[found.label])
+
+
+def _resized(image: PanopticImage, intrinsics: CameraIntrinsics) -> PanopticImage:
+    size = (intrinsics.width, intrinsics.height)
+    instance = cv2.resize(np.asarray(image.instance, np.uint16), size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return PanopticImage(resize_label(image.label, intrinsics), np.asarray(instance, np.uint16))
+
+
+def _figures(counts: PanopticCounts) -> dict[str, Any]:
+    figures = asdict(counts.metrics())
+    figures["pq_per_class"] = figures.pop("per_class")
+    return figures
+
+
+def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> NDArray[np.uint16]:
+    """Ids (H, W) of the boxes of things that a frame sees, where its ``label`` (H, W) has their class."""
+    channel = field.label_set.to_channels(label, f"frame seq={frame.seq}").ravel()
+    names = field.label_set.names
+    boxed = [names.index(b.class_name) for b in field.shape.boxes if b.thing]
+    requested = torch.from_numpy(np.flatnonzero(np.isin(channel, boxed)))
+    k, found = frame.intrinsics, np.zeros(label.size, np.uint16)
+    depth = np.zeros(label.size, np.float32) if frame.depth_m is None else frame.depth_m.ravel()
+    pose = torch.from_numpy(frame.T_world_camera).float()
+    pixels, near_m = pixel_grid(k.width, k.height), field.sampling.near_m
+    with torch.no_grad():
+        for part in requested.split(RAYS):
+            prior = torch.from_numpy(depth[part.numpy()])
+            at = {"near_m": near_m, "far_m": field.sampling.far_m, "stamp_ns": frame.stamp_ns}
+            rays = pixel_rays(pixels[part], k, pose, **at, prior_depth_m=prior)
+            found[part.numpy()] = field.instances(rays, torch.from_numpy(channel[part.numpy()])).numpy()
+    return found.reshape(label.shape)

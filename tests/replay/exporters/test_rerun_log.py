@@ -1,0 +1,61 @@
+"""What Rerun shows: from where a map is looked at first, what moves, and the way of a camera that runs for days."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from semantic_mapper.replay.exporters.base import MAX_PATH, CameraPath
+from semantic_mapper.replay.exporters.rerun_log import eye_on, moving_points
+from semantic_mapper.types import CameraIntrinsics, MapUpdate
+
+SIZE = np.array((5.0, 4.0, 2.6))
+
+
+def room(*, ceiling: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Floor and table, and walls with or without a ceiling, of a room that stands on z = 0."""
+    rng = np.random.default_rng(0)
+
+    def plane(axis: int, value: float) -> np.ndarray:
+        points = rng.random((15_000, 3)) * SIZE
+        points[:, axis] = value
+        return points
+
+    table = rng.random((4000, 3)) * (1.2, 0.8, 0.7) + (2.0, 1.5, 0.0)
+    walls = [plane(axis, value) for axis in (0, 1) for value in (0.0, SIZE[axis])]
+    return np.concatenate((plane(2, 0.0), table)), np.concatenate(walls + ([plane(2, SIZE[2])] if ceiling else []))
+
+
+@pytest.mark.parametrize("ceiling", [False, True])
+def test_the_first_look_is_into_the_room_not_onto_a_wall(ceiling: bool) -> None:
+    inside, around = room(ceiling=ceiling)
+    xyz = np.concatenate((inside, around))
+    eye = eye_on(xyz.astype(np.float32), np.array((0.0, 0.0, 1.0)))
+    assert np.allclose(eye.up, (0, 0, 1), atol=0.05)
+    within = bool(((eye.position > 0) & (eye.position < SIZE)).all())
+    assert within == ceiling, "a closed room is looked at from inside"
+    assert eye.target[2] < eye.position[2] and ((eye.target > 0) & (eye.target < SIZE)).all(), "it looks down into it"
+
+
+def test_what_moves_is_shown_where_it_was_seen() -> None:
+    k = CameraIntrinsics(40.0, 50.0, 15.5, 11.5, 32, 24)
+    shape, moving = (24, 32), np.zeros((24, 32), np.bool_)
+    moving[8, 16] = moving[9, 17] = True  # of every fourth pixel, the first one is among them
+    update = MapUpdate(1, 1, "c", True, False, (), np.zeros(shape, np.uint8), np.ones(shape, np.float32),
+                       np.full(shape, 2.0, np.float32), 0, 0, moving=moving)  # fmt: skip
+    positions = moving_points(update, k).positions
+    assert positions is not None
+    np.testing.assert_allclose(positions.as_arrow_array().to_pylist(), [(0.5 / 40 * 2, -3.5 / 50 * 2, 2.0)], rtol=1e-5)
+    assert not moving_points(dataclasses.replace(update, moving=None), k).positions.as_arrow_array().to_pylist()
+
+
+def test_the_path_of_a_camera_stays_bounded_and_even() -> None:
+    path = CameraPath()
+    for number in range(3 * MAX_PATH):
+        T = np.eye(4)
+        T[0, 3] = number
+        path.add(T)
+    kept = [T[0, 3] for T in path.poses]
+    assert len(kept) <= MAX_PATH and set(np.diff(kept)) == {4.0} and kept[0] == 0
