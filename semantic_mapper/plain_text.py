@@ -47,7 +47,7 @@ def plain_without_secrets(value: Any) -> Any:
 
 
 def user_length(scheme: str, rest: str) -> int:
-    """Letters up to and including the @ of user information; 0 = there is none.
+    """Letters up to and including the @ of user information; 0 = no user information.
 
     Args:
         scheme: Before ``://``; empty for paths.

@@ -430,7 +430,7 @@ def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
 
 
 def _with_images(parts: Parts, packed: _Packed, *, without: str = "", **fields: Any) -> list[bytes]:
-    """A frame with some other images and fields, and without one image that is not given anew."""
+    """A frame with some other images and fields, and without one image that is not given again."""
     header, buffers = _open_as(FrameHeader, parts)
     specs = _specs(header)
     images: _Packed = {name: (specs[name], bytes(data)) for name, data in zip(specs, buffers, strict=True)}
