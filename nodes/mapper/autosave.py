@@ -9,7 +9,7 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.status import PartStatus
 

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.evaluation.panoptic import PanopticImage
 from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.mapping.map_types import MapView
-from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.queries.instances import InstanceTracker

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, make_block_index, pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
-from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, KEY_LIMIT, make_block_index, pack_keys, unpack_keys
+from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.queries.snapshot import COMPUTED, MEASURED, BlockVoxels, MapSnapshot
 from semantic_mapper.queries.surface import NEAREST_STEPS
 from semantic_mapper.types import UInt8

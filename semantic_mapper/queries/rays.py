@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.storage.block_index import BlockIndex
+from semantic_mapper.mapping.blocks import BlockIndex
 from semantic_mapper.queries.checks import (
     as_numbers,
     check_direction,

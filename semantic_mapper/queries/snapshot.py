@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
-from semantic_mapper.mapping.storage.changes import (
+from semantic_mapper.mapping.blocks import BlockIndex, unpack_keys
+from semantic_mapper.mapping.changes import (
     CONFIDENCE_STEPS,
     NONE_CLEARED,
     TSDF_STEPS,

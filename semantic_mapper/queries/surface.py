@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.blocks import BlockIndex
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.checks import check_box, rows_in_box
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8

@@ -36,8 +36,8 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, MapPoints
-from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli

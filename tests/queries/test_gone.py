@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.mapping.storage import changes
-from semantic_mapper.mapping.storage.block_index import pack_keys
-from semantic_mapper.mapping.storage.changes import NONE_CLEARED, ClearedBlocks
+from semantic_mapper.mapping import changes
+from semantic_mapper.mapping.blocks import pack_keys
+from semantic_mapper.mapping.changes import NONE_CLEARED, ClearedBlocks
 from semantic_mapper.queries import instances
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror

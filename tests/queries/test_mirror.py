@@ -16,8 +16,8 @@ import pytest
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS
-from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.mapping.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import mirror as mirror_module
 from semantic_mapper.queries.mirror import MapMirror
@@ -25,7 +25,7 @@ from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
 from tests.mapping.rendered_views import frame, small_map
-from tests.mapping.storage.test_paging import MEMORY_MB, walk
+from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.queries.random_map import random_map
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, seen, whole_map
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError, WeightsError
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.queries.nearest import PointAnswers
 from semantic_mapper.queries.questions import AtRequest, InstanceArrays, decode_question
 from semantic_mapper.transport.query_messages import (
