@@ -283,8 +283,6 @@ class PolledCamera(Camera):
                     self._connected = True
                 except CameraError as error:
                     self._warn_of_device(f"{source} is away: {error}")
-                else:
-                    self._check_after_return()
 
     def _connect(self, *, again: bool) -> None:
         """Open the device, start it, and set ``_info``; ``again``: it was away, and is looked for once.
@@ -309,9 +307,6 @@ class PolledCamera(Camera):
     def _warn_of_device(self, text: str) -> None:
         """Keep it for ``warnings``, until an image comes."""
         raise NotImplementedError
-
-    def _check_after_return(self) -> None:
-        """Raise ``CameraError`` where the camera must not continue after its device was away."""
 
 
 def nominal_hz(reported: float) -> float:

@@ -122,8 +122,7 @@ class VideoFile(Camera):
                 self._stopping.wait(max(0.0, began + since_ns / 1e9 - time.monotonic()))
             if self._stopping.is_set():
                 return
-            stamp_ns = self._config.start_ns + since_ns
-            yield CameraImage(stamp_ns, seq, self._camera_id, self._rectify(bgr), None, self._rectify.intrinsics)
+            yield CameraImage(since_ns, seq, self._camera_id, self._rectify(bgr), None, self._rectify.intrinsics)
         expected = self.info.frame_count or 0
         if seq + 1 < expected - 1:  # some containers count one too many
             _log.warning("video_ended_early", file=self._config.source, images=seq + 1, expected=expected)

@@ -6,7 +6,6 @@ from datetime import timedelta
 from pathlib import Path
 
 import depthai as dai
-import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -94,23 +93,6 @@ def test_images_do_not_wait_for_ever(calibration: Path, monkeypatch: pytest.Monk
     assert not with_pose(images)
 
 
-def test_after_a_reconnection_poses_are_withheld(calibration: Path) -> None:
-    def connect(count: int, ends: bool) -> Sources:
-        return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
-
-    config = msgspec.structs.replace(WAITS, on_tracking_reset="no-poses")
-    camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=config)
-    before: list[CameraImage] = []
-    with camera:
-        for image in camera:
-            if any("began again" in trouble for trouble in camera.warnings):
-                break
-            before.append(image)
-        after = [image, *itertools.islice(camera, 20)]
-    assert with_pose(before) and not with_pose(after)
-    assert after[0].seq > before[-1].seq + 1
-
-
 def test_after_a_reconnection_poses_are_of_another_world(calibration: Path) -> None:
     def connect(count: int, ends: bool) -> Sources:
         return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
@@ -120,16 +102,6 @@ def test_after_a_reconnection_poses_are_of_another_world(calibration: Path) -> N
         images = with_pose(list(itertools.islice(camera, 70)))
     worlds = [image.own_pose.world for image in images if image.own_pose is not None]
     assert len(set(worlds)) == 2 and worlds == sorted(worlds) and min(worlds) > 0
-
-
-def test_a_reconnection_ends_the_camera_where_that_is_asked_for(calibration: Path) -> None:
-    def connect(count: int, ends: bool) -> Sources:
-        return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
-
-    config = msgspec.structs.replace(WAITS, on_tracking_reset="exit")
-    camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=config)
-    with camera, pytest.raises(CameraError, match="was away, and its odometry began again"):
-        list(itertools.islice(camera, 80))
 
 
 def test_a_lost_track_is_told(calibration: Path) -> None:
