@@ -29,17 +29,16 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from semantic_mapper.config import AtLeastOne, Config, convert_config, to_plain
+from semantic_mapper.config import AtLeastOne, Config, convert_config
 from semantic_mapper.errors import SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import (
-    FORMAT,
     MAP_KIND,
-    VERSION,
+    describe,
     find_checkpoint,
-    label_set_from_plain,
-    label_set_to_plain,
+    load_tensors,
     open_weights,
     save_tensors,
+    unpack_label_set,
 )
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
@@ -463,15 +462,9 @@ def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:
     """Write weights as float16, whole or not at all."""
-    metadata = {
-        "format": FORMAT,
-        "version": str(VERSION),
-        "field": MAP_KIND,
-        "label_set": json.dumps(label_set_to_plain(weights.model.label_set)),
-        "model_config": json.dumps(to_plain(weights.model.config)),
-        "recipe": json.dumps(weights.recipe),
-    }
-    tensors = {name: t.detach().half().contiguous() for name, t in weights.model.state_dict().items()}
+    model = weights.model
+    metadata = describe(MAP_KIND, model.config, model.label_set, weights.recipe)
+    tensors = {name: t.detach().half().contiguous() for name, t in model.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     save_tensors(tensors, path, metadata)
 
@@ -491,14 +484,12 @@ def load_nesf(path: Path) -> NesfWeights:
             f"of kind '{MAP_KIND}', from `semantic-mapper-research train --kind {MAP_KIND}`"
         )
     try:
-        label_set = label_set_from_plain(json.loads(metadata["label_set"]))
+        label_set = unpack_label_set(metadata["label_set"])
         config = convert_config(json.loads(metadata["model_config"]), NesfConfig, str(path))
         recipe = dict(json.loads(metadata["recipe"]))
         model = Nesf(label_set, config)
-        model.load_state_dict({name: t.float() for name, t in tensors.items()})
-    except (KeyError, TypeError, ValueError, RuntimeError, SemanticMapperError) as error:
+    except (KeyError, TypeError, ValueError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:300]
         raise WeightsError(f"{path}: damaged: {type(error).__name__}: {reason}") from error
-    if not all(bool(torch.isfinite(t).all()) for t in model.state_dict().values()):
-        raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
+    load_tensors(model, tensors, path)
     return NesfWeights(model.eval(), recipe, hashlib.sha256(path.read_bytes()).hexdigest())

@@ -20,9 +20,9 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import Budget
-from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_fit import distance_to_surface, fit_grid, grid_of_depth, held_out_psnr, render_frame
 from semantic_mapper.training.scene_box import scene_box, sparse_points
+from semantic_mapper.training.views import frame_rays
 from semantic_mapper.types import PosedFrame
 from tests.small import tiny_frames
 from tests.training.two_planes import BOX_M, two_planes

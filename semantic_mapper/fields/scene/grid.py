@@ -45,6 +45,7 @@ NOTHING = -10.0  # raw density of what is empty: an opacity of 5e-8
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 4, 2
 COLOUR_WIDTH = 64
 FEATURE_START = 0.1  # standard deviation
+LEAST_SLOPE = 1e-6  # of a ray along an axis
 OPAQUE = 0.5  # opacity from which on a ray has met something
 
 
@@ -53,10 +54,7 @@ class SceneGrid(nn.Module):
 
     ``values`` (X, Y, Z, 4) holds raw density, red, green and blue; ``occupied`` tells which cells rays may skip;
     ``sky`` (16, 32, 3) are raw colours by direction, for rays that leave the box. They are parameters without
-    gradients: fits that want some ask for them.
-
-    Args:
-        config: The box. All axes are the world's.
+    gradients: fits that want some ask for them. All axes are the world's.
     """
 
     occupied: torch.Tensor
@@ -81,6 +79,14 @@ class SceneGrid(nn.Module):
         middle = torch.full_like(rays.near_m, 0.5) if jitter is None else jitter
         direction = rays.direction / self.config.voxel_m
         return GridRays(origin, direction, rays.near_m, torch.full_like(rays.far_m, math.inf), middle)
+
+    def span(self, rays: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        """z (R,) at which rays enter the box, or begin in it, and at which they leave it; less where they miss it."""
+        low = rays.origin.new_tensor(self.config.origin_m)
+        high = low + self.config.voxel_m * (rays.origin.new_tensor(self.config.shape) - 1)
+        step = torch.where(rays.direction.abs() < LEAST_SLOPE, LEAST_SLOPE, rays.direction)
+        ends = (low - rays.origin) / step, (high - rays.origin) / step
+        return torch.maximum(torch.minimum(*ends).amax(1), rays.near_m), torch.maximum(*ends).amin(1)
 
     def march(self, rays: GridRays, kept: int = KEPT) -> March:
         """The samples of greatest weight of each ray, as far as the grid reaches."""
@@ -260,6 +266,11 @@ class RaySamples:
         """(R,) what the grid stops."""
         return 1 - self.light
 
+    @property
+    def depth_m(self) -> torch.Tensor:
+        """(R,) mean z of what rays meet."""
+        return (self.weight * self.z).sum(1) / self.weight.sum(1).clamp_min(1e-6)
+
     def at(self, index: torch.Tensor) -> RaySamples:
         """The samples at positions (R, N) of each ray."""
         points = self.points.gather(1, index[..., None].expand(-1, -1, 3))
@@ -284,12 +295,8 @@ class GridField(LearnedField):
     """Geometry and colour of one scene, without classes.
 
     Colour, depth and opacity are rendered wherever the grid has them. A ray is *known* where the field can say a
-    class, which this kind nowhere can: its logits are zeros. A kind that can overrides ``classify``.
-
-    Args:
-        config: The box, and whether colours depend on the direction.
-        label_set: Classes of the logits.
-        sampling: Its ``near_m`` bounds rays; where they are sampled, the grid says.
+    class, which this kind nowhere can: its logits are zeros. A kind that can overrides ``classify``. Of the sampling
+    only ``near_m`` counts: where rays are sampled, the grid says.
     """
 
     kind: ClassVar[str] = "grid"
