@@ -17,7 +17,6 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import hashlib
 import json
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -57,7 +56,6 @@ LEVELS = 4
 WIDTHS = (1, 2, 4, 4)  # of the levels, times the width
 BLOCKS = (1, 2, 2, 2)  # on the way down; one on the way up
 CHUNK_ROWS = 1024  # gathered at a time: 27 rows of features each, which stay in the cache
-MAX_BOX = 100  # entries a cell of a table of all cells of a box
 OFFSETS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.int64)  # (27, 3)
 _BITS, _HALF = 21, 1 << 20  # a packed coordinate
 
@@ -111,19 +109,7 @@ def _unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows (N, 27) of the cells round each; looked up in a box round all cells where that is small, else searched."""
-    low = cells.min(0) - 1
-    shape = cells.max(0) - low + 2
-    if math.prod(map(int, shape)) > MAX_BOX * len(cells):
-        return _searched_neighbours(cells)
-    stride = np.array((shape[1] * shape[2], shape[2], 1))
-    place = (cells - low) @ stride
-    box = np.full(int(np.prod(shape)), len(cells), np.int64)
-    box[place] = np.arange(len(cells))
-    return box[place[:, None] + OFFSETS @ stride]
-
-
-def _searched_neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows (N, 27) of the cells round each."""
     keys, count = pack_cells(cells), len(cells)
     table = np.full((count, len(OFFSETS)), count, np.int64)
     middle = len(OFFSETS) // 2

@@ -116,8 +116,8 @@ class KeyframePool:
             self._kept[key] = replace(self._kept[key], validated_by=version, trials=0)
 
     def reject(self, keys: Collection[Key], *, worse: bool) -> int:
-        """A round with these keyframes had no success: those not validated get ``MAX_TRIALS`` such rounds, none where it
-        made the weights ``worse``. Returns how many were dropped."""
+        """A round with these keyframes had no success: those not validated get ``MAX_TRIALS`` such rounds, or none
+        where it made the weights ``worse``. Returns how many were dropped."""
         for key in self._not_validated(keys):
             trials = MAX_TRIALS if worse else self._kept[key].trials + 1
             self._kept[key] = replace(self._kept[key], trials=trials)
