@@ -11,7 +11,7 @@ from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import read_regular
-from semantic_mapper.mapping.map_scale import FIX, voxel_size_text
+from semantic_mapper.mapping.map_types import SCALE_FIX, voxel_size_text
 from semantic_mapper.plain_text import counted
 
 SUMMARY_FILE = "summary.json"
@@ -114,7 +114,9 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             "the beginning of a walk"
         )
     if summary.get("scale") == "unknown":
-        lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {FIX}")
+        lines.append(
+            f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {SCALE_FIX}"
+        )
     if frames.get("left_out"):
         lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
     if frames.get("excluded_from_scores"):
@@ -169,7 +171,8 @@ def _pose_figure(check: Mapping[str, Any], key: str) -> str:
     return "not checked" if value is None else percent(value)
 
 
-def _depth_source(depth: Mapping[str, Any]) -> str:
+def describe_depth(depth: Mapping[str, Any]) -> str:
+    """Where depth comes from."""
     if depth["source"] != "mixed":
         return _DEPTH_SOURCES[depth["source"]]
     fractions = {"computed from the pictures": "computed_fraction", "rendered by the field": "rendered_fraction"}
@@ -192,7 +195,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("frames left out of the log", "frames", lambda f: str(f.get("left_out") or "-")),
     ("scale", "scale", str),
     ("frames scored", "frames.scored", str),
-    ("depth", "depth", _depth_source),
+    ("depth", "depth", describe_depth),
     ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),
     ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
     ("latency p50", "latency_ms.p50", _ms),

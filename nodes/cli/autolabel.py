@@ -30,7 +30,7 @@ def autolabel(
     out: Annotated[Path, typer.Option("--out", metavar="NEW", help="New log to write (.mcap).")],
     depth: Annotated[
         bool,
-        typer.Option("--depth", help="Also give frames without depth what was computed from the pictures or rendered."),
+        typer.Option("--depth", help="Also give frames without depth what was computed from the pictures."),
     ] = False,
     min_confidence: Annotated[
         float, typer.Option("--min-confidence", min=0, max=1, help="Pixels that are less sure are unknown.")
@@ -55,8 +55,7 @@ def autolabel(
     A frame is rendered as `replay` and `eval` render it. All else of the log stays: images, poses, stamps, other
     topics, files that it holds, parts. Such pseudo labels, and such depth, are marked: `finetune` learns from them,
     `eval` and `replay` never score on them, and computed depth counts as in `replay`. Labels that are there stay; those
-    of an earlier autolabel are replaced. Weights that know no classes (`finetune --kind grid`) give depth only. Ctrl-C
-    leaves nothing (exit code 130).
+    of an earlier autolabel are replaced. Ctrl-C leaves nothing (exit code 130).
 
     Example: semantic-mapper autolabel kitchen.mcap --weights kitchen.safetensors --out labelled.mcap
     """
@@ -88,7 +87,7 @@ def autolabel(
             output.print(f"  {what}: {line}")
         if len(lines) > LISTED:
             output.print(f"  and {len(lines) - LISTED} more")
-    if report.note.classes and report.note.kept == report.note.frames:
+    if report.note.kept == report.note.frames:
         output.print("  note: every frame has a label of its own, which stays; --overwrite-labels replaces them")
     if json:
         output.json(found)

@@ -11,7 +11,7 @@ import typer
 from semantic_mapper.nodes.cli.options import MapperSettings, WeightsOption
 from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
 from semantic_mapper.nodes.console import Output
-from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.log import demo_log
 
 
 @verb

@@ -13,7 +13,7 @@ from semantic_mapper.nodes.cli.replay import show_replay
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.run_folder import prepare_folder
 
 

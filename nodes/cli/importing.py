@@ -14,6 +14,7 @@ from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers import ImportOptions, ImportReport, RenameConfig, import_recording
+from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 
@@ -86,7 +87,7 @@ def import_(
     Example: semantic-mapper import cut-off.mcap clean.mcap
     """
     output = Output.guarded()
-    if format is None and source.suffix == LOG_SUFFIX:
+    if format is None and source.suffix == LOG_SUFFIX and not is_bag(source):
         _recover(output, source, log)
         return
 

@@ -17,7 +17,7 @@ from semantic_mapper.client import MapClient, Weights
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.files.map_file import describe_map
-from semantic_mapper.mapping.map_scale import length_unit, voxel_size_text
+from semantic_mapper.mapping.map_types import length_unit, voxel_size_text
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
@@ -179,7 +179,7 @@ def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
         note: As ``AutolabelNote.plain`` gives it.
     """
     confidence = "" if note["mean_confidence"] is None else f", mean confidence {note['mean_confidence'] * 100:.1f} %"
-    if note.get("labelled_pixels") is not None:
+    if note["labelled_pixels"] is not None:
         confidence = f", {note['labelled_pixels'] * 100:.1f} % of the pixels{confidence}"
     frames = counted(note["frames"], "frame")
     counts = [f"{note['labelled']} of {frames} labelled{confidence}"]
@@ -189,8 +189,6 @@ def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
     settings += ["--depth"] if note["depth"] else []
     by = f"{note['weights']} ({note['kind']}, SHA-256 {note['digest'][:16]})"
     by = " ".join([by, *settings])
-    if not note["classes"]:
-        return [("depth by", by), ("depth", f"{note['depth_written']} of {frames} got what was rendered")]
     return [("pseudo labels by", by), ("pseudo labels", "; ".join(counts))]
 
 

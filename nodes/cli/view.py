@@ -16,8 +16,13 @@ from semantic_mapper.errors import ConfigError, TransportError
 from semantic_mapper.nodes.cli.options import MaxFramesOption, Remote, WeightsOption
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
-from semantic_mapper.nodes.launcher.launch_view import LaunchView
-from semantic_mapper.nodes.launcher.running import launch_folder, node_endpoints, read_launch_note, status_endpoint
+from semantic_mapper.nodes.launcher.running import (
+    LaunchView,
+    launch_folder,
+    node_endpoints,
+    read_launch_note,
+    status_endpoint,
+)
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.replay.run_folder import is_log, is_map, map_path

@@ -27,7 +27,7 @@ from semantic_mapper.nodes.mapper.offered_weights import read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions
 from semantic_mapper.nodes.process import run_when_idle
-from semantic_mapper.nodes.status import publish_status
+from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.online import KeyframePool, KeyframeSplit, OnlineResult, learn

@@ -33,7 +33,7 @@ from semantic_mapper.fields.scene.march import (
     gather,
     march,
 )
-from semantic_mapper.fields.volume import composite_depth, field_render, interval_lengths
+from semantic_mapper.fields.volume import composite_depth, field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -331,10 +331,9 @@ class GridField(LearnedField):
         none = torch.zeros(count, dtype=torch.bool, device=samples.z.device)
         return samples.z.new_zeros(count, len(self.label_set)), none
 
-    def known(self, samples: RaySamples, *, sky: bool = False) -> torch.Tensor:
-        """Where rays (R,) have met something; for kinds with a class for the sky, ``sky`` = those that leave, too."""
-        opaque = samples.opacity > OPAQUE
-        return (opaque | sky) & self.fitted
+    def known(self, samples: RaySamples) -> torch.Tensor:
+        """Where rays (R,) have met something."""
+        return (samples.opacity > OPAQUE) & self.fitted
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """The views' cameras and colours, without features: nothing of them is looked at.
@@ -350,22 +349,9 @@ class GridField(LearnedField):
             marched = March(marched.z, torch.zeros_like(marched.weight), torch.ones_like(marched.light))
         return RaySamples(rays, in_grid.points(marched.z), marched.z, marched.weight, marched.light)
 
-    def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
-        """Depths (R, K) of the samples of greatest weight."""
-        with torch.no_grad():
-            return self.march(rays).z
-
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays; differentiable by what asks for gradients."""
         return self.render_marched(self.march(rays), sources)
-
-    def render_samples(
-        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
-    ) -> tuple[FieldRender, torch.Tensor]:
-        """Render rays at given sample depths z (R, N), metres; also the compositing weights (R, N)."""
-        in_grid = self.grid.rays(rays)
-        samples = self.samples_at(rays, in_grid, z)
-        return self.render_marched(samples, sources), samples.weight
 
     def render_marched(self, samples: RaySamples, sources: EncodedViews) -> FieldRender:
         """What marched rays render to."""
@@ -386,15 +372,3 @@ class GridField(LearnedField):
         if self.trunk is None:
             return self.grid.colour(samples.points)
         return self.trunk.colour(self.trunk(samples.points), samples.rays.direction)
-
-    def samples_at(self, rays: RayBatch, in_grid: GridRays, z: torch.Tensor) -> RaySamples:
-        """Samples at given depths, each as long as it is to the next one."""
-        points = in_grid.points(z)
-        top = points.new_tensor([n - 1 for n in self.config.grid.shape])
-        inside = ((points >= 0) & (points <= top)).all(-1)
-        raw = gather(self.grid.values, points)[..., 0]
-        length = interval_lengths(z, in_grid.direction.norm(dim=1))
-        depth = SceneGrid.optical_depth(raw) * length * inside * self.fitted
-        before = torch.cumsum(depth, 1) - depth
-        weight = torch.exp(-before) * -torch.expm1(-depth)
-        return RaySamples(rays, points, z, weight, 1 - weight.sum(1))

@@ -18,7 +18,7 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
-from semantic_mapper.labels import ROOMS, STUFF_NAMES, make_label_set
+from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.finetune import finetune_lines
 from semantic_mapper.nodes.console import frame_progress
@@ -31,7 +31,7 @@ from semantic_mapper.replay.jobs import AutolabelRequest, FinetuneRequest, Finet
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.config import FinetuneConfig
 from tests.nodes.cli.test_autolabel import StopsAfter
-from tests.nodes.support import error_line, run, write_log
+from tests.nodes.support import error_line, run
 from tests.replay.test_boxes import kitti_xml
 from tests.small import tiny_frames
 
@@ -165,13 +165,7 @@ def test_frames_with_labels_go_before_others() -> None:
     assert choose_frames(3, 9, frozenset((1,))) == [0, 1, 2]
 
 
-def test_a_class_that_labels_lack_says_whose_classes_they_are_and_which_weights_have_it(
-    log: Path, boxes: Path, tmp_path: Path
-) -> None:
-    mine = make_label_set("mine", ["wall", "spaceship"])
-    own = write_log(tmp_path / "own.mcap", [replace(tiny_frames(1)[0], label=np.ones((72, 96), np.uint8))], mine)
-    with open_log(own) as opened, pytest.raises(ConfigError, match=r"own label images; .*: --pseudo rooms takes"):
-        match_boxes(load_boxes(boxes), boxes, open_pseudo_labels(opened, None))
+def test_a_class_that_labels_lack_says_whose_classes_they_are(log: Path, boxes: Path, tmp_path: Path) -> None:
     strange = tmp_path / "strange.json"
     strange.write_text(boxes.read_text().replace('"class": "', '"class": "un'))
     expected = r"own label images: correct the classes of the boxes"
@@ -240,18 +234,6 @@ def test_a_drive_of_kitti360_and_its_boxes_are_used_as_they_are(boxes: Path, set
         (9, "truck"),
         (10, "truck"),
     }
-
-
-def test_a_folder_named_as_weights_in_the_package_has_to_be_told_from_them(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "rooms").mkdir()
-    cv2.imwrite(str(tmp_path / "rooms" / "000002.png"), np.ones((72, 96), np.uint8))
-    with open_log(log) as opened:
-        with pytest.raises(ConfigError, match=r"Give \./rooms for the label images"):
-            open_pseudo_labels(opened, "rooms")
-        assert open_pseudo_labels(opened, "./rooms").numbers == {2}
 
 
 def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights: Path, tmp_path: Path) -> None:
