@@ -43,10 +43,10 @@ from semantic_mapper.replay.run_folder import prepare_file
 from semantic_mapper.training.config import FinetuneConfig
 from semantic_mapper.training.finetune import FITTERS, finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.frame_rays import usable_frames
 from semantic_mapper.training.panoptic import boxes_in_view
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
+from semantic_mapper.training.views import usable_frames
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 FrameKey = tuple[str, int]  # camera and stamp

@@ -88,10 +88,7 @@ class FinetuneRound:
     """A round of learning in a thread of its own, which rests after each step and each look as its share says.
 
     Args:
-        keyframes: To learn from, and to judge by.
-        parent: Weights in use.
-        parent_digest: SHA-256 of their file, hexadecimal.
-        config: Of the round.
+        parent, parent_digest: Weights in use, and the SHA-256 of their file.
         fraction: Of a core, or of the GPU, in 0..1.
         idle: Learn only while nobody else wants the processor.
     """

@@ -18,13 +18,12 @@ from semantic_mapper.errors import ConfigError, LabelError, LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.device import DeviceField
 from semantic_mapper.fields.render import render_view
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import sample_guided
-from semantic_mapper.imaging import resize_depth
+from semantic_mapper.imaging import depth_prior, resize_depth
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer
 from semantic_mapper.rays import pixel_grid, pixel_rays

@@ -31,8 +31,8 @@ from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
-from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_fit import fit_grid, held_out_psnr, render_frame
+from semantic_mapper.training.views import frame_rays
 from semantic_mapper.types import Float32, PosedFrame
 
 _log = get_logger(__name__)

@@ -42,10 +42,9 @@ from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import FinetuneConfig
 from semantic_mapper.training.fit import Budget
-from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_fit import GridFit, fit_trunk, trunk_steps
 from semantic_mapper.training.irt import ClassFit, labelled_rays
-from semantic_mapper.training.views import stack_sources, view_from_frame
+from semantic_mapper.training.views import frame_rays, stack_sources, view_from_frame
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 _log = get_logger(__name__)

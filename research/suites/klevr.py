@@ -26,7 +26,7 @@ from research.suites.store import RecordStore
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, Config, NotNegative, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
-from semantic_mapper.training.frame_rays import frame_rays
+from semantic_mapper.training.views import frame_rays
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 RECORD_VERSION = 4  # raised by a change of what a record means: older ones are made again

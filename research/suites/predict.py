@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from research.suites.config import TierConfig
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import SemanticField
-from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import around_computed
-from semantic_mapper.imaging import fill_holes, resize_depth, resize_rgb
+from semantic_mapper.imaging import depth_prior, fill_holes, resize_depth, resize_rgb
 from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, Float32, PosedFrame, UInt8

@@ -26,7 +26,7 @@ from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, Fraction, No
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays
+from semantic_mapper.training.views import FrameRays, frame_rays
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 

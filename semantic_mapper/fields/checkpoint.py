@@ -12,18 +12,20 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import nn
 
-from semantic_mapper.config import to_plain
-from semantic_mapper.errors import SemanticMapperError, WeightsError
+from semantic_mapper.config import Config, to_plain
+from semantic_mapper.errors import LabelError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
@@ -109,18 +111,24 @@ def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
         f"model.{name}": _stored(t, half and "running_" not in name)
         for name, t in checkpoint.model.state_dict().items()
     }
-    metadata = {
-        "format": FORMAT,
-        "version": str(VERSION),
-        "field": checkpoint.model.kind,
-        "model_config": json.dumps(to_plain(checkpoint.model.config)),
-        "label_set": json.dumps(label_set_to_plain(checkpoint.label_set)),
-        "recipe": json.dumps(checkpoint.recipe),
-    }
+    model = checkpoint.model
+    metadata = describe(model.kind, model.config, model.label_set, checkpoint.recipe)
     if checkpoint.anchors:
         anchor_tensors, metadata["anchors"] = _pack_anchors(checkpoint.anchors)
         tensors |= anchor_tensors
     return save(tensors, metadata)
+
+
+def describe(kind: str, config: Config, label_set: LabelSet, recipe: dict[str, Any]) -> dict[str, str]:
+    """The metadata of a weights file."""
+    return {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "field": kind,
+        "model_config": json.dumps(to_plain(config)),
+        "label_set": pack_label_set(label_set),
+        "recipe": json.dumps(recipe),
+    }
 
 
 def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[str, str]) -> None:
@@ -139,7 +147,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     path = find_checkpoint(path)
     tensors, metadata = open_weights(path)
     try:
-        label_set = label_set_from_plain(json.loads(metadata["label_set"]))
+        label_set = unpack_label_set(metadata["label_set"])
         recipe = _checked_recipe(json.loads(metadata["recipe"]))
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
         kind = metadata["field"]
@@ -149,11 +157,14 @@ def load_checkpoint(path: Path) -> Checkpoint:
     except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:MESSAGE]
         raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
-    weights = {
-        n.removeprefix("model."): t if t.dtype == torch.float64 else t.float()
-        for n, t in tensors.items()
-        if n.startswith("model.")
-    }
+    load_tensors(model, {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")}, path)
+    return Checkpoint(model.eval(), anchors, recipe)
+
+
+def load_tensors(model: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
+    """Put weights of a file into a network.
+    Raises WeightsError: they do not fit, or hold NaN."""
+    weights = {name: t if t.dtype == torch.float64 else t.float() for name, t in tensors.items()}
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
@@ -161,7 +172,6 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise WeightsError(f"{path}: weights do not fit their model config: {first}") from error
     if not all(bool(torch.isfinite(t).all()) for t in weights.values()):
         raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
-    return Checkpoint(model.eval(), anchors, recipe)
 
 
 def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
@@ -200,7 +210,7 @@ def check_same_shape(path: Path, like: Checkpoint) -> None:
     try:
         with safe_open(path, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
-        label_set = label_set_from_plain(json.loads(metadata["label_set"]))
+        label_set = unpack_label_set(metadata["label_set"])
         kind = metadata["field"]
         shape = kind, json.loads(metadata["model_config"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, SemanticMapperError) as error:
@@ -239,22 +249,16 @@ def adapt_model(model: LearnedField, label_set: LabelSet) -> LearnedField:
 def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
     """A frame at working width, with depth rounded as the file stores it."""
     intrinsics = working_intrinsics(frame.intrinsics, width)
-    depth = None
-    if frame.depth_m is not None:
-        depth = _depth_from_units(_depth_to_units(resize_depth(frame, intrinsics)))
     spread = resize_spread(frame, intrinsics)
-    return PosedFrame(
-        stamp_ns=frame.stamp_ns,
-        seq=frame.seq,
-        camera_id=frame.camera_id,
+    return replace(
+        frame,
         rgb=resize_rgb(frame, intrinsics),
-        depth_m=depth,
-        depth_sigma_m=None if spread is None else _depth_from_units(_depth_to_units(spread)),
+        depth_m=None if frame.depth_m is None else _rounded(resize_depth(frame, intrinsics)),
+        depth_sigma_m=None if spread is None else _rounded(spread),
         label=None if frame.label is None else resize_label(frame.label, intrinsics),
+        label_is_pseudo=False,
+        world=0,
         intrinsics=intrinsics,
-        T_world_camera=frame.T_world_camera,
-        pose_source=frame.pose_source,
-        pose_sigma=frame.pose_sigma,
     )
 
 
@@ -282,27 +286,26 @@ def _depth_from_units(units: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return units.astype(np.float32) / np.float32(DEPTH_UNITS_PER_M)
 
 
+def _rounded(depth_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return _depth_from_units(_depth_to_units(depth_m))
+
+
 def _pack_anchors(anchors: Sequence[PosedFrame]) -> tuple[dict[str, torch.Tensor], str]:
     tensors: dict[str, torch.Tensor] = {}
     described: list[dict[str, Any]] = []
     for i, a in enumerate(anchors):
-        tensors[f"anchor.{i}.rgb"] = torch.from_numpy(np.ascontiguousarray(a.rgb))
-        if a.depth_m is not None:
-            tensors[f"anchor.{i}.depth"] = torch.from_numpy(_depth_to_units(a.depth_m))
-        if a.depth_sigma_m is not None:
-            tensors[f"anchor.{i}.depth_sigma"] = torch.from_numpy(_depth_to_units(a.depth_sigma_m))
-        if a.label is not None:
-            tensors[f"anchor.{i}.label"] = torch.from_numpy(np.ascontiguousarray(a.label))
+        depths = {"depth": a.depth_m, "depth_sigma": a.depth_sigma_m}
+        images = {"rgb": a.rgb, "label": a.label}
+        images |= {name: None if depth is None else _depth_to_units(depth) for name, depth in depths.items()}
+        tensors |= {
+            f"anchor.{i}.{name}": torch.from_numpy(np.ascontiguousarray(image))
+            for name, image in images.items()
+            if image is not None
+        }
         k = a.intrinsics
-        described.append(
-            {
-                "stamp_ns": a.stamp_ns,
-                "seq": a.seq,
-                "camera_id": a.camera_id,
-                "intrinsics": [k.fx, k.fy, k.cx, k.cy, k.width, k.height],
-                "T_world_camera": a.T_world_camera.tolist(),
-            }
-        )
+        about = {"stamp_ns": a.stamp_ns, "seq": a.seq, "camera_id": a.camera_id}
+        about |= {"intrinsics": [k.fx, k.fy, k.cx, k.cy, k.width, k.height]}
+        described.append(about | {"T_world_camera": a.T_world_camera.tolist()})
     return tensors, json.dumps(described)
 
 
@@ -328,18 +331,15 @@ def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, 
     return tuple(anchors)
 
 
-def label_set_to_plain(label_set: LabelSet) -> dict[str, Any]:
-    """Plain data, for the metadata of a weights file."""
-    return {
-        "name": label_set.name,
-        "ids": list(label_set.ids),
-        "names": list(label_set.names),
-        "colors": [list(c) for c in label_set.colors],
-        "ignore_id": label_set.ignore_id,
-    }
+def pack_label_set(label_set: LabelSet) -> str:
+    """Classes as they stand in the metadata of a weights file."""
+    return msgspec.json.encode(label_set).decode()
 
 
-def label_set_from_plain(data: dict[str, Any]) -> LabelSet:
-    """What ``label_set_to_plain`` gave. Raises KeyError, TypeError, ValueError, LabelError: it is something else."""
-    colors = tuple((int(r), int(g), int(b)) for r, g, b in data["colors"])
-    return LabelSet(str(data["name"]), tuple(data["ids"]), tuple(data["names"]), colors, int(data["ignore_id"]))
+def unpack_label_set(packed: str) -> LabelSet:
+    """What ``pack_label_set`` gave.
+    Raises LabelError: it is something else."""
+    try:
+        return msgspec.json.decode(packed, type=LabelSet)
+    except msgspec.MsgspecError as error:
+        raise LabelError(f"no label set: {error}") from error

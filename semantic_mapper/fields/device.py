@@ -100,13 +100,8 @@ class DeviceField:
     """Inference-only field on a device. Satisfies ``SemanticField`` and ``Sampled``.
 
     Weights and the features of keyframes stay on the device; rays are made there, and callers fetch what is rendered,
-    a chunk at a time. Sums on a GPU come in no fixed order: its renders repeat but for the last digits.
-
-    Args:
-        model: Trained field; it is copied.
-        device: Where it computes.
-        sampling: Where rays are sampled.
-        bfloat16: Let the networks among ``BFLOAT16_PARTS`` compute in bfloat16.
+    a chunk at a time. Sums on a GPU come in no fixed order: its renders repeat but for the last digits. The model is
+    copied; with ``bfloat16`` its networks among ``BFLOAT16_PARTS`` compute in that.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ class LearnedField(nn.Module, ABC):
     """Base of all fields with weights. Satisfies ``SemanticField``.
 
     A kind of field implements ``encode`` and ``render_samples``; sampling is shared, so that kinds differ in what they
-    make of the samples and in nothing else.
+    make of the samples and in nothing else. Kinds that find samples of their own implement ``render`` instead.
 
     Args:
         config: Shape of the network; part of every checkpoint.
@@ -71,11 +71,11 @@ class LearnedField(nn.Module, ABC):
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode source views."""
 
-    @abstractmethod
     def render_samples(
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
     ) -> tuple[FieldRender, torch.Tensor]:
         """Render rays at given sample depths z (R, N), ascending, metres; also the compositing weights (R, N)."""
+        raise NotImplementedError
 
     def source_logits(self, sources: EncodedViews) -> torch.Tensor | None:
         """Logits (m, L, h, w) of the source images by themselves, for a dense loss; None where a kind has none."""

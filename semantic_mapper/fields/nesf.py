@@ -17,7 +17,6 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import hashlib
 import json
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -29,17 +28,16 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from semantic_mapper.config import AtLeastOne, Config, convert_config, to_plain
+from semantic_mapper.config import AtLeastOne, Config, convert_config
 from semantic_mapper.errors import SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import (
-    FORMAT,
     MAP_KIND,
-    VERSION,
+    describe,
     find_checkpoint,
-    label_set_from_plain,
-    label_set_to_plain,
+    load_tensors,
     open_weights,
     save_tensors,
+    unpack_label_set,
 )
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
@@ -58,7 +56,6 @@ LEVELS = 4
 WIDTHS = (1, 2, 4, 4)  # of the levels, times the width
 BLOCKS = (1, 2, 2, 2)  # on the way down; one on the way up
 CHUNK_ROWS = 1024  # gathered at a time: 27 rows of features each, which stay in the cache
-MAX_BOX = 100  # entries a cell of a table of all cells of a box
 OFFSETS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.int64)  # (27, 3)
 _BITS, _HALF = 21, 1 << 20  # a packed coordinate
 
@@ -112,19 +109,7 @@ def _unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows (N, 27) of the cells round each; looked up in a box round all cells where that is small, else searched."""
-    low = cells.min(0) - 1
-    shape = cells.max(0) - low + 2
-    if math.prod(map(int, shape)) > MAX_BOX * len(cells):
-        return _searched_neighbours(cells)
-    stride = np.array((shape[1] * shape[2], shape[2], 1))
-    place = (cells - low) @ stride
-    box = np.full(int(np.prod(shape)), len(cells), np.int64)
-    box[place] = np.arange(len(cells))
-    return box[place[:, None] + OFFSETS @ stride]
-
-
-def _searched_neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows (N, 27) of the cells round each."""
     keys, count = pack_cells(cells), len(cells)
     table = np.full((count, len(OFFSETS)), count, np.int64)
     middle = len(OFFSETS) // 2
@@ -463,15 +448,9 @@ def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:
     """Write weights as float16, whole or not at all."""
-    metadata = {
-        "format": FORMAT,
-        "version": str(VERSION),
-        "field": MAP_KIND,
-        "label_set": json.dumps(label_set_to_plain(weights.model.label_set)),
-        "model_config": json.dumps(to_plain(weights.model.config)),
-        "recipe": json.dumps(weights.recipe),
-    }
-    tensors = {name: t.detach().half().contiguous() for name, t in weights.model.state_dict().items()}
+    model = weights.model
+    metadata = describe(MAP_KIND, model.config, model.label_set, weights.recipe)
+    tensors = {name: t.detach().half().contiguous() for name, t in model.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     save_tensors(tensors, path, metadata)
 
@@ -491,14 +470,12 @@ def load_nesf(path: Path) -> NesfWeights:
             f"of kind '{MAP_KIND}', from `semantic-mapper-research train --kind {MAP_KIND}`"
         )
     try:
-        label_set = label_set_from_plain(json.loads(metadata["label_set"]))
+        label_set = unpack_label_set(metadata["label_set"])
         config = convert_config(json.loads(metadata["model_config"]), NesfConfig, str(path))
         recipe = dict(json.loads(metadata["recipe"]))
         model = Nesf(label_set, config)
-        model.load_state_dict({name: t.float() for name, t in tensors.items()})
-    except (KeyError, TypeError, ValueError, RuntimeError, SemanticMapperError) as error:
+    except (KeyError, TypeError, ValueError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:300]
         raise WeightsError(f"{path}: damaged: {type(error).__name__}: {reason}") from error
-    if not all(bool(torch.isfinite(t).all()) for t in model.state_dict().values()):
-        raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
+    load_tensors(model, tensors, path)
     return NesfWeights(model.eval(), recipe, hashlib.sha256(path.read_bytes()).hexdigest())

@@ -200,10 +200,7 @@ def fill_between_rays(
     Args:
         count: Rows of pixels, half a step apart.
         step: Pixels between those of the grid.
-        probabilities: (H, W, L) float32, zeros but at the grid; written between it, as are ``known`` (H, W) bool and
-            ``depth`` (H, W) float32 in metres.
-        prior: (H, W) float32 depth prior in metres.
-        rgb: (H, W, 3) uint8.
-        uncertainty: (H, W) float32, written: how little the grid says of such a pixel, 0 = enough.
+        probabilities, known, depth: (H, W, L), (H, W), (H, W) metres: zeros but at the grid; written between it.
+        uncertainty: (H, W), written: how little the grid says of such a pixel, 0 = enough.
     """
     ...

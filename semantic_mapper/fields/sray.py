@@ -194,13 +194,8 @@ class ContextualSpace:
 
 def contextual_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
     """Reproject samples z (R, N) of whole rays into all views and gather M (S-Ray Eq. 3 to 5)."""
-    where = reproject(rays, z, sources)
-    found = gather(sources, where)
     delta = interval_lengths(z, rays.direction.norm(dim=-1))
-    hit, visibility = hit_and_visibility(found.geometry, where.z, 0.5 * delta)
-    hit, visibility = hit * where.valid, visibility * where.valid
-    cues = torch.stack((hit, visibility, where.view_cosine, torch.log(found.geometry[..., 1])), dim=-1)
-    return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, delta, found.channel)
+    return _gather_space(rays, z, sources, delta)
 
 
 def background_space(rays: RayBatch, sources: EncodedViews) -> ContextualSpace:
@@ -208,14 +203,18 @@ def background_space(rays: RayBatch, sources: EncodedViews) -> ContextualSpace:
 
     The sky, or what lies beyond the sensor's range: it has no depth, but every view that looks that way has an opinion.
     """
-    where = reproject(rays, rays.origin.new_full((len(rays.origin), 1), BACKGROUND_M), sources)
+    far = rays.origin.new_full((len(rays.origin), 1), BACKGROUND_M)
+    space = _gather_space(rays, far, sources, torch.zeros_like(far))
+    return replace(space, channel=torch.full_like(space.channel, -1))
+
+
+def _gather_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews, delta: torch.Tensor) -> ContextualSpace:
+    where = reproject(rays, z, sources)
     found = gather(sources, where)
-    hit, visibility = hit_and_visibility(found.geometry, where.z, where.z.new_zeros(()))
-    visibility = visibility * where.valid
+    hit, visibility = hit_and_visibility(found.geometry, where.z, 0.5 * delta)
+    hit, visibility = hit * where.valid, visibility * where.valid
     cues = torch.stack((hit, visibility, where.view_cosine, torch.log(found.geometry[..., 1])), dim=-1)
-    nowhere = rays.origin.new_zeros(len(rays.origin), 1)
-    channel = torch.full_like(found.channel, -1)
-    return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, nowhere, channel)
+    return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, delta, found.channel)
 
 
 def surface_space(
@@ -296,11 +295,7 @@ def radial_attention(x: torch.Tensor, valid: torch.Tensor, layer: MultiHeadAtten
 
 def cross_view_attention(x: torch.Tensor, valid: torch.Tensor, layer: MultiHeadAttention) -> torch.Tensor:
     """Cross-view sparse attention, Eq. 10: over the m views at one sample. x (R, m, N, C), valid (R, m, N)."""
-    rays, views, samples, dim = x.shape
-    out = layer(
-        x.transpose(1, 2).reshape(rays * samples, views, dim), valid.transpose(1, 2).reshape(rays * samples, views)
-    )
-    return out.view(rays, samples, views, dim).transpose(1, 2)
+    return radial_attention(x.transpose(1, 2), valid.transpose(1, 2), layer).transpose(1, 2)
 
 
 def constrained_weights(score: torch.Tensor, valid: torch.Tensor, tau: float) -> torch.Tensor:
@@ -341,13 +336,7 @@ class ViewWeightNet(nn.Module):
 
 
 class SRay(LearnedField):
-    """The S-Ray field.
-
-    Args:
-        config: Shape of the network.
-        label_set: Classes of the logits.
-        sampling: Where rays are sampled; may be exchanged at any time, no weights depend on it.
-    """
+    """The S-Ray field."""
 
     kind = "sray"
     class_rows = ("classifier.weight", "classifier.bias")
@@ -438,10 +427,6 @@ class SRay(LearnedField):
         clear = space.valid & (space.visibility >= HIDDEN)
         return replace(space, valid=torch.where(clear.any(0), clear, space.valid))
 
-    def pruned(self, space: ContextualSpace, weights: torch.Tensor, least: float) -> ContextualSpace:
-        """M without the samples whose fraction of the compositing weights (R, N) of their ray is below ``least``."""
-        return replace(space, valid=space.valid & (weights >= least * weights.sum(1, keepdim=True)))
-
     def attend(self, space: ContextualSpace) -> torch.Tensor:
         """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
         x = space.feature.transpose(0, 1)  # (R, m, N, C)
@@ -513,7 +498,8 @@ class SRay(LearnedField):
         kept = weights
         seen = space if self.at_surface else self.mask_occluded(space)
         if sample_weight_threshold > 0:
-            seen = self.pruned(seen, weights, sample_weight_threshold)
+            heavy = weights >= sample_weight_threshold * opacity[:, None]
+            seen = replace(seen, valid=seen.valid & heavy)
             kept = weights * seen.valid.any(0)
             kept = kept * (opacity / kept.sum(1).clamp_min(1e-12))[:, None]
         refined = self.attend(seen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -56,13 +57,9 @@ class StreamingSRay:
         """As ``SRay.encode``, with maps laid out channels-last so that a sample reads one cache line, not C."""
         with torch.inference_mode():
             encoded = self.model.encode(views)
-            return EncodedViews(
-                encoded.feature.contiguous(memory_format=torch.channels_last),
-                encoded.rgb.contiguous(memory_format=torch.channels_last),
-                encoded.geometry.contiguous(memory_format=torch.channels_last),
-                encoded.K,
-                encoded.T_camera_world,
-                encoded.channel,
+            maps = {"feature": encoded.feature, "rgb": encoded.rgb, "geometry": encoded.geometry}
+            return replace(
+                encoded, **{name: m.contiguous(memory_format=torch.channels_last) for name, m in maps.items()}
             )
 
     def source_logits(self, sources: EncodedViews) -> torch.Tensor:
@@ -86,7 +83,7 @@ class StreamingSRay:
         count, channels = len(z), self.model.config.feature_dim
         expect_shape(rays.origin, f"{count} 3", "ray origins")
         expect_shape(rays.direction, f"{count} 3", "ray directions")
-        # Torch's buffers are aligned alike every time; the matrix product of _classify rounds differently otherwise.
+        # Torch's buffers are aligned alike every time; the product with the classifier rounds differently otherwise.
         rendered, colour = torch.empty(count, channels), torch.empty(count, 3)
         depth, opacity, known = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.bool)
         carried = torch.empty(count, len(self.label_set))
@@ -98,17 +95,6 @@ class StreamingSRay:
             self._weights,
             _Rendered(*(t.numpy() for t in (rendered, colour, depth, opacity, known, carried))),
         )
-        return self._classify(rendered, colour, depth, opacity, known, carried)
-
-    def _classify(
-        self,
-        rendered: torch.Tensor,
-        colour: torch.Tensor,
-        depth: torch.Tensor,
-        opacity: torch.Tensor,
-        known: torch.Tensor,
-        carried: torch.Tensor,
-    ) -> FieldRender:
         with torch.inference_mode():
             classifier = self.model.classifier
             sum_of_weights = 1.0 if self.model.at_surface else opacity[:, None]

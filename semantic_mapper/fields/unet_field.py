@@ -25,14 +25,8 @@ from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
 
 class UNetField(LearnedField):
-    """Per-image classification behind the ray interface. Depth priors of rays play no part; measured
-    depth of an image does where the encoder sees it.
-
-    Args:
-        config: Shape of the network.
-        label_set: Classes of the logits.
-        sampling: Not used: the answer does not depend on where a ray is sampled.
-    """
+    """Per-image classification behind the ray interface. Depth priors of rays and where these are sampled play no part;
+    measured depth of an image does where the encoder sees it."""
 
     kind = "unet"
     needs_own_view = True

@@ -113,12 +113,7 @@ def interval_lengths(z: torch.Tensor, direction_norm: torch.Tensor) -> torch.Ten
 def compositing_weights(sigma: torch.Tensor, delta: torch.Tensor) -> torch.Tensor:
     """Weights T(z_k) (1 - exp(-sigma_k delta_k)), T(z_k) = exp(-sum_{k'<k} sigma_k' delta_k').
 
-    Args:
-        sigma: (R, N) density, 1 / m, non-negative.
-        delta: (R, N) interval lengths, m.
-
-    Returns:
-        (R, N) in [0, 1]; their sum over a ray is its opacity, at most 1. Differentiable.
+    Of densities (R, N) in 1 / m and interval lengths in m: (R, N) in [0, 1], whose sum is the ray's opacity.
     """
     optical_depth = sigma * delta
     alpha = -torch.expm1(-optical_depth)

@@ -16,11 +16,11 @@ import torch
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
-from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import (
     FrameViews,
+    depth_prior,
     fill_holes,
     is_measured,
     resize_label,

@@ -45,7 +45,6 @@ from semantic_mapper.training.fit import (
     make_optimiser,
     set_rates,
 )
-from semantic_mapper.training.frame_rays import usable_frames
 from semantic_mapper.training.grid_fit import fit_scene
 from semantic_mapper.training.irt import fit_irt
 from semantic_mapper.training.losses import IGNORE, guess_loss, image_loss, ray_loss, semantic_loss
@@ -58,6 +57,7 @@ from semantic_mapper.training.views import (
     mirrored_view,
     query_rays,
     stack_sources,
+    usable_frames,
     view_from_frame,
     view_overlap,
     withhold_depth,
@@ -257,9 +257,7 @@ def _end_of_images(model: LearnedField, config: FinetuneConfig) -> float:
 def _weigh_own_view(model: LearnedField, scene: _Scene, learns_images: bool) -> dict[str, float]:
     """Let the own image, which steps on images fit to this scene, count more than one view among others.
 
-    Returns:
-        The factors; empty where the encoder learns nothing of the scene, or where no view has depth: then every ray
-        needs the other views.
+    No factors where the encoder learns nothing of the scene, or where no view has depth: every ray needs the others.
     """
     has_depth = any(bool((view.depth_m > 0).any()) for view in scene.train)
     if not (learns_images and has_depth and model.weigh_own_view(OWN_VIEW_FACTOR, OWN_VIEW_FACTOR_WITHOUT_DEPTH)):
@@ -276,9 +274,7 @@ def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:
 def _linear_probe(model: LearnedField, scene: _Scene, config: FinetuneConfig, held_out: HeldOut) -> EncodedViews | None:
     """Fit the class rows alone, undone where held-out rays say that it did no good.
 
-    Returns:
-        The views as they are encoded now, for a frozen encoder; None of a kind that classifies while it encodes: kept
-        features leave it nothing to learn.
+    Returns the views as they are encoded now, for a frozen encoder; None of a kind that classifies while it encodes.
     """
     if model.needs_own_view:
         return None
@@ -291,18 +287,10 @@ def _linear_probe(model: LearnedField, scene: _Scene, config: FinetuneConfig, he
 
 
 def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[LabelledView], steps: int) -> bool:
-    """Fit the class rows of ``model`` to the labelled pixels of ``views``; nothing else changes.
+    """Fit the class rows of ``model`` to the labelled pixels of ``views``, which it has ``encoded``; False = it cannot.
 
     Convex, since the classifier is linear, and cheap, since nothing is rendered or encoded: what is left for the steps
-    on rays is what they alone can do. Kinds of fields that say nothing of images by themselves are left as they are.
-
-    Args:
-        encoded: The same views, encoded by ``model``.
-        views: Their labels count, at the size of the features.
-        steps: Over all views at once.
-
-    Returns:
-        Whether anything was fitted.
+    on rays is what they alone can do.
     """
     rows = [model.get_parameter(name) for name in model.class_rows]
     channel = torch.stack([view.channel for view in views]).to(encoded.feature.device)

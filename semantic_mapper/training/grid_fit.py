@@ -48,8 +48,8 @@ from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import FinetuneConfig
 from semantic_mapper.training.fit import Budget, Fitted, descend, fit
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays
 from semantic_mapper.training.scene_box import check_parallax, scene_box
+from semantic_mapper.training.views import FrameRays, frame_rays
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 
 BETA1, BETA2 = 0.9, 0.99
@@ -97,10 +97,8 @@ def fit_grid(
 
     Args:
         frames: Of a scene that stands still, with rigid poses; sizes and cameras may differ.
-        config: Box and resolution.
         budget: None = that of ``config``; without steps those of ``config.grid``.
         box: Instead of the one that ``config`` describes.
-        leave_out: Which pixels show something else than the scene.
 
     Raises:
         FrameError: too few frames, poses that only turn, or held-out views rendered hardly better than by their mean
@@ -226,34 +224,30 @@ class _Fitter:
 
     def _allocate(self) -> None:
         """Buffers for the grid as it is now."""
-        self.values = self.grid.values.detach().numpy()
-        self.gradient, self.first, self.second = (np.zeros_like(self.values) for _ in range(3))
-        self.samples = SampleLists.empty(self.config.rays, most_samples(self.values.shape), 4)
-        self.rate, self.since = view_fraction(self.rays, self.grid.config, self.config.near_m), 0
+        self.adam = GridAdam(self.grid, self.rays, self.config.near_m)
+        self.gradient = np.zeros_like(self.adam.values)
+        self.samples = SampleLists.empty(self.config.rays, most_samples(self.gradient.shape), 4)
 
     def learn(self, fraction: float) -> float:
         """One step of Adam on a batch of rays at a fraction of the budget; returns their mean squared error."""
         step, self.steps = self.steps, self.steps + 1
         if self.stage + 1 < len(self.stages) and fraction >= self.stages[self.stage + 1][0]:
             self.stage += 1
-            del self.gradient, self.first, self.second, self.samples  # before larger ones are made
+            del self.adam, self.gradient, self.samples  # before larger ones are made
             self.grid = self.grid.resampled(at_resolution(self.box, self._long_side(self.stage)))
             self._allocate()
         elif step >= WARM_UP and step % PRUNE_EVERY == 0:
             self.grid.update_occupied()
         loss = self._rays_backward(self._draw())
-        self.since += 1
         rate, count = LEARNING_RATE * FINAL_FRACTION**fraction, self.config.rays
         variation = (DENSITY_VARIATION / count, COLOUR_VARIATION / count)
-        add_total_variation(len(self.values), self.values, self.gradient, *variation)
-        buffers = (self.values, self.gradient, self.first, self.second, self.rate)
-        corrections = (1 - BETA1**self.since, 1 - BETA2**self.since)
-        adam_grid(len(self.values), *buffers, rate, rate, BETA1, BETA2, *corrections)
+        add_total_variation(len(self.gradient), self.adam.values, self.gradient, *variation)
+        self.adam.step(self.gradient, rate, rate)
         return loss
 
     def finish(self) -> SceneGrid:
         """The grid, empty where no frame looks."""
-        self.values[self.rate == 0] = (NOTHING, 0, 0, 0)
+        self.adam.values[self.adam.seen == 0] = (NOTHING, 0, 0, 0)
         self.grid.update_occupied()
         return self.grid
 
@@ -292,6 +286,22 @@ class _Fitter:
         colour = 1 / (1 + np.exp(-sky))
         by_texel = _sums(texel.ravel(), (weight[..., None] * gradient[:, None]).reshape(-1, 3), sky[..., 0].size)
         sky -= SKY_RATE * self.sky_adam.step(by_texel.reshape(sky.shape) * colour * (1 - colour)).astype(np.float32)
+
+
+class GridAdam:
+    """Adam for the values of a grid, each as far as frames look at its vertex; a gradient is 0 after its step."""
+
+    def __init__(self, grid: SceneGrid, rays: FrameRays, near_m: float) -> None:
+        self.values = grid.values.detach().numpy()
+        self.seen = view_fraction(rays, grid.config, near_m)
+        self._first, self._second, self._count = np.zeros_like(self.values), np.zeros_like(self.values), 0
+
+    def step(self, gradient: Float32, density_rate: float, colour_rate: float) -> None:
+        """One step down a gradient (X, Y, Z, 4)."""
+        self._count += 1
+        buffers = (self.values, gradient, self._first, self._second, self.seen)
+        corrections = (1 - BETA1**self._count, 1 - BETA2**self._count)
+        adam_grid(len(self.values), *buffers, density_rate, colour_rate, BETA1, BETA2, *corrections)
 
 
 class _Adam:

@@ -20,17 +20,15 @@ from torch.nn import functional
 from semantic_mapper.config import IRTConfig
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.scene.grid import RaySamples
+from semantic_mapper.fields.scene.grid import OPAQUE, RaySamples
 from semantic_mapper.fields.scene.irt import IRT, RayTexture, at_measured, no_texture, surface
 from semantic_mapper.geometry import camera_matrix, invert_pose
-from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import FinetuneConfig
 from semantic_mapper.training.fit import Budget, Fitted, HeldOut, State, cosine_rate, descend, fit, held_out_blocks
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays
 from semantic_mapper.training.grid_fit import fit_geometry, fit_trunk, grid_figures, trunk_steps
 from semantic_mapper.training.losses import IGNORE, RAREST, semantic_loss
-from semantic_mapper.training.views import jittered
+from semantic_mapper.training.views import FrameRays, frame_rays, jittered, pixel_channels
 from semantic_mapper.types import PosedFrame
 
 RAYS = 512  # a step
@@ -121,12 +119,7 @@ def labelled_rays(frames: Sequence[PosedFrame], label_set: LabelSet, config: Fin
     rays = frame_rays(frames, config.width)
     if len({(k.width, k.height) for k in rays.intrinsics}) > 1:
         raise FrameError("labelled frames have several sizes; give those of one camera")
-    channel = [
-        label_set.to_channels(resize_label(f.label, k), f"frame seq={f.seq}").ravel()
-        for f, k in zip(frames, rays.intrinsics, strict=True)
-        if f.label is not None
-    ]
-    flat = torch.from_numpy(np.concatenate(channel)).long()
+    flat = pixel_channels(frames, rays, label_set)
     if len(flat[flat >= 0].unique()) < 2:
         raise FrameError("the labelled frames show fewer than two classes; there is nothing to tell apart")
     height, width = rays.image_size(0)
@@ -284,9 +277,7 @@ def carry_labels(field: IRT, rays: FrameRays, channel: torch.Tensor, near_m: flo
         with torch.no_grad():
             for part in blank.split(4096):
                 samples = field.march(rays.rays(pixels[part.numpy()], near_m))
-                met = samples.opacity > 0.5
-                z = (samples.weight * samples.z).sum(1) / samples.weight.sum(1).clamp_min(1e-6)
-                depth[part] = torch.where(met, z, torch.zeros_like(z))
+                depth[part] = torch.where(samples.opacity > OPAQUE, samples.depth_m, 0.0)
         carried.depth_m[i] = depth.view(size)
         carried.channel[i] = channel[torch.from_numpy(pixels)].view(size).to(torch.int16)
         carried.K[i] = torch.from_numpy(camera_matrix(k))

@@ -38,11 +38,9 @@ def semantic_loss(logits: torch.Tensor, channel: torch.Tensor, weight: torch.Ten
 
 
 def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> torch.Tensor:
-    """Cross-entropy over labelled pixels, 0 without any.
+    """Cross-entropy of logits (m, L, h, w) over labelled pixels (m, H, W), 0 without any.
 
     Args:
-        logits: (m, L, h, w).
-        channel: (m, H, W) int64, -1 = ignore; the nearest pixel counts where sizes differ.
         balance: A class counts by its fraction of the pixels to the power of minus this: 0 as it comes, 1 all alike.
     """
     size = logits.shape[-2:]
@@ -64,9 +62,8 @@ def guess_loss(geometry: torch.Tensor, given_m: torch.Tensor, depth_m: torch.Ten
     alike, and the width is learned with the guess.
 
     Args:
-        geometry: (m, G, h, w) of ``EncodedViews``: nearer component first, its depth and its spread in metres.
-        given_m: (m, H, W) depth that the field was given, 0 = none.
-        depth_m: (m, H, W) depth that was measured, 0 = unknown.
+        geometry: (m, G, h, w) of ``EncodedViews``.
+        given_m, depth_m: (m, H, W) depth that the field was given, and that was measured; 0 = none.
     """
     size = geometry.shape[-2:]
     target = functional.interpolate(depth_m[:, None], size=size, mode="nearest-exact")[:, 0]

@@ -85,9 +85,7 @@ class KeyframePool:
     def add(self, frame: PosedFrame, label_set: LabelSet) -> None:
         """Add a keyframe; one of the same camera and time is replaced, and no longer validated.
 
-        Args:
-            frame: With labels.
-            label_set: Of these; classes are translated by name, those that the weights lack are not learned.
+        Its classes are translated by name; those that the weights lack are not learned.
 
         Raises:
             FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed.
@@ -118,15 +116,8 @@ class KeyframePool:
             self._kept[key] = replace(self._kept[key], validated_by=version, trials=0)
 
     def reject(self, keys: Collection[Key], *, worse: bool) -> int:
-        """A round with these keyframes had no success: those not validated get ``MAX_TRIALS`` such rounds.
-
-        Args:
-            keys: Of the round.
-            worse: It made the weights worse: those not validated are dropped at once.
-
-        Returns:
-            How many were dropped.
-        """
+        """A round with these keyframes had no success: those not validated get ``MAX_TRIALS`` such rounds, or none
+        where it made the weights ``worse``. Returns how many were dropped."""
         for key in self._not_validated(keys):
             trials = MAX_TRIALS if worse else self._kept[key].trials + 1
             self._kept[key] = replace(self._kept[key], trials=trials)
@@ -206,10 +197,7 @@ def learn(
 
     Args:
         keyframes: At least two to learn from and one to judge by.
-        current: Weights in use.
-        config: Of the round.
-        on_progress: Called after every step.
-        on_judged: Called after each held-out keyframe. What either raises ends the round.
+        on_progress, on_judged: Called after every step, and every held-out keyframe. What either raises ends the round.
 
     Raises:
         FrameError: too few keyframes, or those held out have nothing to judge by.

@@ -20,25 +20,15 @@ from semantic_mapper.errors import ConfigError, FrameError, WeightsError
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.boxes import MovingBoxes, RaysInBox
 from semantic_mapper.fields.scene.grid import NOTHING, OPAQUE, RaySamples, SceneGrid, ray_fraction
-from semantic_mapper.fields.scene.march import adam_grid
 from semantic_mapper.fields.scene.panoptic import CORE, LOOSE_M, BoxesOnRays, Panoptic, merged_classes
 from semantic_mapper.fields.scene.primitives import ALONE_NS, Primitive
 from semantic_mapper.geometry import invert_pose
-from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import FinetuneConfig, PanopticFitConfig
 from semantic_mapper.training.fit import Budget, Fitted, descend, fit
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays
-from semantic_mapper.training.grid_fit import (
-    BETA1,
-    BETA2,
-    fit_geometry,
-    grid_figures,
-    grid_of_depth,
-    trunk_optimiser,
-    view_fraction,
-)
+from semantic_mapper.training.grid_fit import GridAdam, fit_geometry, grid_figures, grid_of_depth, trunk_optimiser
+from semantic_mapper.training.views import FrameRays, frame_rays, pixel_channels
 from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame
 
 GRID_UNTIL = 0.35  # fraction of the time for geometry and colours alone
@@ -71,17 +61,6 @@ class PseudoRays:
     channel: torch.Tensor  # (P,) int64, -1 = none
     gain: torch.Tensor  # (F, 3) exposure of the frames
     still: Int64  # numbers of the pixels that show what stands still
-
-
-@dataclass(frozen=True, slots=True)
-class Survey:
-    """What boxes and pseudo labels have to do with each other."""
-
-    # How many stand still, and how many of these any surveyed ray meets
-    boxes: int
-    seen: int
-    covered: float  # fraction of pixels whose ray meets a box
-    matched: float  # fraction of pixels with a pseudo label whose class is possible on their ray
 
 
 def fit_panoptic(
@@ -141,11 +120,7 @@ def fit_panoptic(
     if steps < LEARNED and budget.stopped():
         field.shape = field.config = msgspec.structs.replace(field.shape, classes="fixed")
     fill_boxes(field, grid.frames, data.rays, grid.gains, config.grid.near_m)
-    found = {
-        "boxes": survey.boxes,
-        "seen": survey.seen,
-        "covered": round(survey.covered, 4),
-        "matched": round(survey.matched, 4),
+    found = survey | {
         "moving": len(start.moving) - lost,
         "lost": lost,
         "labelled_frames": sum(f.label is not None for f in frames),
@@ -173,13 +148,7 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
     rays = frame_rays(frames, width)
     if all(f.label is None for f in frames):
         raise FrameError("no frame has a pseudo label; give a folder of them or weights that make some (--pseudo)")
-    channel = [
-        np.full(k.width * k.height, -1)
-        if f.label is None
-        else label_set.to_channels(resize_label(f.label, k), f"frame seq={f.seq}").ravel()
-        for f, k in zip(frames, rays.intrinsics, strict=True)
-    ]
-    channels = torch.from_numpy(np.concatenate(channel)).long()
+    channels = pixel_channels(frames, rays, label_set)
     if not (channels >= 0).any():
         raise FrameError(
             f"all pixels of all {sum(f.label is not None for f in frames)} pseudo labels are unknown (id "
@@ -188,12 +157,19 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
     return PseudoRays(rays, channels, torch.ones(len(frames), 3), np.arange(len(rays)))
 
 
-def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> Survey:
-    """How many pixels meet boxes.
-    Raises ConfigError: no pixel does, or boxes and pseudo labels have no class in common."""
+def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> dict[str, float]:
+    """What boxes that stand still and pseudo labels have to do with each other, of some of the pixels.
+
+    Returns:
+        ``boxes``, and how many of these are ``seen``; fractions of the pixels whose ray meets one (``covered``), and of
+        those with a pseudo label whose class is possible on their ray (``matched``).
+
+    Raises:
+        ConfigError: no pixel meets a box, or boxes and pseudo labels have no class in common.
+    """
     if not len(field.primitives):
-        return Survey(0, 0, 0.0, 1.0)
-    pixels = _some_pixels(data, config.seed)
+        return {"boxes": 0, "seen": 0, "covered": 0.0, "matched": 1.0}
+    pixels = np.random.default_rng(config.seed).integers(0, len(data.rays), SURVEYED)
     rays = data.rays.rays(pixels, config.grid.near_m)
     found = field.primitives.intervals(rays)
     covered = (found.count > 0).float().mean().item()
@@ -217,7 +193,8 @@ def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> S
         _log.warning(
             "few_labels_match", matched=round(matched, 4), reason="most name a class that no box on their ray has"
         )
-    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched)
+    seen = len(found.index[found.index >= 0].unique())
+    return {"boxes": len(field.primitives), "seen": seen, "covered": round(covered, 4), "matched": round(matched, 4)}
 
 
 def possible(on_ray: torch.Tensor, group: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
@@ -237,12 +214,9 @@ def semantic_losses(
     """Eq. 5 and 6: the pseudo labels against the fixed field and the learned one, and this one against the boxes.
 
     Args:
-        samples: R rays; weights differentiable by the density.
-        boxes: What holds them.
+        boxes: What holds the samples.
         learned: (R, K, L) the learned field.
-        channel: (R,) pseudo labels, -1 = none.
-        group: (L, L) of ``merged_classes``.
-        weights: Of the three terms.
+        channel: (R,) pseudo labels, -1 = none; ``group`` (L, L) says what they may stand for.
     """
     there = channel >= 0
     stands_for = group[channel.clamp_min(0)]
@@ -269,9 +243,7 @@ class JointFit:
         self.optimiser = trunk_optimiser(field.trunk, field.head, field.classifier)
         self.rates = [group["lr"] for group in self.optimiser.param_groups]
         field.grid.values.requires_grad_(True)
-        values = field.grid.values.detach().numpy()
-        self.first, self.second = np.zeros_like(values), np.zeros_like(values)
-        self.rate = view_fraction(data.rays, field.grid.config, config.grid.near_m)
+        self.adam = GridAdam(field.grid, data.rays, config.grid.near_m)
         self.solid = field.solid() if field.shape.uncovered == "empty" else None
         self.step = 0
         self._empty_cells()
@@ -321,23 +293,9 @@ class JointFit:
 
     def _step_density(self, rate: float) -> None:
         self.step += 1
-        grid = self.field.grid
-        gradient = grid.values.grad
+        gradient = self.field.grid.values.grad
         assert gradient is not None
-        adam_grid(
-            len(self.rate),
-            grid.values.detach().numpy(),
-            gradient.contiguous().numpy(),
-            self.first,
-            self.second,
-            self.rate,
-            rate,
-            0.0,
-            BETA1,
-            BETA2,
-            1 - BETA1**self.step,
-            1 - BETA2**self.step,
-        )
+        self.adam.step(gradient.contiguous().numpy(), rate, 0.0)
         if self.step % EMPTY_EVERY == 0:
             self._empty_cells()
 
@@ -358,22 +316,11 @@ def _followed(start: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays) ->
     return tuple(box for box in start.shape.boxes if box.id not in lost), len(lost)
 
 
-def _some_pixels(data: PseudoRays, seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, len(data.rays), SURVEYED)
-
-
 def boxes_in_view(boxes: Sequence[Primitive], frames: Sequence[PosedFrame]) -> Bool:
     """Which boxes (P,) may be in the image of a frame, none of those that are for certain (what hides them is ignored).
 
     A box is taken as the ball round it, and an image as the cone through its corners. Boxes that move are looked at
-    where they are at the time of each frame.
-
-    Args:
-        boxes: P of them.
-        frames: With rigid poses, at any size.
-
-    Raises:
-        ConfigError: no box may be in any image.
+    where they are at the time of each frame. Raises ConfigError: no box may be in any image.
     """
     balls = [_ball(box) for box in boxes]
     centre = np.array([c for c, _ in balls]).reshape(-1, 3)
@@ -470,14 +417,7 @@ def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, g
     """Fill the grids of the boxes that move from depth images and colours; the scene's own grid is fitted.
 
     What the scene itself has at a measured depth, such as the road under a car, is not of the box. Where no frame
-    measures the inside of a box, its core is full.
-
-    Args:
-        field: Its boxes that move are filled.
-        frames: F of them.
-        rays: Of the frames.
-        gains: (F, 3) exposure of the frames.
-        near_m: From which on rays look.
+    measures the inside of a box, its core is full. ``gains`` (F, 3) is the exposure of the frames.
     """
     boxes = field.moving
     depths = [np.zeros_like(rays.depth_m) for _ in boxes.primitives]
@@ -535,8 +475,7 @@ def _scene_depth(field: Panoptic, rays: FrameRays, pixels: Int64, near_m: float)
     """z (R,) of the scene that stands still at pixels, 0 where nothing is."""
     with torch.no_grad():
         samples = field.march(rays.rays(pixels, near_m))
-        z = (ray_fraction(samples) * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)
-    return torch.where(samples.opacity > OPAQUE, z, 0.0).numpy()
+    return torch.where(samples.opacity > OPAQUE, samples.depth_m, 0.0).numpy()
 
 
 def _ends(met: RaysInBox) -> tuple[torch.Tensor, torch.Tensor]:

@@ -16,7 +16,7 @@ import numpy as np
 from semantic_mapper.config import GridConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.scene.grid import grid_box
-from semantic_mapper.geometry import camera_matrix, invert_pose, nearest_pixels, transform
+from semantic_mapper.geometry import camera_matrix, invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.imaging import resize_depth, resize_rgb, working_intrinsics
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import GridFitConfig
@@ -124,10 +124,7 @@ def _tiles(frame: PosedFrame, points: Float64) -> Float64:
 def _measured(frame: PosedFrame) -> Float32:
     """Some of the measured points (N, 3) in the world."""
     depth = resize_depth(frame, frame.intrinsics)
-    v, u = np.nonzero(depth)
-    v, u = v[::EVERY], u[::EVERY]
-    z, k = depth[v, u].astype(np.float64), frame.intrinsics
-    points = np.stack(((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z), axis=1)
+    points = unproject(depth, frame.intrinsics)[depth > 0][::EVERY]
     return transform(frame.T_world_camera, points).astype(np.float32)
 
 

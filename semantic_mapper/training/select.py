@@ -80,9 +80,7 @@ def suggest_frames(
     Where no candidate has depth, each suggestion is the frame farthest in time from all labelled ones.
 
     Args:
-        candidates: Frames in the order of the log, labelled ones among them.
-        count: Wanted.
-        labelled: Indices of those whose labels are known.
+        candidates: Frames in the order of the log, ``labelled`` ones (their indices) among them.
         weights: (P,) what each of a candidate's pixels counts, one array a candidate; None = all alike.
     """
     if not any(len(c.cells) for c in candidates):

@@ -29,12 +29,7 @@ DEPTH_LEVELS = 180.0  # of the guide for one dioptre
 def grow_strokes(frame: PosedFrame, label_set: LabelSet) -> PosedFrame:
     """A frame whose label image has grown from its strokes; painted pixels stay as they are.
 
-    Args:
-        frame: With label image. Its depth, where it has some, ends strokes, too.
-        label_set: Of the label image.
-
-    Raises:
-        FrameError: it has no label image.
+    Depth ends strokes, too, where the frame has some. Raises FrameError: it has no label image.
     """
     if frame.label is None:
         raise FrameError(f"frame seq={frame.seq} has no label image whose strokes could grow")

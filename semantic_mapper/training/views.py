@@ -1,4 +1,4 @@
-"""Labelled views as tensors, how much they see of each other, and the draws that fits make from them."""
+"""Frames as fits take them: labelled views and who sees whom of them, or the rays of all pixels of many frames."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ import numpy as np
 import torch
 
 from semantic_mapper.config import SamplingConfig
+from semantic_mapper.errors import FrameError, PoseError
 from semantic_mapper.fields.base import UNSURE_SPREAD
 from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
-from semantic_mapper.geometry import GUESSED_DEPTHS_M, camera_matrix, transform, unproject, visible_points
+from semantic_mapper.geometry import GUESSED_DEPTHS_M, camera_matrix, check_pose, transform, unproject, visible_points
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.rays import pixel_rays
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, RayBatch, SourceViews
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64, PosedFrame, RayBatch, SourceViews, UInt8
+
+_log = get_logger(__name__)
 
 PROBE = 24  # pixels a row of a view that overlap is found with
 
@@ -125,12 +129,7 @@ def jittered(rgb: torch.Tensor, strength: float, generator: torch.Generator) -> 
 def draw_pixels(
     channel: torch.Tensor, count: int, balanced_fraction: float, generator: torch.Generator, classes: int
 ) -> torch.Tensor:
-    """Flat indices of labelled pixels (count,): partly uniform, partly with every class present equally likely.
-
-    Args:
-        channel: (H, W) int64, -1 = not to be drawn.
-        classes: L.
-    """
+    """Flat indices of labelled pixels (count,): partly uniform, partly with every class present equally likely."""
     flat = channel.flatten()
     labelled = (flat >= 0).nonzero()[:, 0]
     if len(labelled) == 0:
@@ -198,11 +197,7 @@ def guided_rays(
 
 
 def view_overlap(views: Sequence[LabelledView]) -> torch.Tensor:
-    """Fraction of what each view sees that each other view sees, too: who shares nothing with a query teaches nothing.
-
-    Returns:
-        (n, n) float32 in [0, 1]; row = the view that is seen, column = the one that looks; 0 on the diagonal.
-    """
+    """Fraction (n, n) of what each view (row) sees that each other view (column) sees, too; 0 on the diagonal."""
     overlap = torch.zeros(len(views), len(views))
     poses = [view.T_world_camera.cpu().numpy().astype(np.float64) for view in views]
     depths = [view.depth_m.cpu().numpy() for view in views]
@@ -223,3 +218,86 @@ def _points(pose: Float64, depth_m: Float32, view: LabelledView) -> tuple[Float6
     if not (depth > 0).any():
         return transform(pose, np.concatenate([unit * z for z in GUESSED_DEPTHS_M])), False
     return transform(pose, unit[depth > 0] * depth[depth > 0, None]), True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRays:
+    """Pixels of F frames, P in all, frame by frame and row by row."""
+
+    intrinsics: tuple[CameraIntrinsics, ...]  # of each frame, at working width; sizes may differ
+    T_world_camera: Float32  # (F, 4, 4) float32
+    first: Int64  # (F + 1,) number of each frame's first pixel
+    rgb: UInt8  # (P, 3) uint8
+    depth_m: Float32  # (P,) z in metres, 0 = none
+
+    def __len__(self) -> int:
+        return int(self.first[-1])
+
+    def frame_of(self, pixels: Int64) -> Int64:
+        """Number of the frame (R,) of each pixel."""
+        return np.searchsorted(self.first, pixels, side="right") - 1
+
+    def rays(self, pixels: Int64, near_m: float) -> RayBatch:
+        """Rays of the world through pixels (R,), without bound behind."""
+        frame = self.frame_of(pixels)
+        camera = np.array([(k.fx, k.fy, k.cx, k.cy, k.width) for k in self.intrinsics])[frame]
+        v, u = np.divmod(pixels - self.first[frame], camera[:, 4].astype(np.int64))
+        towards = np.stack(
+            ((u - camera[:, 2]) / camera[:, 0], (v - camera[:, 3]) / camera[:, 1], np.ones(len(u))), axis=1
+        )
+        direction = np.einsum("rij,rj->ri", self.T_world_camera[frame, :3, :3], towards.astype(np.float32))
+        near, far, none = (torch.full((len(u),), x) for x in (near_m, np.inf, 0.0))
+        origin = np.ascontiguousarray(self.T_world_camera[frame, :3, 3])
+        return RayBatch(torch.from_numpy(origin), torch.from_numpy(direction), near, far, none)
+
+    def colours(self, pixels: Int64) -> torch.Tensor:
+        """Colours (R, 3) in [0, 1] of pixels (R,)."""
+        return torch.from_numpy(self.rgb[pixels] / np.float32(255))
+
+    def pixels_of(self, frame: int) -> Int64:
+        """Numbers of all pixels of a frame, row by row."""
+        return np.arange(self.first[frame], self.first[frame + 1])
+
+    def image_size(self, frame: int) -> tuple[int, int]:
+        """Height and width of a frame."""
+        return self.intrinsics[frame].height, self.intrinsics[frame].width
+
+
+def frame_rays(frames: Sequence[PosedFrame], width: int) -> FrameRays:
+    """The pixels of frames at a working width. Raises FrameError: no frames."""
+    if not frames:
+        raise FrameError("there are no frames to take rays from")
+    intrinsics = tuple(working_intrinsics(f.intrinsics, width) for f in frames)
+    return FrameRays(
+        intrinsics,
+        np.stack([f.T_world_camera for f in frames]).astype(np.float32),
+        np.concatenate(([0], np.cumsum([k.width * k.height for k in intrinsics]))).astype(np.int64),
+        np.concatenate([resize_rgb(f, k).reshape(-1, 3) for f, k in zip(frames, intrinsics, strict=True)]),
+        np.concatenate([resize_depth(f, k).reshape(-1) for f, k in zip(frames, intrinsics, strict=True)]),
+    )
+
+
+def pixel_channels(frames: Sequence[PosedFrame], rays: FrameRays, label_set: LabelSet) -> torch.Tensor:
+    """Class channels (P,) int64 of the frames' label images, -1 = none."""
+    channels = [
+        np.full(k.width * k.height, -1)
+        if f.label is None
+        else label_set.to_channels(resize_label(f.label, k), f"frame seq={f.seq}").ravel()
+        for f, k in zip(frames, rays.intrinsics, strict=True)
+    ]
+    return torch.from_numpy(np.concatenate(channels)).long()
+
+
+def usable_frames(frames: Sequence[PosedFrame]) -> list[PosedFrame]:
+    """The frames whose poses are rigid; others are left out, with a warning that counts them."""
+    good: list[PosedFrame] = []
+    reasons: list[str] = []
+    for frame in frames:
+        try:
+            check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
+            good.append(frame)
+        except PoseError as error:
+            reasons.append(str(error))
+    if reasons:
+        _log.warning("frames_left_out", count=len(reasons), reason=reasons[0])
+    return good

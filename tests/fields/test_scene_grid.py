@@ -75,19 +75,6 @@ def test_a_kind_says_what_samples_mean_and_only_where_something_is() -> None:
     assert not away.known.any()
 
 
-def test_given_samples_render_as_marched_ones_do() -> None:
-    field = wall_field()
-    rays = wall_rays(pose_at(0.0), step=11)
-    sources = field.encode(wall_sources(POSES[:1]))
-    z = torch.arange(0.3, 3.0, 0.02).expand(len(rays.origin), -1).contiguous()
-    given, weights = field.render_samples(rays, z, sources)
-    marched = field.render(rays, sources)
-    torch.testing.assert_close(given.opacity, weights.sum(1))
-    torch.testing.assert_close(given.depth_m, marched.depth_m, atol=0.05, rtol=0)
-    torch.testing.assert_close(given.rgb, marched.rgb, atol=0.03, rtol=0)
-    assert field.sample(rays, sources).shape == (len(rays.origin), 16)
-
-
 @pytest.mark.parametrize("features", [0, 8])
 def test_a_file_holds_the_grid_as_float16_and_gives_it_back(features: int, tmp_path) -> None:
     field = wall_field(features)

@@ -147,29 +147,6 @@ def test_the_photometric_step_has_the_gradients_of_plain_torch() -> None:
     torch.testing.assert_close(torch.from_numpy(results.sky_gradient), sky.grad, atol=1e-6, rtol=1e-3)
 
 
-def test_every_loop_gives_the_same_bits_on_any_number_of_threads() -> None:
-    before = torch.get_num_threads()
-    found: list[list[np.ndarray]] = []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            values, occupied = random_grid()
-            gradient, results, _ = photometric(values, occupied)
-            leaf = values.clone().requires_grad_()
-            marched = march(leaf, occupied, random_rays())
-            marched.weight.square().sum().backward()
-            assert leaf.grad is not None
-            stepped, first, second = values.numpy().copy(), np.zeros_like(gradient), np.zeros_like(gradient)
-            add_total_variation(len(gradient), stepped, gradient, 1e-3, 1e-3)
-            rate = np.ones(SHAPE, np.float32)
-            adam_grid(len(gradient), stepped, gradient, first, second, rate, 0.1, 0.1, 0.9, 0.99, 0.1, 0.01)
-            found.append([stepped, first, *results, marched.z.numpy(), leaf.grad.numpy()])
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert all(np.array_equal(a, b) for a, b in zip(found[0], other, strict=True))
-
-
 def test_adam_steps_as_torch_does_and_leaves_what_has_no_gradient() -> None:
     values, _ = random_grid()
     gradient = np.random.default_rng(0).normal(size=(3, *values.shape)).astype(np.float32)

@@ -27,9 +27,9 @@ from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.training.config import GridFitConfig
-from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_fit import grid_of_depth
 from semantic_mapper.training.scene_box import scene_box
+from semantic_mapper.training.views import frame_rays
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.small import INTRINSICS, tiny_field, tiny_frames

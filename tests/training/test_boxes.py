@@ -19,8 +19,7 @@ from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.finetune import finetune
-from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.views import stack_sources, view_from_frame
+from semantic_mapper.training.views import frame_rays, stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, PosedFrame
 from tests.training.test_panoptic import SMALL
 from tests.training.two_planes import BOX_M, two_planes

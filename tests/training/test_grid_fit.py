@@ -20,9 +20,9 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import Budget
-from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.grid_fit import distance_to_surface, fit_grid, grid_of_depth, held_out_psnr, render_frame
+from semantic_mapper.training.grid_fit import fit_grid, held_out_psnr, render_frame
 from semantic_mapper.training.scene_box import scene_box, sparse_points
+from semantic_mapper.training.views import frame_rays
 from semantic_mapper.types import PosedFrame
 from tests.small import tiny_frames
 from tests.training.two_planes import BOX_M, two_planes
@@ -59,18 +59,6 @@ def test_the_same_fit_gives_the_same_bits_on_any_number_of_threads() -> None:
         torch.set_num_threads(before)
     for other in grids[1:]:
         assert all(torch.equal(tensor, other[name]) for name, tensor in grids[0].items())
-
-
-def test_a_grid_of_depth_alone_has_its_surface_where_depth_was_measured() -> None:
-    rays = frame_rays(tiny_frames(), 96)
-    box = scene_box(tiny_frames(), GridFitConfig(long_side=96))
-    grid = grid_of_depth(rays, box)
-    _, depth = render_frame(grid, rays, 2, 0.1)
-    measured = rays.depth_m[rays.pixels_of(2)].reshape(depth.shape)
-    seen = measured > 0
-    assert np.median(np.abs(depth - measured)[seen]) < 0.6 * box.voxel_m
-    _, observed = distance_to_surface(rays, box)
-    assert 0.05 < observed.mean() < 0.95
 
 
 def test_a_fit_that_starts_from_depth_keeps_it_and_learns_colours() -> None:

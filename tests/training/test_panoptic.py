@@ -21,9 +21,8 @@ from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig, StepConfig
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.panoptic import boxes_in_view, held_out_unlabelled, semantic_losses
-from semantic_mapper.training.views import stack_sources, view_from_frame
+from semantic_mapper.training.views import frame_rays, stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, RayBatch
 from tests.training.two_planes import two_planes
 

@@ -18,7 +18,7 @@ from research.train.grid_nesf import (
 from semantic_mapper.config import GridConfig
 from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.labels import KLEVR
-from semantic_mapper.training.frame_rays import frame_rays
+from semantic_mapper.training.views import frame_rays
 
 RUN = KlevrConfig(width=40, views=12, train_views=8, label_maps=2)
 TRAINING = GridNesfTraining(network=GridNesfConfig(size=16, width=4), near_m=1.0)

@@ -81,14 +81,8 @@ def trimmed(found: Intervals) -> Intervals:
 
 
 class PrimitiveSet:
-    """Primitives that stand still, ready for rays.
-
-    Args:
-        primitives: P of them, none of which moves.
-
-    Raises:
-        ConfigError: a mesh is open or has no volume, naming its box.
-    """
+    """P primitives that stand still, ready for rays.
+    Raises ConfigError: a mesh is open or has no volume, naming its box."""
 
     def __init__(self, primitives: Sequence[Primitive]) -> None:
         self.primitives = tuple(primitives)
@@ -157,15 +151,8 @@ class RaysInBox:
 
 
 class MovingBoxes(nn.Module):
-    """M boxes that move. Their grids are empty until somebody fills them.
-
-    Args:
-        primitives: With stamps.
-        voxel_m: Of the scene's grid.
-
-    Raises:
-        ConfigError: a mesh is open or has no volume, naming its box.
-    """
+    """M boxes that move, with stamps. Their grids, finer than the scene's, are empty until somebody fills them.
+    Raises ConfigError: a mesh is open or has no volume, naming its box."""
 
     def __init__(self, primitives: Sequence[Primitive], voxel_m: float) -> None:
         super().__init__()

@@ -33,7 +33,7 @@ from semantic_mapper.fields.scene.march import (
     gather,
     march,
 )
-from semantic_mapper.fields.volume import composite_depth, field_render, interval_lengths
+from semantic_mapper.fields.volume import composite_depth, field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -45,6 +45,7 @@ NOTHING = -10.0  # raw density of what is empty: an opacity of 5e-8
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 4, 2
 COLOUR_WIDTH = 64
 FEATURE_START = 0.1  # standard deviation
+LEAST_SLOPE = 1e-6  # of a ray along an axis
 OPAQUE = 0.5  # opacity from which on a ray has met something
 
 
@@ -53,10 +54,7 @@ class SceneGrid(nn.Module):
 
     ``values`` (X, Y, Z, 4) holds raw density, red, green and blue; ``occupied`` tells which cells rays may skip;
     ``sky`` (16, 32, 3) are raw colours by direction, for rays that leave the box. They are parameters without
-    gradients: fits that want some ask for them.
-
-    Args:
-        config: The box. All axes are the world's.
+    gradients: fits that want some ask for them. All axes are the world's.
     """
 
     occupied: torch.Tensor
@@ -81,6 +79,14 @@ class SceneGrid(nn.Module):
         middle = torch.full_like(rays.near_m, 0.5) if jitter is None else jitter
         direction = rays.direction / self.config.voxel_m
         return GridRays(origin, direction, rays.near_m, torch.full_like(rays.far_m, math.inf), middle)
+
+    def span(self, rays: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        """z (R,) at which rays enter the box, or begin in it, and at which they leave it; less where they miss it."""
+        low = rays.origin.new_tensor(self.config.origin_m)
+        high = low + self.config.voxel_m * (rays.origin.new_tensor(self.config.shape) - 1)
+        step = torch.where(rays.direction.abs() < LEAST_SLOPE, LEAST_SLOPE, rays.direction)
+        ends = (low - rays.origin) / step, (high - rays.origin) / step
+        return torch.maximum(torch.minimum(*ends).amax(1), rays.near_m), torch.maximum(*ends).amin(1)
 
     def march(self, rays: GridRays, kept: int = KEPT) -> March:
         """The samples of greatest weight of each ray, as far as the grid reaches."""
@@ -260,6 +266,11 @@ class RaySamples:
         """(R,) what the grid stops."""
         return 1 - self.light
 
+    @property
+    def depth_m(self) -> torch.Tensor:
+        """(R,) mean z of what rays meet."""
+        return (self.weight * self.z).sum(1) / self.weight.sum(1).clamp_min(1e-6)
+
     def at(self, index: torch.Tensor) -> RaySamples:
         """The samples at positions (R, N) of each ray."""
         points = self.points.gather(1, index[..., None].expand(-1, -1, 3))
@@ -284,12 +295,8 @@ class GridField(LearnedField):
     """Geometry and colour of one scene, without classes.
 
     Colour, depth and opacity are rendered wherever the grid has them. A ray is *known* where the field can say a
-    class, which this kind nowhere can: its logits are zeros. A kind that can overrides ``classify``.
-
-    Args:
-        config: The box, and whether colours depend on the direction.
-        label_set: Classes of the logits.
-        sampling: Its ``near_m`` bounds rays; where they are sampled, the grid says.
+    class, which this kind nowhere can: its logits are zeros. A kind that can overrides ``classify``. Of the sampling
+    only ``near_m`` counts: where rays are sampled, the grid says.
     """
 
     kind: ClassVar[str] = "grid"
@@ -324,10 +331,9 @@ class GridField(LearnedField):
         none = torch.zeros(count, dtype=torch.bool, device=samples.z.device)
         return samples.z.new_zeros(count, len(self.label_set)), none
 
-    def known(self, samples: RaySamples, *, sky: bool = False) -> torch.Tensor:
-        """Where rays (R,) have met something; for kinds with a class for the sky, ``sky`` = those that leave, too."""
-        opaque = samples.opacity > OPAQUE
-        return (opaque | sky) & self.fitted
+    def known(self, samples: RaySamples) -> torch.Tensor:
+        """Where rays (R,) have met something."""
+        return (samples.opacity > OPAQUE) & self.fitted
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """The views' cameras and colours, without features: nothing of them is looked at.
@@ -343,22 +349,9 @@ class GridField(LearnedField):
             marched = March(marched.z, torch.zeros_like(marched.weight), torch.ones_like(marched.light))
         return RaySamples(rays, in_grid.points(marched.z), marched.z, marched.weight, marched.light)
 
-    def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
-        """Depths (R, K) of the samples of greatest weight."""
-        with torch.no_grad():
-            return self.march(rays).z
-
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays; differentiable by what asks for gradients."""
         return self.render_marched(self.march(rays), sources)
-
-    def render_samples(
-        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
-    ) -> tuple[FieldRender, torch.Tensor]:
-        """Render rays at given sample depths z (R, N), metres; also the compositing weights (R, N)."""
-        in_grid = self.grid.rays(rays)
-        samples = self.samples_at(rays, in_grid, z)
-        return self.render_marched(samples, sources), samples.weight
 
     def render_marched(self, samples: RaySamples, sources: EncodedViews) -> FieldRender:
         """What marched rays render to."""
@@ -379,15 +372,3 @@ class GridField(LearnedField):
         if self.trunk is None:
             return self.grid.colour(samples.points)
         return self.trunk.colour(self.trunk(samples.points), samples.rays.direction)
-
-    def samples_at(self, rays: RayBatch, in_grid: GridRays, z: torch.Tensor) -> RaySamples:
-        """Samples at given depths, each as long as it is to the next one."""
-        points = in_grid.points(z)
-        top = points.new_tensor([n - 1 for n in self.config.grid.shape])
-        inside = ((points >= 0) & (points <= top)).all(-1)
-        raw = gather(self.grid.values, points)[..., 0]
-        length = interval_lengths(z, in_grid.direction.norm(dim=1))
-        depth = SceneGrid.optical_depth(raw) * length * inside * self.fitted
-        before = torch.cumsum(depth, 1) - depth
-        weight = torch.exp(-before) * -torch.expm1(-depth)
-        return RaySamples(rays, points, z, weight, 1 - weight.sum(1))

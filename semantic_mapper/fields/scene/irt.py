@@ -66,13 +66,7 @@ class TextureNet(nn.Module):
 
 
 class IRT(GridField):
-    """Classes of one scene from its geometry, its colours and the texture of the query's own image.
-
-    Args:
-        config: The box, the variant, sizes.
-        label_set: Classes of the logits.
-        sampling: As of ``GridField``.
-    """
+    """Classes of one scene from its geometry, its colours and the texture of the query's own image."""
 
     kind = "irt"
     class_rows = ("classifier.weight", "classifier.bias")
@@ -110,7 +104,8 @@ class IRT(GridField):
         texture = self.texture_of(samples.rays, sources)
         samples = at_measured(samples, self.grid.config)
         logits = self.logits(samples, texture, self.carried_to(samples))
-        seen = texture.there & self.crosses(samples.rays) & self.fitted
+        enter, leave = self.grid.span(samples.rays)
+        seen = texture.there & (leave > enter) & self.fitted
         return logits, self.known(samples) | seen
 
     def logits(self, samples: RaySamples, texture: RayTexture, carried: torch.Tensor | None) -> torch.Tensor:
@@ -140,22 +135,11 @@ class IRT(GridField):
             return None
         return self.carried(surface(samples), torch.ones(self.shape.carried, device=samples.z.device))
 
-    def crosses(self, rays: RayBatch) -> torch.Tensor:
-        """Whether rays (R,) meet the box."""
-        box = self.config.grid
-        low = rays.origin.new_tensor(box.origin_m)
-        high = low + box.voxel_m * (rays.origin.new_tensor(box.shape) - 1)
-        slope = torch.where(rays.direction.abs() < 1e-9, torch.full_like(rays.direction, 1e-9), rays.direction)
-        a, b = (low - rays.origin) / slope, (high - rays.origin) / slope
-        enter, leave = torch.minimum(a, b).amax(1), torch.maximum(a, b).amin(1)
-        return (leave > enter) & (leave > rays.near_m)
-
 
 def surface(samples: RaySamples) -> torch.Tensor:
     """Points (R, 3) of the world where rays end: measured depth where it is known, else that of the grid."""
-    mean = (samples.weight * samples.z).sum(1) / samples.weight.sum(1).clamp_min(1e-6)
     prior = samples.rays.prior_depth_m
-    z = torch.where(prior > 0, prior, mean)
+    z = torch.where(prior > 0, prior, samples.depth_m)
     return samples.rays.origin + z[:, None] * samples.rays.direction
 
 
@@ -238,12 +222,7 @@ class PointNet(nn.Module):
 
 
 class RayTransformer(nn.Module):
-    """Points of a ray attend to each other, and to a token of the texture of its pixel.
-
-    Args:
-        channels_in: Of points.
-        token: Whether there is one.
-    """
+    """Points of a ray attend to each other, and to a token of the texture of its pixel where there is one."""
 
     def __init__(self, channels_in: int, *, token: bool) -> None:
         super().__init__()
@@ -287,13 +266,7 @@ class Attention(nn.Module):
 
 
 class CarriedLabels(nn.Module):
-    """Votes of F labelled frames for the class of a point of the world, by how well their depth agrees.
-
-    Args:
-        frames: F.
-        size: Height and width of the frames.
-        classes: L.
-    """
+    """Votes of labelled frames of one size for the class of a point of the world, by how well their depth agrees."""
 
     depth_m: torch.Tensor
     channel: torch.Tensor

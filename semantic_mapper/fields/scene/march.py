@@ -221,14 +221,8 @@ class March(NamedTuple):
 def march(values: torch.Tensor, occupied: torch.Tensor, rays: GridRays, kept: int = KEPT) -> March:
     """The ``kept`` samples of greatest weight of each ray; differentiable by ``values``.
 
-    The gradient is exact: also samples that are left out, and those before a kept one, have theirs.
-
-    Args:
-        values: (X, Y, Z, C) at the vertices; channel 0 is the raw density.
-        occupied: uint8, of each cell of 4 intervals a side whether anything may be in it.
-
-    Raises:
-        ShapeError: a grid without two vertices a side.
+    The gradient is exact: also samples that are left out, and those before a kept one, have theirs. ``values`` and
+    ``occupied`` are those of ``GridArrays``. Raises ShapeError: a grid without two vertices a side.
     """
     if values.ndim != 4 or min(values.shape[:3]) < 2:
         raise ShapeError(f"a grid has at least 2 vertices a side and channels, got shape {tuple(values.shape)}")

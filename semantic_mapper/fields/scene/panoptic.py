@@ -68,23 +68,10 @@ class BoxesOnRays:
         total = allowed.sum(-1, keepdim=True)
         return torch.where(total > 0, allowed / total.clamp_min(LEAST), points)
 
-    @property
-    def covered(self) -> torch.Tensor:
-        """Whether samples (R, K) are in any box."""
-        return self.box.any(-1)
-
 
 class Panoptic(GridField):
-    """Classes and instances of one scene from its boxes, its geometry and what label images taught.
-
-    Args:
-        config: The grid's box, sizes, and the boxes; those that move have grids of their own.
-        label_set: Classes of the logits.
-        sampling: As of ``GridField``.
-
-    Raises:
-        LabelError: a box of a class that the label set lacks.
-    """
+    """Classes and instances of one scene from its boxes, its geometry and label images; boxes that move have
+    grids of their own. Raises LabelError: a box of a class that the label set lacks."""
 
     kind = "panoptic"
     class_rows = ("classifier.weight", "classifier.bias")
@@ -214,18 +201,9 @@ class Panoptic(GridField):
         return self.held[place] == pair
 
     def _behind(self, rays: RayBatch, found: Intervals) -> torch.Tensor:
-        beyond = (found.index >= 0) & (found.leave > self.span(rays)[1][:, None])
+        beyond = (found.index >= 0) & (found.leave > self.grid.span(rays)[1][:, None])
         first = found.index.gather(1, beyond.float().argmax(1, keepdim=True))[:, 0]
         return torch.where(beyond.any(1), self._channels(first), -1 if self.sky is None else self.sky)
-
-    def span(self, rays: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
-        """z (R,) at which rays enter the grid, or begin in it, and at which they leave it; less where they miss it."""
-        grid = self.grid.config
-        low = rays.origin.new_tensor(grid.origin_m)
-        high = low + grid.voxel_m * (rays.origin.new_tensor(grid.shape) - 1)
-        step = torch.where(rays.direction.abs() < LEAST, LEAST, rays.direction)
-        ends = (low - rays.origin) / step, (high - rays.origin) / step
-        return torch.maximum(torch.minimum(*ends).amax(1), rays.near_m), torch.maximum(*ends).amin(1)
 
     def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
         """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 outside of all boxes.

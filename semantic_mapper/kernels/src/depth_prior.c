@@ -1,4 +1,4 @@
-/* Depth borders drawn to the edges of the image: see fields/depth_prior.py. */
+/* Depth borders drawn to the edges of the image: see imaging.py. */
 #include <math.h>
 
 #include "kernels.h"

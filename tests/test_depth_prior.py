@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.fields.depth_prior import depth_prior
-from semantic_mapper.imaging import fill_holes
+from semantic_mapper.imaging import depth_prior, fill_holes
 
 NEAR_M, FAR_M, EDGE, WIDTH = 1.0, 2.0, 80, 160
 
