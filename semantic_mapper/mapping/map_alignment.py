@@ -10,14 +10,22 @@ import numpy as np
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import project
-from semantic_mapper.localization.consensus import Sighting, agreed, agreeing_with, find_consensus, sighting
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import Place
-from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.localization.relocalizer import (
+    NotFound,
+    Relocalized,
+    Relocalizer,
+    Sighting,
+    agreed,
+    agreeing_with,
+    find_consensus,
+    sighting,
+)
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.merge import check_fit
-from semantic_mapper.mapping.map_scale import require_same_scale
+from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -49,11 +57,7 @@ class MapAlignment:
 
 
 def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
-    """Refuse two saved maps without reading their blocks.
-
-    Args:
-        path, other: Of the first and the second.
-        find: Where the second lies in the first is to be found.
+    """Refuse two saved maps without reading their blocks; ``find``: where the second lies in the first is to be found.
 
     Raises:
         MapError: only one is in metres, they are the same map, or what is to be found cannot be; or one cannot be read.
@@ -76,11 +80,7 @@ def _nothing_to_find(which: str, way_out: str = _WAY_OUT) -> str:
 
 
 def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT) -> MapAlignment:
-    """Where another map lies in this one.
-
-    Args:
-        voxel_map, other: Are read.
-        way_out: What errors advise where it cannot be found.
+    """Where another map lies in this one; ``way_out`` is what errors advise where it cannot be found.
 
     Raises:
         MapError: the maps do not fit each other, nothing is found, or not for sure; says why.
@@ -99,7 +99,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
         if isinstance(found, NotFound):
             reasons[found.reason] += 1
         else:
-            seen.append(sighting(found.T_map_camera, place.T_world_camera, found.inliers))
+            seen.append(sighting(found.T_map_camera, place.T_world_camera))
     consensus = find_consensus(seen)
     if consensus.refusal:
         refused = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
@@ -109,9 +109,8 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
         )
     T = agreed(consensus.agreeing)
     refined = _refine(voxel_map, other, T)
-    if 2 * sum(bool(agreeing_with(Sighting(refined, s.T_world_camera, 0), [s])) for s in consensus.agreeing) >= len(
-        consensus.agreeing
-    ):
+    kept = [s for s in consensus.agreeing if agreeing_with(Sighting(refined, s.T_world_camera), [s])]
+    if 2 * len(kept) >= len(consensus.agreeing):
         T = refined
     else:
         _log.warning("alignment_not_refined", reason="the surfaces fit best where the places do not agree")
@@ -149,4 +148,4 @@ def _find(finder: Relocalizer, other: VoxelMap, place: Place) -> Relocalized | N
     points = place.points.astype(np.float64)
     features = Features(project(points, _VIEW), points[:, 2], place.descriptors)
     label = np.where(view.confidence >= SURE, view.label, np.uint8(other.label_set.ignore_id)).astype(np.uint8)
-    return finder.find_features(features, view.rgb, view.depth_m, _VIEW, label)
+    return finder.find(view.rgb, view.depth_m, _VIEW, lambda: label, features)
