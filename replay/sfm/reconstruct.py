@@ -20,7 +20,7 @@ from semantic_mapper.drivers.calibration import Rectifier, load_calibration
 from semantic_mapper.errors import ConfigError, DependencyError, FrameError, ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import camera_matrix, scale_intrinsics, transform
-from semantic_mapper.image_rotation import rotate_intrinsics
+from semantic_mapper.imaging import rotate_intrinsics
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.format import LogWriter, atomic_log
 from semantic_mapper.replay.sfm import colmap_process as colmap
