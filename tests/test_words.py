@@ -18,7 +18,7 @@ DIALECT = re.compile(
     re.IGNORECASE,
 )
 THIRD_PARTY = {  # words of others, by file
-    "replay/importers/opensfm.py": {"shot", "shots"},  # keys of OpenSfM's files
+    "replay/importers/models.py": {"Shot", "shot", "shots"},  # keys of OpenSfM's files
     "replay/sfm/reconstruct.py": {"ARM"},  # processors
 }
 

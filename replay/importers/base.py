@@ -68,36 +68,22 @@ class RenameConfig(Config, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """Something that was left out.
+    """Something that was left out."""
 
-    Args:
-        file: The file that is at fault.
-        reason: What is wrong with it, and how to fix it.
-        frame: Number of the frame in the recording.
-        label_only: The frame is in the log, but without its label image.
-    """
-
-    file: Path
-    reason: str
-    frame: int
-    label_only: bool = False
+    file: Path  # that is at fault
+    reason: str  # what is wrong with it, and how to fix it
+    frame: int  # number of the frame in the recording
+    label_only: bool = False  # the frame is in the log, but without its label image
 
 
 @dataclass(frozen=True, slots=True)
 class DepthScale:
-    """What the numbers of a recording's depth images mean.
-
-    Args:
-        units_per_m: Units per metre.
-        given_in: The file that gives it; None: assumed, since the recording does not say.
-        convention: Whose convention was assumed, for people.
-        float_units_per_m: Units per metre of numbers with a point (NumPy's files).
-    """
+    """What the numbers of a recording's depth images mean."""
 
     units_per_m: float
-    given_in: Path | None = None
-    convention: str = ""
-    float_units_per_m: float = 1.0
+    given_in: Path | None = None  # the file that gives it; None: assumed, since the recording does not say
+    convention: str = ""  # whose convention was assumed, for people
+    float_units_per_m: float = 1.0  # of numbers with a point (NumPy's files)
 
     def __str__(self) -> str:
         """For people."""
@@ -108,31 +94,18 @@ class DepthScale:
 
 @dataclass(slots=True)
 class ImportReport:
-    """What an import did.
+    """What an import did."""
 
-    Args:
-        format: Of the recording.
-        depth_scale: How its depth images were read.
-        info: What stands in the log's head.
-        frames: In the log.
-        labelled: Of these, with a label image that no weights have rendered.
-        with_depth: Of these, with a depth image of a sensor.
-        median_depth_m: Of the measurements in the first of them, to judge the scale by; 0 without any.
-        skipped: Frames and label images that were left out.
-        notices: Sentences on what had to be assumed of the whole recording.
-        bytes: Size of the log.
-    """
-
-    format: str
-    depth_scale: DepthScale
-    info: StreamInfo
-    frames: int = 0
-    labelled: int = 0
-    with_depth: int = 0
-    median_depth_m: float = 0.0
-    skipped: list[Skipped] = field(default_factory=list[Skipped])
-    notices: list[str] = field(default_factory=list[str])
-    bytes: int = 0
+    format: str  # of the recording
+    depth_scale: DepthScale  # how its depth images were read
+    info: StreamInfo  # what stands in the log's head
+    frames: int = 0  # in the log
+    labelled: int = 0  # of these, with a label image that no weights have rendered
+    with_depth: int = 0  # of these, with a depth image of a sensor
+    median_depth_m: float = 0.0  # of the measurements in the first of them, to judge the scale by; 0 without any
+    skipped: list[Skipped] = field(default_factory=list[Skipped])  # frames and label images that were left out
+    notices: list[str] = field(default_factory=list[str])  # sentences on what had to be assumed of the recording
+    bytes: int = 0  # size of the log
 
     def count(self, frame: PosedFrame) -> None:
         """Count a frame that is in the log."""

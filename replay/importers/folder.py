@@ -131,7 +131,7 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
 
 
 def _read_stamps(file: Path, count: int, notices: list[str]) -> Sequence[int | BadFrameError]:
-    """Of each frame its stamp, or why there is none.
+    """Of each frame its stamp, or why it is missing.
 
     Raises:
         ImportSourceError: too few rows, or in another unit.

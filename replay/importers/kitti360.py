@@ -169,7 +169,7 @@ def _read_poses(file: Path, notices: list[str]) -> dict[int, Float64]:
 
 
 def _read_stamps(file: Path, count: int, notices: list[str]) -> list[int | BadFrameError]:
-    """Of each image below ``count`` the stamp, or why there is none."""
+    """Of each image below ``count`` the stamp, or why it is missing."""
     if not file.exists():
         notices.append(f"{file} is missing: stamps are made up at {NOMINAL_HZ:g} frames a second")
         return [round(number * 1e9 / NOMINAL_HZ) for number in range(count)]

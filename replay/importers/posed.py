@@ -41,50 +41,29 @@ _SAME_PIXEL = 0.25  # px; pictures that are off by less are not resampled
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedPicture:
-    """One picture of a recording.
-
-    Args:
-        file: The picture.
-        intrinsics: With distortion, of the picture at any size.
-        pose: T_world_camera (4, 4), OpenCV's axes; or why the picture cannot be used.
-        stamp_ns: None = not known.
-        depth_file: 16-bit PNG or NumPy's file, of any size with the same view; None = no depth.
-        confidence_file: 8-bit PNG of the depth image's size, whose 0 means that the depth is not to be trusted.
-        sigma_file: The depth is computed, and this is its one-sigma spread.
-        label_file: 8-bit PNG of the picture's size.
-        pseudo_label: Weights have rendered the label image.
-        view: Another camera at the same place, to whose pixels picture and labels are brought; depth has them.
-        seq: Number of the frame in the log; None = its place in the recording.
-        camera_id: Name of the camera in the log.
-    """
+    """One picture of a recording."""
 
     file: Path
-    intrinsics: CameraIntrinsics
-    pose: Float64 | BadFrameError
-    stamp_ns: int | None = None
-    depth_file: Path | None = None
-    confidence_file: Path | None = None
-    sigma_file: Path | None = None
-    label_file: Path | None = None
-    pseudo_label: bool = False
-    view: CameraIntrinsics | None = None
-    seq: int | None = None
-    camera_id: str = CAMERA_ID
+    intrinsics: CameraIntrinsics  # with distortion, of the picture at any size
+    pose: Float64 | BadFrameError  # T_world_camera (4, 4), OpenCV's axes; or why the picture cannot be used
+    stamp_ns: int | None = None  # None = not known
+    depth_file: Path | None = None  # 16-bit PNG or NumPy's file, of any size with the same view
+    confidence_file: Path | None = None  # 8-bit PNG of its size, whose 0 means that the depth is not to be trusted
+    sigma_file: Path | None = None  # the depth is computed, and this is its one-sigma spread
+    label_file: Path | None = None  # 8-bit PNG of the picture's size
+    pseudo_label: bool = False  # weights have rendered the label image
+    view: CameraIntrinsics | None = None  # a camera at the same place, to whose pixels, as depth has, all is brought
+    seq: int | None = None  # number of the frame in the log; None = its place in the recording
+    camera_id: str = CAMERA_ID  # in the log
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedFrame:
-    """One frame of a recording.
+    """One frame of a recording."""
 
-    Args:
-        frame: Ready for the log.
-        encoded_rgb: Its colour image as the file holds it; None where it had to be changed.
-        label_error: Why it has no label image although there is a file; None where all is well.
-    """
-
-    frame: PosedFrame
-    encoded_rgb: EncodedImage | None
-    label_error: BadFrameError | None = None
+    frame: PosedFrame  # ready for the log
+    encoded_rgb: EncodedImage | None  # its colour image as the file holds it; None where it had to be changed
+    label_error: BadFrameError | None = None  # why it has no label image although there is a file
 
 
 class PosedPictures:
@@ -98,7 +77,7 @@ class PosedPictures:
         notices: What is to be said of the recording so far.
         metric: Whether lengths are metres.
         hz: About the rate of the pictures.
-        labels: Classes of the label images; None = there are none.
+        labels: Classes of the label images; None = no labels.
         read_rgb: Reads a picture.
         read_depth: Reads the depth image of a picture, in metres and in the pixels of its rectified image; None = by
             ``depth_scale``, where its file is there.

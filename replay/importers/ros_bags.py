@@ -190,18 +190,12 @@ def _with_profile(file: Path, folder: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of images.
-
-    Args:
-        name: Of the topic; ``encoding``: of its first message with data.
-        raw: ``sensor_msgs/Image``, not compressed.
-        frame: Of the first message that names one.
-    """
+    """A topic of images."""
 
     name: str
-    raw: bool
-    encoding: str
-    frame: str
+    raw: bool  # ``sensor_msgs/Image``, not compressed
+    encoding: str  # of its first message with data
+    frame: str  # of the first message that names one
 
     @property
     def rectified(self) -> bool:
@@ -219,26 +213,16 @@ class Topic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A ``sensor_msgs/CameraInfo``.
+    """A ``sensor_msgs/CameraInfo``."""
 
-    Args:
-        frame: Of the camera.
-        size: (width, height) of its images.
-        model: Of the lens.
-        K: (9,) of the raw image; P: (12,) of the rectified one.
-        D: Coefficients of the lens.
-        R: (3, 3) by which rectification turns the image.
-        whole: Without binning, and without a region of interest.
-    """
-
-    frame: str
-    size: tuple[int, int]
-    model: str
-    K: Float64
-    D: Float64
-    R: Float64
-    P: Float64
-    whole: bool
+    frame: str  # of the camera
+    size: tuple[int, int]  # (width, height) of its images
+    model: str  # of the lens
+    K: Float64  # (9,) of the raw image
+    D: Float64  # coefficients of the lens
+    R: Float64  # (3, 3) by which rectification turns the image
+    P: Float64  # (12,) of the rectified image
+    whole: bool  # without binning, and without a region of interest
 
     @property
     def says_something(self) -> bool:

@@ -213,10 +213,10 @@ class TransformTree:
             sources = self._published[child]
             for name, given in sources.items():
                 if len(given.fixed) > 1:
-                    a, b = (_place(T) for T in (given.fixed[0], given.fixed[-1]))
+                    apart = np.linalg.norm(given.fixed[0][:3, 3] - given.fixed[-1][:3, 3])
                     raise ImportSourceError(
-                        f"{what} is fixed, but {name} says first {a}, then {b}: cut the bag between the two, or record "
-                        "the true one alone"
+                        f"{what} is fixed, but {name} says two things, {apart:.3f} m apart: cut the bag between the "
+                        "two, or record the true one alone"
                     )
             for (a, given), (b, other) in combinations(sources.items(), 2):
                 if given.contradicts(other):
@@ -326,9 +326,3 @@ def _same(a: Float64, b: Float64) -> bool:
 def _some(indices: NDArray[np.intp]) -> NDArray[np.intp]:
     """At most 1000 of them, evenly."""
     return indices[:: max(1, len(indices) // 1000)]
-
-
-def _place(T: Float64) -> str:
-    """A transform (4, 4) for people: metres, and degrees about x, y and z."""
-    degrees = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
-    return f"({', '.join(f'{v:.3f}' for v in T[:3, 3])}) m turned by ({', '.join(f'{v:.1f}' for v in degrees)}) degrees"

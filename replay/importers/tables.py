@@ -1,4 +1,4 @@
-"""What recordings hold beside their images: numbered files, rows of numbers, lists, and JSON of other programs."""
+"""What recordings hold next to their images: numbered files, rows of numbers, lists, and JSON of other programs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) 
 
 
 def left_out_notice(kind: str, left_out: Sequence[str], why: str = "") -> list[str]:
-    """A sentence on things that are left out, with the first of them; empty where there are none."""
+    """A sentence on things that are left out, with the first of them; empty without any."""
     if not left_out:
         return []
     return [f"{counted(len(left_out), kind)} left out{', ' + why if why else ''}; the first: {left_out[0]}"]
@@ -159,7 +159,7 @@ def read_pose_rows(file: Path, pictures: Collection[int]) -> dict[int, Float64 |
     """Poses (4, 4) of numbered pictures, by a file whose i-th row, 16 numbers row by row, belongs to picture i.
 
     Returns:
-        Of each picture and each row the pose, or why there is none.
+        Of each picture and each row the pose, or why it is missing.
 
     Raises:
         ImportSourceError: missing, not text, or without a row.

@@ -50,50 +50,33 @@ _NAMES = ("cameras", "images", "points3D")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColmapImage:
-    """One registered image.
+    """One registered image."""
 
-    Args:
-        name: As the model has it, a path below the folder of images.
-        camera_id: Of its camera.
-        T_world_camera: (4, 4).
-        xy: (N, 2) its features in pixels.
-        point_ids: (N,) of their points; -1 = none.
-    """
-
-    name: str
+    name: str  # as the model has it, a path below the folder of images
     camera_id: int
-    T_world_camera: Float64
-    xy: Float64
-    point_ids: Int64
+    T_world_camera: Float64  # (4, 4)
+    xy: Float64  # (N, 2) its features in pixels
+    point_ids: Int64  # (N,) of their points; -1 = none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColmapModel:
-    """A model.
+    """A model."""
 
-    Args:
-        cameras: By their ids; with distortion as OpenCV has it.
-        images: In the order of their names, by the numbers in these.
-        points: (3,) of each point by its id.
-        errors_px: Mean reprojection error of each point, by its id.
-        left_out: Images whose camera cannot be used, and why.
-    """
-
-    cameras: dict[int, CameraIntrinsics]
-    images: tuple[ColmapImage, ...]
-    points: dict[int, Float64]
-    errors_px: dict[int, float]
-    left_out: tuple[str, ...] = ()
+    cameras: dict[int, CameraIntrinsics]  # by their ids; with distortion as OpenCV has it
+    images: tuple[ColmapImage, ...]  # in the order of their names, by the numbers in these
+    points: dict[int, Float64]  # (3,) of each by its id
+    errors_px: dict[int, float]  # mean reprojection error of each point, by its id
+    left_out: tuple[str, ...] = ()  # images whose camera cannot be used, and why
 
 
 def find_models(folder: Path) -> list[Path]:
     """Folders of models: this one, or else those in ``sparse`` or ``colmap/sparse`` below it, by their numbers."""
-    for place in (folder, folder / "sparse", folder / "colmap" / "sparse"):
+    if _is_model(folder):
+        return [folder]
+    for place in (folder / "sparse", folder / "colmap" / "sparse"):
         below = sorted(place.iterdir(), key=lambda path: numeric_order(path.name)) if place.is_dir() else []
-        found = (
-            [path for path in (place, *below) if _is_model(path)] if place != folder else [folder] * _is_model(folder)
-        )
-        if found:
+        if found := [path for path in (place, *below) if _is_model(path)]:
             return found
     return []
 

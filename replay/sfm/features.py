@@ -16,21 +16,16 @@ MAX_ANGLE, MAX_ANGLE_RATIO = 0.7, 0.8  # radians between two descriptors of one 
 MIN_SIMILARITY = 0.15  # of two frames that may show the same place; of two any frames it is about 0
 
 
-class FeatureFinder:
-    """Finds SIFT features."""
-
-    def __init__(self) -> None:
-        self._sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=_CONTRAST)
-
-    def find(self, bgr: UInt8) -> tuple[Float32, UInt8]:
-        """Pixels (N, 2) float32, centres of pixels being integers, and descriptors (N, 128) uint8 (square roots)."""
-        keypoints, found = self._sift.detectAndCompute(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), None)
-        if found is None or not len(keypoints):
-            return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
-        xy = np.array([k.pt for k in keypoints], np.float32)[:MOST_FEATURES]
-        rows = np.asarray(found, np.float32)[:MOST_FEATURES]
-        rooted = np.sqrt(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-9))
-        return xy, np.clip(np.round(512 * rooted), 0, 255).astype(np.uint8)
+def find_features(bgr: UInt8) -> tuple[Float32, UInt8]:
+    """SIFT's pixels (N, 2) float32, centres of pixels being integers, and descriptors (N, 128) uint8 (square roots)."""
+    sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=_CONTRAST)
+    keypoints, found = sift.detectAndCompute(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), None)
+    if found is None or not len(keypoints):
+        return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
+    xy = np.array([k.pt for k in keypoints], np.float32)[:MOST_FEATURES]
+    rows = np.asarray(found, np.float32)[:MOST_FEATURES]
+    rooted = np.sqrt(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-9))
+    return xy, np.clip(np.round(512 * rooted), 0, 255).astype(np.uint8)
 
 
 def match_features(a: UInt8, b: UInt8) -> NDArray[np.uint32]:

@@ -42,21 +42,13 @@ class GpsPosition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpsFit:
-    """How a model lies on the Earth: ``T_world_model @ (scale * p)``; the world has x east, y north, z up.
+    """How a model lies on the Earth: ``T_world_model @ (scale * p)``; the world has x east, y north, z up."""
 
-    Args:
-        T_world_model: (4, 4).
-        scale: Metres per unit of the model.
-        origin: Of the world: the first picture's position.
-        pictures: That it was fitted to.
-        error_m: Their median distance from where they say they are.
-    """
-
-    T_world_model: Float64
-    scale: float
-    origin: GpsPosition
-    pictures: int
-    error_m: float
+    T_world_model: Float64  # (4, 4)
+    scale: float  # metres per unit of the model
+    origin: GpsPosition  # of the world: the first picture's position
+    pictures: int  # that it was fitted to
+    error_m: float  # their median distance from where they say they are
 
     def moved(self, T_model_camera: Float64) -> Float64:
         """A pose (4, 4) in the world."""

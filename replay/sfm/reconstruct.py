@@ -26,7 +26,7 @@ from semantic_mapper.replay.log.format import LogWriter, atomic_log
 from semantic_mapper.replay.sfm import colmap_process as colmap
 from semantic_mapper.replay.sfm.between import Anchor, follow_pose
 from semantic_mapper.replay.sfm.colmap_model import ColmapModel, read_model
-from semantic_mapper.replay.sfm.features import FeatureFinder
+from semantic_mapper.replay.sfm.features import find_features
 from semantic_mapper.replay.sfm.film import (
     LEAST_MOTION,
     STEP,
@@ -296,12 +296,12 @@ class _Import:
 
     def _find_features(self, look: FilmLook, rows: Int64, board: BoardScale | None) -> list[int]:
         """Index of each picked frame; its features are in the folder, under its place in the sequence."""
-        finder, counts = FeatureFinder(), list[int]()
+        counts: list[int] = []
         picked: list[int] = []
         (self._folder / colmap.FEATURES).mkdir()
         for frame in self._frames({int(i) for i in look.index[rows]}):
             seen = self._lens.seen(frame.bgr)
-            xy, descriptors = finder.find(seen)
+            xy, descriptors = find_features(seen)
             np.savez(self._folder / colmap.FEATURES / f"{len(picked):06d}.npz", xy=xy, descriptors=descriptors)
             if board is not None:
                 board.look(frame.index, np.asarray(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB), np.uint8))

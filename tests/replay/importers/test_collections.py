@@ -265,17 +265,16 @@ def test_newer_models_of_colmap_are_judged_by_their_values(model: str, params: l
             intrinsics_of(other, 64, 48, [1.0] * count, "camera 1")
 
 
-def test_coefficients_of_brown_conrady_come_in_the_order_of_opencv() -> None:
-    """COLMAP has k1 k2 k3 p1 p2, OpenCV k1 k2 p1 p2 k3."""
-    found = intrinsics_of("BROWN_CONRADY", 64, 48, [50, 32, 24, 0.1, 0.2, 0.3, 0.01, 0.02], "camera 1")
-    assert found.distortion[:5] == (0.1, 0.2, 0.01, 0.02, 0.3) and found.fy == 50
-
-
 @pytest.mark.parametrize(("times", "fps"), [([5.0, 5.5], 10), ([None, 5.0, 5.5], 10), ([5.0, "x", 6.0], None)])
 def test_times_that_record3d_lacks_are_made_up_at_its_rate(tmp_path: Path, times: list[Any], fps: float | None) -> None:
     report, frames = imported(make_record3d(tmp_path / "phone", frameTimestamps=times, fps=fps))
     assert [frame.stamp_ns for frame in frames] == [round(n * 1e9 / (fps or 60)) for n in range(3)]
     assert f"made up at {fps or 60} frames a second" in said(report)
+
+
+def test_coefficients_of_brown_conrady_come_in_the_order_of_opencv() -> None:
+    found = intrinsics_of("BROWN_CONRADY", 64, 48, [50, 32, 24, 0.1, 0.2, 0.3, 0.01, 0.02], "camera 1")
+    assert found.distortion[:5] == (0.1, 0.2, 0.01, 0.02, 0.3) and found.fy == 50  # COLMAP's: k1 k2 k3 p1 p2
 
 
 def change(folder: Path, **changes: Any) -> list[dict[str, Any]]:

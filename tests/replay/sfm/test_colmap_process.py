@@ -77,10 +77,3 @@ def test_a_straight_way_does_not_tell_the_focal_length_and_says_so(tmp_path: Pat
 def test_a_camera_that_only_turns_is_recognised_and_not_begun_straight_ahead(tmp_path: Path) -> None:
     outcome = reconstruct(tmp_path, TURN, CALIBRATED)
     assert colmap.turn_fraction(outcome.pairs) == 1 and not any(a.ahead for a in outcome.attempts)
-
-
-def test_the_best_attempt_has_the_largest_model_then_the_smallest_error() -> None:
-    def attempt(*models: tuple[int, float]) -> colmap.Attempt:
-        return colmap.Attempt(500.0, [colmap.Model("", images, error, 500.0) for images, error in models])
-
-    assert colmap.best_attempt([attempt(), attempt((9, 0.4), (2, 0.1)), attempt((9, 0.3)), attempt((5, 0.1))]) == 2

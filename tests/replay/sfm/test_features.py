@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.replay.sfm.features import FeatureFinder, loop_pairs, match_features
+from semantic_mapper.replay.sfm.features import find_features, loop_pairs, match_features
 from semantic_mapper.types import UInt8
 
 
@@ -11,9 +11,9 @@ def test_features_are_on_pixels_whose_centres_are_integers() -> None:
     for y in range(80):
         for x in range(100):
             picture[y, x] = round(255 * np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 18))
-    xy, descriptors = FeatureFinder().find(picture)
+    xy, descriptors = find_features(picture)
     assert np.abs(xy - (40, 30)).max(axis=1).min() < 0.3 and descriptors.dtype == np.uint8
-    assert len(FeatureFinder().find(np.zeros((80, 100, 3), np.uint8))[0]) == 0
+    assert len(find_features(np.zeros((80, 100, 3), np.uint8))[0]) == 0
 
 
 def test_frames_of_one_place_are_paired_across_the_film(rng: np.random.Generator) -> None:

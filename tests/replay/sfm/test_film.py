@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.sfm.film import MAX_SIDE_PX, Film, FilmLook, look_through, pick_frames
+from semantic_mapper.replay.sfm.film import Film, FilmLook, look_through, pick_frames
 from semantic_mapper.types import UInt8
 
 from . import films
@@ -37,19 +37,6 @@ def test_a_film_that_is_marked_as_turned_comes_upright(tmp_path: Path) -> None:
     assert (film.width, film.height) == (96, 128)
     frame = next(iter(film)).bgr
     assert frame[:64, 48:].mean() > 240 > frame[:64, :48].mean()  # the white quarter went from upper left to the right
-
-
-def test_a_turn_may_be_asked_for(tmp_path: Path) -> None:
-    path = films.write_film(tmp_path / "a.mp4", [card()] * 2)
-    frame = next(iter(Film(path, quarters=1))).bgr
-    assert frame.shape[:2] == (128, 96) and frame[:64, 48:].mean() > 240
-
-
-def test_large_frames_are_made_smaller(tmp_path: Path) -> None:
-    path = films.write_film(tmp_path / "a.mp4", [np.zeros((1080, 1920, 3), np.uint8)] * 2)
-    film = Film(path)
-    assert (film.full_width, film.width, film.height) == (1920, MAX_SIDE_PX, 720)
-    assert next(iter(film)).bgr.shape == (720, MAX_SIDE_PX, 3)
 
 
 def test_a_folder_of_pictures_is_a_film_in_the_order_of_its_numbers(tmp_path: Path) -> None:
@@ -129,20 +116,3 @@ def test_of_each_step_of_motion_the_sharpest_frame_is_picked() -> None:
 def test_straight_ahead_the_edges_of_the_picture_tell_the_step() -> None:
     sideways, ahead = look_of([0.01] * 41), look_of([0.01] * 41, fast=[0.03] * 41)
     assert len(pick_frames(sideways)) == 11 and len(pick_frames(ahead)) == 23
-
-
-def test_the_look_measures_what_moves_at_the_edges(tmp_path: Path) -> None:
-    card_px = np.kron(np.random.default_rng(0).integers(0, 255, (12, 16), np.uint8), np.ones((20, 20), np.uint8))
-    zoomed = [cv2.warpAffine(card_px, cv2.getRotationMatrix2D((159, 119), 0, 1.01**n), (320, 240)) for n in range(6)]
-    pictures = [np.asarray(gray, np.uint8)[..., None].repeat(3, 2) for gray in zoomed]
-    look = look_through(Film(films.write_film(tmp_path / "a.avi", pictures)), lambda _: None)
-    assert (look.fast[1:] > 1.3 * look.motion[1:]).all()
-
-
-def test_a_long_way_gets_longer_steps() -> None:
-    look = look_of([0.05] * 1000)
-    assert 90 <= len(pick_frames(look, most=100)) <= 101
-
-
-def test_a_frame_that_cannot_be_followed_counts_as_a_step() -> None:
-    assert len(pick_frames(look_of([0.0, float("nan"), float("nan"), 0.0]))) == 3

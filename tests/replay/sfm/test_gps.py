@@ -37,13 +37,6 @@ def test_a_picture_without_all_of_a_position_has_none(tmp_path: Path, without: t
     assert read_position(tmp_path / "missing.jpg") is None
 
 
-def test_a_receiver_without_a_fix_and_damaged_files_tell_nothing(tmp_path: Path) -> None:
-    tag(picture(tmp_path / "a.jpg"), GpsPosition(0.0, 0.0, 10.0))
-    assert read_position(tmp_path / "a.jpg") is None
-    (tmp_path / "b.jpg").write_bytes(b"\xff\xd8\xff\xe1\x00\x10Exif\x00\x00MM\x00*")
-    assert read_position(tmp_path / "b.jpg") is None
-
-
 def test_metres_follow_the_ellipsoid() -> None:
     """A degree of latitude at the equator is 110.574 km, of longitude 111.320 km (WGS 84)."""
     zero = GpsPosition(0.0, 0.0, 0.0)
