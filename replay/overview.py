@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from semantic_mapper.evaluation.upright import ceiling_height, plan_rotation, upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.plots import (
     DIM_TEXT,
     PANEL,
@@ -190,7 +189,7 @@ def _put_map(
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
     axes = put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}")
-    _put_scale_bar(axes, scale, unit)
+    put_scale_bar(axes, scale, unit)
     for name, outline in rooms:
         corners = (from_above(outline @ R_plan_world.T)[:, :2] - camera[0]) * scale + np.array(size) / 2
         _put_room(axes, name, corners)
@@ -238,14 +237,14 @@ def _put_room(axes: Axes, name: str, corners: Float64) -> None:
     put_text(axes, (float(at[0]), float(at[1])), name, bbox=behind, clip_on=True)
 
 
-def _put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
+def put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
     """A bar of 1 m (or of the power of ten that fits) in the lower left corner; ``scale`` is in pixels a metre."""
     metres = 1.0
     while metres * scale > axes.get_xlim()[1] / 3:
         metres /= 10
     while metres * scale < 24:
         metres *= 10
-    y = MAP_HEIGHT - 18
+    y = axes.get_ylim()[0] - 18
     axes.plot((16, 16 + metres * scale), (y, y), color="white", linewidth=3, solid_capstyle="butt")
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 2}  # points may lie here
     put_text(axes, (16, y - 15), f"{metres:g} {unit}", bbox=behind)
@@ -363,7 +362,6 @@ def point_spacing(xyz: Float64) -> float:
     """Typical distance of a point to its fourth neighbour, metres: the pitch of a surface sampled on a grid."""
     if len(xyz) < 5:
         return 0.05
-    check_room_for_scipy()
     asking = xyz[:: max(1, len(xyz) // 500)]
     distances, _ = scipy.spatial.KDTree(xyz).query(asking, k=5)
     return float(np.percentile(distances[:, 4], 75))

@@ -14,7 +14,6 @@ from typing import Any, Self
 
 import structlog
 
-from semantic_mapper.backoff import backoff_s
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
 from semantic_mapper.drivers.mounts import Mount, mount_of
@@ -27,7 +26,7 @@ from semantic_mapper.nodes.camera.corrections import CorrectionSender, without_l
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions, LiveCamera, table_of
-from semantic_mapper.nodes.status import publish_status
+from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, EndReason, NodeState, Parts, Status
 from semantic_mapper.transport.sockets import Publisher
@@ -143,7 +142,7 @@ def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, sta
             reporter.watch(source)
             return source
         failures += 1
-        _pause(context, backoff_s(failures, FIRST_PAUSE_S, MAX_PAUSE_S))
+        _pause(context, min(FIRST_PAUSE_S * 2.0 ** min(failures - 1, 64), MAX_PAUSE_S))
     return None
 
 

@@ -16,7 +16,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.exporters import LogExportRequest, export_log, log_format_of
+from semantic_mapper.replay.exporters import export_log, log_format_of
 from semantic_mapper.replay.exporters.map_files import ExportRequest, export_map, format_of, parse_transform, parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import (
@@ -182,12 +182,12 @@ def export_recording(
     """
     if map_options:
         raise ConfigError(f"{', '.join(map_options)}: for saved maps only; {source} is a log")
-    request = LogExportRequest(log_format_of(out, format_name), camera, max_frames)
+    name = log_format_of(out, format_name)
     prepare_folder(out.parent)
     with open_log(source) as log, frame_progress("export", min(len(log), max_frames or len(log))) as bar:
-        report = export_log(log, out, request, bar.advance)
+        report = export_log(log, out, name, camera=camera, max_frames=max_frames, on_frame=bar.advance)
         damage, notices = [str(e) for e in log.errors], list(log.notices)
-    output.print(f"{out}: {counted(report.frames, 'frame')} ({request.format})")
+    output.print(f"{out}: {counted(report.frames, 'frame')} ({name})")
     for notice in (*notices, *report.notices):
         output.print(f"  note: {notice}")
     lost = [*damage, *report.left_out]

@@ -12,7 +12,6 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.drivers.poses.config import BoardPoses
@@ -55,29 +54,12 @@ class MarkedDistance:
 
 @dataclass(frozen=True, slots=True)
 class ScaleHint:
-    """What tells the size of the scene; at most one of these.
+    """What tells the size of the scene; the first of these that is given."""
 
-    Args:
-        factor: Metres per unit of the log that comes without a scale: by how much its map is too small.
-        distance: Two marked points.
-        board: A printed board that is seen in the film.
-        camera_height_m: Of the camera over the floor, the median over the film.
-
-    Raises:
-        ConfigError: several of them, or a number that cannot be.
-    """
-
-    factor: float | None = None
+    factor: float | None = None  # metres per unit of the log that comes without a scale
     distance: MarkedDistance | None = None
-    board: BoardPoses | None = None
-    camera_height_m: float | None = None
-
-    def __post_init__(self) -> None:
-        if sum(getattr(self, name) is not None for name in self.__slots__) > 1:
-            raise ConfigError("the scale comes from one source only: a factor, a distance, a board or a height")
-        for number in (self.factor, self.camera_height_m):
-            if number is not None and not 1e-6 < number < 1e6:
-                raise ConfigError(f"a scale or height of {number:g} cannot be; give a number above 0")
+    board: BoardPoses | None = None  # a printed board that is seen in the film
+    camera_height_m: float | None = None  # of the camera over the floor, the median over the film
 
 
 def parse_distance(text: str) -> MarkedDistance:
@@ -98,17 +80,10 @@ def parse_distance(text: str) -> MarkedDistance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegisteredFrame:
-    """A frame of the model.
+    """A frame of the model."""
 
-    Args:
-        stamp_ns: Time within the film.
-        T_world_camera: (4, 4).
-        xyz: (N, 3) the points that it sees, in the world.
-    """
-
-    stamp_ns: int
-    T_world_camera: Float64
-    xyz: Float64
+    T_world_camera: Float64  # (4, 4)
+    xyz: Float64  # (N, 3) the points that it sees, in the world
 
 
 def upright(T_world_first: Float64, up: Float64) -> Float64:
@@ -166,12 +141,6 @@ def fit_to_scene(config: MapperConfig, info: StreamInfo) -> tuple[MapperConfig, 
     )
     fitted_depth = msgspec.structs.replace(config.depth, from_motion=motion)
     return msgspec.structs.replace(config, voxel_map=voxel_map, depth=fitted_depth), said
-
-
-def floor_under(frames: Sequence[RegisteredFrame]) -> float | None:
-    """z of the floor under the frames, where z is up; None if no floor is found."""
-    camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames]))
-    return floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames]), camera_z)
 
 
 def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:

@@ -20,7 +20,7 @@ from semantic_mapper.errors import ConfigError, ImportSourceError, LogError, Map
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.export import export_recording
 from semantic_mapper.nodes.console import Output
-from semantic_mapper.replay.exporters import LogExportReport, LogExportRequest, export_log, log_format_of
+from semantic_mapper.replay.exporters import LogExportReport, export_log, log_format_of
 from semantic_mapper.replay.importers import ImportOptions, import_recording
 from semantic_mapper.replay.importers.tum import read_trajectory
 from semantic_mapper.replay.log.format import LogReader, LogWriter
@@ -58,7 +58,7 @@ def write_log(path: Path, frames: list[PosedFrame], packing: tuple[CodecOptions,
 
 def exported(log: Path, out: Path, name: str | None = None, **more: Any) -> LogExportReport:
     with LogReader(log) as reader:
-        return export_log(reader, out, LogExportRequest(log_format_of(out, name), **more), lambda: None)
+        return export_log(reader, out, log_format_of(out, name), **more)
 
 
 @pytest.fixture

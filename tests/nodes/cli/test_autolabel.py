@@ -24,7 +24,7 @@ from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel import AutolabelReport, AutolabelRequest, autolabel_log
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.exporters import LogExportRequest, export_log
+from semantic_mapper.replay.exporters import export_log
 from semantic_mapper.replay.importers import import_recording
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.jobs import OFFLINE
@@ -248,7 +248,7 @@ def test_finetune_learns_from_pseudo_labels_says_so_and_remembers_the_teachers_k
 
 def test_export_and_import_keep_pseudo_labels_apart(new: Path, tmp_path: Path) -> None:
     with LogReader(new) as log:
-        report = export_log(log, tmp_path / "folder", LogExportRequest("folder"), lambda: None)
+        report = export_log(log, tmp_path / "folder", "folder")
     assert any("4 label images are pseudo labels" in notice for notice in report.notices)
     assert [f.name for f in sorted((tmp_path / "folder" / "label").iterdir())] == ["000000.png", "000001.png"]
     assert len(list((tmp_path / "folder" / "pseudo_label").iterdir())) == 4
@@ -263,8 +263,8 @@ def test_export_and_import_keep_pseudo_labels_apart(new: Path, tmp_path: Path) -
 
 def test_foxglove_and_rerun_name_pseudo_labels(new: Path, tmp_path: Path) -> None:
     with LogReader(new) as log:
-        export_log(log, tmp_path / "fox.mcap", LogExportRequest("foxglove"), lambda: None)
-        report = export_log(log, tmp_path / "log.rrd", LogExportRequest("rrd"), lambda: None)
+        export_log(log, tmp_path / "fox.mcap", "foxglove")
+        report = export_log(log, tmp_path / "log.rrd", "rrd")
     data = (tmp_path / "fox.mcap").read_bytes()
     assert b"/rooms/pseudo_labels" in data and b"/rooms/labels" in data
     assert any("pseudo labels" in notice for notice in report.notices)
@@ -290,8 +290,8 @@ def test_computed_depth_has_its_spread_and_never_passes_for_measured(with_depth:
     with LogReader(with_depth) as log:
         frames = [f for f in log if f.depth_m is not None]
         assert [e.seq for e, _ in log.frame_parts()] == list(range(6))  # in order, though frames wait for later ones
-        export_log(log, tmp_path / "folder", LogExportRequest("folder"), lambda: None)
-        tum = export_log(log, tmp_path / "tum", LogExportRequest("tum"), lambda: None)
+        export_log(log, tmp_path / "folder", "folder")
+        tum = export_log(log, tmp_path / "tum", "tum")
     assert len(frames) > 2
     for frame in frames:
         assert frame.depth_sigma_m is not None and not is_measured(frame) and frame.depth_m is not None
