@@ -19,12 +19,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from semantic_mapper.bundle.adjustment import minimize
+from semantic_mapper.bundle.keyframes import minimize
 from semantic_mapper.drivers.base import CorrectedWorld
 from semantic_mapper.geometry import interpolate_pose, invert_pose, pose_distance
 from semantic_mapper.localization.depth_alignment import FALSE, POINTS_A_VOTE, Fit, Target, align, fit
 from semantic_mapper.localization.features import Features, pose_from_features
-from semantic_mapper.localization.places import rank_places
+from semantic_mapper.localization.places import most_crowded, rank_places, view_distances
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import Float64
 
@@ -136,7 +136,7 @@ class KeyframeGraph:
 
     def distances(self, T_world_camera: Float64) -> tuple[Float64, Float64]:
         """Metres (N,) and radians (N,) from a pose to each keyframe's."""
-        return _distances(np.array([*self.poses.values()]), T_world_camera)
+        return view_distances(np.array([*self.poses.values()]), T_world_camera)
 
     def near(self, T_world_camera: Float64, count: int) -> list[OdometryKeyframe]:
         """Up to ``count`` keyframes to align a view to: the nearest one first, then the oldest ones within reach.
@@ -183,9 +183,8 @@ class KeyframeGraph:
         if len(self.frames) <= MAX_KEYFRAMES:
             return None
         numbers, poses = [*self.frames][:-1], np.array([*self.poses.values()])[:-1]
-        way, turn = _distances(poses[:, None], poses[None])
-        crowded = np.hypot(way / _REACH_M, turn / _REACH_RAD) + np.diag(np.full(len(poses), np.inf))
-        first, second = sorted(int(i) for i in np.unravel_index(int(crowded.argmin()), crowded.shape))
+        way, turn = view_distances(poses[:, None], poses[None])
+        first, second = most_crowded(np.hypot(way / _REACH_M, turn / _REACH_RAD))
         heir, gone, T_heir_gone = numbers[first], numbers[second], invert_pose(poses[first]) @ poses[second]
         del self.frames[gone]
         edges: list[Edge] = []
@@ -433,13 +432,6 @@ class PoseTrail:
             given.T_world_camera = pose
         until_ns, motion = self._given[-1].stamp_ns, poses[-1] @ invert_pose(before[-1])
         return CorrectedWorld({g.stamp_ns: g.T_world_camera for g in self._given}, until_ns, motion)
-
-
-def _distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:
-    """Metres and radians between poses (..., 4, 4)."""
-    way = np.linalg.norm(T_world_a[..., :3, 3] - T_world_b[..., :3, 3], axis=-1)
-    trace = (T_world_a[..., :3, :3] * T_world_b[..., :3, :3]).sum(axis=(-2, -1))
-    return way, np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def _covariance(found: Fit) -> Float64:

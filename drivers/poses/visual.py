@@ -15,8 +15,7 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from semantic_mapper.bundle.adjustment import adjust_bundle
-from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap, triangulate
+from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap, adjust_bundle, triangulate
 from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.scale import ScaleEstimator, floor_height
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
@@ -359,9 +358,9 @@ class VisualOdometry:
         tracks = self._tracker.replenish()
         number = self._map.keyframes[-1].number + 1
         self._map.add(Keyframe(number, tracks, pose, pose, sigmas))
-        bundle = self._map.bundle()
-        if bundle is not None:
-            self._map.apply(bundle, adjust_bundle(bundle.problem, _ITERATIONS))
+        problem = self._map.bundle()
+        if problem is not None:
+            self._map.apply(problem, adjust_bundle(problem, _ITERATIONS))
         pose = self._map.keyframes[-1].T_world_camera
         self._places.append(self._place(image, self._map.keyframes[-1].tracks, pose))
         if len(self._places) > _PLACES:

@@ -1,16 +1,22 @@
-"""Keyframes with the corners that they see, and the points in space that these are of."""
+"""Keyframes with the corners that they see, the points in space that these are of, and the bundle adjustment of both.
+
+GTSAM finds poses and points that fit the pixels best, with given poses as priors, and old keyframes held.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import L, X
 
-from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, reprojection_errors
 from semantic_mapper.bundle.tracks import Tracks
 from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose, project, transform
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, Int64
 
 _LEAST_PARALLAX = np.radians(1.0)  # between the rays that a point is found from
@@ -20,6 +26,13 @@ _PNP_PX = 3.0
 _FLOW = 0.04  # of the image's width that corners move by to the next keyframe
 _LEFT = 0.6  # of the last keyframe's corners: fewer, and there is another keyframe
 _LEAST_CORNERS = 20
+_PIXEL_SIGMA = 0.7  # of a corner that is followed
+_HUBER_SIGMAS = 1.5  # errors beyond count less
+_PRIOR_HUBER_SIGMAS = 2.0
+_HELD_SIGMA = 1e-4  # metres and radians, of keyframes that stay where they are
+_TOLERANCE = 1e-4  # relative decrease of the cost that ends it
+
+_log = get_logger(__name__)
 
 
 @dataclass(slots=True, eq=False)
@@ -41,12 +54,47 @@ class Keyframe:
     prior_sigmas: tuple[float, float]
 
 
-class Bundle(NamedTuple):
-    """A problem to solve, and what its rows are: keyframes, and ids of points."""
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleProblem:
+    """K keyframes, P points, N sights of them.
 
-    problem: BundleProblem
-    keyframes: list[Keyframe]
-    ids: list[int]
+    Args:
+        intrinsics: Of the images that the pixels are in.
+        poses: (K, 4, 4) T_world_camera, first guesses.
+        held: (K,) whether a keyframe stays at its first guess.
+        priors: (K, 4, 4) T_world_camera as given.
+        prior_sigmas: (K, 2) one sigma of these in metres and radians; infinite = none was given.
+        points: (P, 3) first guesses, world.
+        keyframe, point: (N,) rows of what sees and what is seen.
+        pixels: (N, 2) as (u, v).
+        keyframes, ids: Of a map: its keyframes, and the tracks of the points.
+    """
+
+    intrinsics: CameraIntrinsics
+    poses: Float64
+    held: Bool
+    priors: Float64
+    prior_sigmas: Float64
+    points: Float64
+    keyframe: Int64
+    point: Int64
+    pixels: Float64
+    keyframes: Sequence[Keyframe] = ()
+    ids: Sequence[int] = ()
+
+
+class BundleResult(NamedTuple):
+    """What a bundle adjustment found.
+
+    Args:
+        poses: (K, 4, 4).
+        points: (P, 3).
+        errors_px: (N,) of each sight; infinite behind the camera.
+    """
+
+    poses: Float64
+    points: Float64
+    errors_px: Float64
 
 
 class KeyframeMap:
@@ -130,7 +178,7 @@ class KeyframeMap:
         expected[front] = project(rays[front], self.intrinsics)
         return expected
 
-    def bundle(self) -> Bundle | None:
+    def bundle(self) -> BundleProblem | None:
         """The last keyframes and what they see, held by earlier ones; None where nothing is seen twice."""
         free = self.keyframes[-self._window :]
         wanted = set(np.concatenate([k.tracks.ids for k in free]).tolist()) & self.points.keys()
@@ -152,7 +200,7 @@ class KeyframeMap:
         rows, columns, pixels = zip(*sights, strict=True)
         held = np.arange(len(keyframes)) < len(old)
         held[0] |= not any(np.isfinite(k.prior_sigmas[0]) for k in keyframes)  # something must hold the others
-        problem = BundleProblem(
+        return BundleProblem(
             self.intrinsics,
             np.array([k.T_world_camera for k in keyframes]),
             held,
@@ -162,15 +210,16 @@ class KeyframeMap:
             np.array(rows),
             np.array(columns),
             np.array(pixels),
+            keyframes,
+            ids,
         )
-        return Bundle(problem, keyframes, ids)
 
-    def apply(self, bundle: Bundle, found: BundleResult) -> None:
+    def apply(self, problem: BundleProblem, found: BundleResult) -> None:
         """Take over what a bundle found. Keyframes added since move with the last one that took part.
 
         Sights that are far off are dropped, and points with fewer than two left.
         """
-        problem, keyframes, ids = bundle
+        keyframes, ids = problem.keyframes, problem.ids
         moved = found.poses[-1] @ invert_pose(keyframes[-1].T_world_camera)
         for keyframe, pose in zip(keyframes, found.poses, strict=True):
             keyframe.T_world_camera = pose
@@ -221,3 +270,67 @@ def triangulate(
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (to_a * to_b).sum(axis=1) / (np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1))
     return points, good & (cosine < np.cos(_LEAST_PARALLAX))
+
+
+def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
+    """Least squares of all sights and priors (Levenberg-Marquardt, Huber). Deterministic.
+
+    Args:
+        problem: At least one keyframe must be held or have a prior.
+        iterations: At most.
+    """
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    k = problem.intrinsics
+    lens = gtsam.Cal3_S2(k.fx, k.fy, 0.0, k.cx, k.cy)
+    noise = gtsam.noiseModel
+    held = noise.Isotropic.Sigma(6, _HELD_SIGMA)
+    for row, pose in enumerate(problem.poses):
+        start.insert(X(row), gtsam.Pose3(pose))
+        metres, radians = problem.prior_sigmas[row]
+        if problem.held[row]:
+            graph.add(gtsam.PriorFactorPose3(X(row), gtsam.Pose3(pose), held))
+        elif np.isfinite(metres):
+            sigmas = noise.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
+            robust = noise.Robust.Create(noise.mEstimator.Huber.Create(_PRIOR_HUBER_SIGMAS), sigmas)
+            graph.add(gtsam.PriorFactorPose3(X(row), gtsam.Pose3(problem.priors[row]), robust))
+    for row, point in enumerate(problem.points):
+        start.insert(L(row), point)
+    pixel = noise.Robust.Create(noise.mEstimator.Huber.Create(_HUBER_SIGMAS), noise.Isotropic.Sigma(2, _PIXEL_SIGMA))
+    factor = gtsam.GenericProjectionFactorCal3_S2
+    for seen, row, column in zip(problem.pixels, problem.keyframe.tolist(), problem.point.tolist(), strict=True):
+        graph.add(factor(seen, pixel, X(row), L(column), lens, False, False))
+    try:
+        found = minimize(graph, start, iterations)
+    except RuntimeError as error:  # what GTSAM raises where sights leave a direction open
+        _log.warning("bundle_left_out", reason=str(error).strip()[:200])
+        found = start
+    poses = np.array([found.atPose3(X(row)).matrix() for row in range(len(problem.poses))])
+    poses[problem.held] = problem.poses[problem.held]
+    points = np.array([found.atPoint3(L(row)) for row in range(len(problem.points))]).reshape(-1, 3)
+    R, t = poses[problem.keyframe, :3, :3], poses[problem.keyframe, :3, 3]
+    p_camera = np.einsum("nji,nj->ni", R, points[problem.point] - t)
+    return BundleResult(poses, points, reprojection_errors(p_camera, problem.pixels, problem.intrinsics))
+
+
+def minimize(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int) -> gtsam.Values:
+    """Values of the least cost (Levenberg-Marquardt), after at most so many iterations.
+
+    Raises:
+        RuntimeError: by GTSAM, where the factors leave a direction open.
+    """
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams())
+    cost = optimizer.error()
+    for _ in range(iterations):  # ``optimize`` would keep Python's other threads waiting until its end
+        optimizer.iterate()
+        before, cost = cost, optimizer.error()
+        if before - cost <= _TOLERANCE * before:
+            break
+    return optimizer.values()
+
+
+def reprojection_errors(p_camera: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> Float64:
+    """Distances (N,) in pixels between points (N, 3) of the camera's frame and where they are seen (N, 2)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = p_camera[:, :2] / p_camera[:, 2:] * (intrinsics.fx, intrinsics.fy) + (intrinsics.cx, intrinsics.cy)
+    errors = np.linalg.norm(uv - pixels, axis=1)
+    return np.where((p_camera[:, 2] > 1e-3) & np.isfinite(errors), errors, np.inf)

@@ -8,8 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semantic_mapper.bundle.adjustment import BundleResult, adjust_bundle, reprojection_errors
-from semantic_mapper.bundle.keyframes import Bundle, Keyframe, KeyframeMap
+from semantic_mapper.bundle.keyframes import (
+    BundleProblem,
+    BundleResult,
+    Keyframe,
+    KeyframeMap,
+    adjust_bundle,
+    reprojection_errors,
+)
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.geometry import invert_pose, nearest_pose, pose_distance, transform
@@ -83,7 +89,7 @@ class PoseRefiner:
         self._sigma_m = config.sigma_m  # of the last given pose
         self._misfits: deque[float] = deque(maxlen=_MISFIT_FRAMES)  # of given poses beyond refined ones, radians
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
-        self._pending: tuple[Bundle, Future[BundleResult]] | None = None
+        self._pending: tuple[BundleProblem, Future[BundleResult]] | None = None
 
     def push(self, frame: PosedFrame) -> RefinedPose:
         """Refine the next frame's pose."""
@@ -191,23 +197,23 @@ class PoseRefiner:
 
     def _adjust(self) -> None:
         """Bundle now, or in the worker where that is free."""
-        bundle = None if self._pending is not None else self._map.bundle()
-        if bundle is None:
+        problem = None if self._pending is not None else self._map.bundle()
+        if problem is None:
             return
         if self._worker is None:
-            self._apply(bundle, adjust_bundle(bundle.problem, _ITERATIONS))
+            self._apply(problem, adjust_bundle(problem, _ITERATIONS))
         else:
-            self._pending = bundle, self._worker.submit(adjust_bundle, bundle.problem, _ITERATIONS)
+            self._pending = problem, self._worker.submit(adjust_bundle, problem, _ITERATIONS)
 
     def _collect(self, wait: bool) -> None:
         if self._pending is not None and (wait or self._pending[1].done()):
-            (bundle, future), self._pending = self._pending, None
-            self._apply(bundle, future.result())
+            (problem, future), self._pending = self._pending, None
+            self._apply(problem, future.result())
 
-    def _apply(self, bundle: Bundle, found: BundleResult) -> None:
+    def _apply(self, problem: BundleProblem, found: BundleResult) -> None:
         last = self._map.keyframes[-1]
         before = invert_pose(last.T_world_camera)
-        self._map.apply(bundle, found)
+        self._map.apply(problem, found)
         self._refined = last.T_world_camera @ before @ self._refined
 
     def _disagreement(self, tracks: Tracks, given: Float64, refined: Float64) -> tuple[float, float]:

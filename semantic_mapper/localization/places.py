@@ -100,7 +100,8 @@ class PlaceStore:
         """Keep a place."""
         self._places.append(place)
         if len(self._places) > self._capacity:
-            del self._places[self._most_crowded()]
+            poses = self._poses()[:-1]  # never the newest
+            del self._places[most_crowded(_apart(poses[:, None], poses[None]))[1]]
 
     def move(self, poses: Mapping[tuple[str, int], Float64]) -> None:
         """Give places other poses, by (camera_id, stamp_ns); those that are not named stay where they are."""
@@ -110,16 +111,22 @@ class PlaceStore:
     def _poses(self) -> Float64:
         return np.array([p.T_world_camera for p in self._places]).reshape(-1, 4, 4)
 
-    def _most_crowded(self) -> int:
-        """Number of the younger of the two that are nearest to each other; never the newest."""
-        poses = self._poses()[:-1]
-        apart = _apart(poses[:, None], poses[None])
-        apart[np.triu_indices(len(poses))] = np.inf
-        return int(apart.argmin()) // len(poses)
+
+def view_distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:
+    """Metres and radians between poses (..., 4, 4)."""
+    way = np.linalg.norm(T_world_a[..., :3, 3] - T_world_b[..., :3, 3], axis=-1)
+    cosine = ((T_world_a[..., :3, :3] * T_world_b[..., :3, :3]).sum(axis=(-2, -1)) - 1) / 2
+    return way, np.arccos(np.clip(cosine, -1, 1))
+
+
+def most_crowded(apart: Float64) -> tuple[int, int]:
+    """Of views in their order, the older and the younger of the two that are nearest by their distances (N, N)."""
+    below = np.where(np.tri(len(apart), k=-1, dtype=bool), apart, np.inf)
+    younger, older = divmod(int(below.argmin()), len(apart))
+    return older, younger
 
 
 def _apart(T_world_a: Float64, T_world_b: Float64) -> Float64:
     """Distances of views (..., 4, 4) in spacings."""
-    way = np.linalg.norm(T_world_a[..., :3, 3] - T_world_b[..., :3, 3], axis=-1)
-    cosine = ((T_world_a[..., :3, :3] * T_world_b[..., :3, :3]).sum(axis=(-2, -1)) - 1) / 2
-    return np.maximum(way / _SPACING_M, np.arccos(np.clip(cosine, -1, 1)) / _SPACING_RAD)
+    way, turn = view_distances(T_world_a, T_world_b)
+    return np.maximum(way / _SPACING_M, turn / _SPACING_RAD)

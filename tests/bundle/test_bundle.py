@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.bundle.adjustment import BundleProblem, adjust_bundle
-from semantic_mapper.bundle.keyframes import triangulate
+from semantic_mapper.bundle.keyframes import BundleProblem, adjust_bundle, triangulate
 from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose, align_poses
 from semantic_mapper.bundle.tracks import Tracker, follow, prepare_image
 from semantic_mapper.config import PoseRefinerConfig

@@ -10,7 +10,6 @@ import pytest
 from semantic_mapper.config import DepthFromMotionConfig
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS, MAX_VIEWS, DepthFromMotion
 from semantic_mapper.depth_from_motion.views import DepthEstimate
-from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.depth_from_motion.pictures import CAMERA, plane_frame
 
@@ -97,17 +96,6 @@ def test_a_camera_that_leaves_does_not_hold_up_the_others() -> None:
     assert not stream.push(plane_frame(camera_id="gone")[0])
     done = [ready.camera_id for frame, _ in walk(12, camera_id="here") for ready in stream.push(frame)]
     assert done[0] == "gone" and len(done) + len(stream.finish()) == 13
-
-
-def test_frames_of_another_size_serve_as_sources() -> None:
-    small = scale_intrinsics(CAMERA, 48, 36)
-    stream = DepthFromMotion(CONFIG)
-    for k in range(3):
-        stream.push(plane_frame(0.1 * k, seq=k, camera=small)[0])
-    frame, truth = plane_frame(0.3, seq=3)
-    (done,) = stream.push(frame)
-    assert done.depth_m is not None and done.depth_m.shape == truth.shape
-    assert relative_error(done, truth) < 0.05
 
 
 def test_a_hint_decides_where_the_picture_says_nothing() -> None:

@@ -4,7 +4,6 @@ import numpy as np
 
 from semantic_mapper.geometry import make_pose, unproject
 from semantic_mapper.localization.depth_alignment import (
-    OUTLIER_M,
     Level,
     Target,
     align,
@@ -76,13 +75,6 @@ def test_sums_over_points_are_those_of_a_plain_loop() -> None:
         expected = (seen / known, near / flat, np.sqrt(squares / near), cost / flat, np.sqrt(weighted / weight))
         measured = (found.overlap, found.fitness, found.rmse_m, found.cost_m, found.noise_m)
         assert np.allclose(measured, expected, rtol=1e-9)
-
-
-def test_a_view_without_points_fits_nothing() -> None:
-    level, nothing = random_level(1), random_level(2)
-    nothing.points[:] = np.nan
-    found = fit([level], Target((nothing,), np.eye(4)), np.eye(4))
-    assert found.overlap == 0 and found.fitness == 0 and found.cost_m == OUTLIER_M
 
 
 def levels_of(frame: PosedFrame) -> tuple[Level, ...]:

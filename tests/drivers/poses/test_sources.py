@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import tomllib
 from typing import Any
 
@@ -64,16 +62,3 @@ def test_matrices_must_be_rigid(kind: str, name: str) -> None:
                 if kind == "topic"
                 else {"kind": kind, name: rows}
             )
-
-
-@pytest.mark.slow
-def test_no_pose_source_loads_open3d() -> None:
-    program = (
-        "import sys\n"
-        "from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config\n"
-        "for kind in ('fixed', 'board', 'device', 'rgbd'):\n"
-        "    make_poses(read_pose_config({'kind': kind}))\n"
-        "print('open3d' in sys.modules)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.stdout.split()[-1:] == ["False"], done.stderr

@@ -168,18 +168,6 @@ def test_what_is_no_endpoint_is_refused() -> None:
         pass
 
 
-def test_poses_of_another_machine_need_keys(tmp_path: Path) -> None:
-    for endpoint in ("tcp://robot:5560", "tcp://192.168.1.5:5560"):
-        with pytest.raises(CameraError, match=r"on another machine.*option `server`"):
-            TopicPoseSource(TopicPoses(endpoint=endpoint))
-    with pytest.raises(CameraError, match="no keys here; make them with"):
-        TopicPoseSource(TopicPoses(endpoint="tcp://robot:5560", server="robot", keys=str(tmp_path)))
-    keys = make_keys(tmp_path / "desk")
-    source = TopicPoseSource(TopicPoses(endpoint="tcp://192.0.2.1:5560", server="robot", keys=str(keys.folder)))
-    with pytest.raises(CameraError, match="no peer 'robot'"), source:
-        pass
-
-
 def test_a_robot_with_keys_is_listened_to_and_one_in_its_place_is_not(tmp_path: Path) -> None:
     robot, thief, desk = (make_keys(tmp_path / name) for name in ("robot", "thief", "desk"))
     allow(desk.folder, "robot", robot.public.decode())
