@@ -27,8 +27,7 @@ from semantic_mapper.nodes.launcher.liveness import (
 )
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT, STOP_SIGNAL
-from semantic_mapper.plain_text import visible
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import visible, without_secrets
 from semantic_mapper.transport.messages import NodeState
 
 # How long a node may make no progress when it is to end: one that makes progress, be it slowly, may take as long as it
