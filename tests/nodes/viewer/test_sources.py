@@ -11,24 +11,18 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-import msgspec
 import numpy as np
 import pytest
 import rerun.chunk
 from rerun import RecordingStream
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.nodes.cli.options import Remote
-from semantic_mapper.nodes.cli.view import _find_live
-from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
-from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer import server
 from semantic_mapper.nodes.viewer.mapped_log import show_log
@@ -39,7 +33,7 @@ from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file,
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
-from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
+from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import Publisher
 from tests.nodes.foxglove.robot import update_for
 from tests.nodes.mapper.test_query_service import answering
@@ -191,33 +185,6 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
     camera = f"/world/cameras/{frames[0].camera_id}/image"
     assert 1 <= rows[f"{camera}/rgb"] <= 3 and 1 <= rows[f"{camera}/semantics"] <= 3, "the newest of what came"
     assert rows["/world/map/class"] == rows["/world/map/age"] == 1, "a map that has not changed is not sent again"
-
-
-def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:
-    states: dict[str, NodeState] = {"left": "running", "right": "stopping", "gone": "ended", "mapper": "running"}
-    kinds = {name: "mapper" if name == "mapper" else "camera" for name in states}
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
-        note = LaunchNote("test.toml", tuple(NodeNote(name, kind, {}) for name, kind in kinds.items()))
-        (Path(folder) / NOTE).write_bytes(msgspec.json.encode(note))
-        ended = threading.Event()
-
-        def launcher() -> None:
-            with Publisher(f"ipc://{folder}/{STATUS_SOCKET}") as publisher:
-                while not ended.wait(0.1):
-                    for name, state in (*states.items(), (STATUS_SOCKET, "running")):
-                        counters = {"nodes": len(states)}
-                        publisher.publish(encode(Status(name, state, time.monotonic_ns(), counters)))
-
-        thread = threading.Thread(target=launcher)
-        thread.start()
-        try:
-            assert eventually((Path(folder) / STATUS_SOCKET).exists, 20)
-            live = _find_live(folder, "query", Remote())
-        finally:
-            ended.set()
-            thread.join()
-        assert live.streams == 2 and live.query == f"ipc://{folder}/query"
-        assert set(live.nodes) == {f"ipc://{folder}/{name}" for name in ("left", "right", "mapper")}
 
 
 def test_a_map_on_another_machine_is_shown_to_who_has_a_key(tmp_path: Path) -> None:
