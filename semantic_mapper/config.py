@@ -197,7 +197,7 @@ class VoxelMapConfig(Config, frozen=True):
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
     unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
-    clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``fusion/clearing.py``)
+    clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``mapping/clearing.py``)
 
     # The same for all maps:
     truncation_voxels: ClassVar[float] = 4.0
@@ -214,9 +214,6 @@ class PoseRefinerConfig(Config, frozen=True):
     # pictures ...
     sigma_m: Positive = 0.02
     sigma_deg: Positive = 0.5  # ... and of their rotations
-    window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 20  # keyframes that are adjusted together
-    corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
-    width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
 
 
 class HistoryConfig(Config, frozen=True):
@@ -263,7 +260,6 @@ class DepthFromMotionConfig(Config, frozen=True):
     planes: Annotated[int, msgspec.Meta(ge=16, le=256, multiple_of=16)] = 64  # depths tried, uniform in inverse depth
     near_m: Metres = 0.4
     far_m: Metres = 8.0
-    sources: Annotated[int, msgspec.Meta(ge=1, le=16)] = 4  # other frames that each is matched with
     # A frame waits for this many later ones, which see it from the other side: more accurate. 0 = live.
     delay_frames: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
 
