@@ -49,7 +49,6 @@ MAX_REQUEST_ROWS = 1 << 16  # points, rays or poses of one question
 MAX_WAIT_S = 3600.0  # for an answer, of a client that does not say
 
 AnswerT = TypeVar("AnswerT")
-RequestT = TypeVar("RequestT", bound="Request[Any]")
 
 _ERROR = "error"  # in the place of an answer's name
 _RAISED = {
@@ -386,15 +385,15 @@ NAMES = {question.request: name for name, question in QUESTIONS.items()}
 
 
 def decode_question(parts: Parts) -> Request[Any]:
-    """A question of any kind.
+    """A question of any kind; its arrays are fresh and writable.
 
     Raises:
-        CodecError: it is not a question.
+        CodecError: anything that ``encode_request`` would not have made.
     """
     name = read_name(parts)
     if name not in QUESTIONS:
         raise CodecError(f"unknown question {name!r}; there are {', '.join(QUESTIONS)}")
-    return decode_request(parts, QUESTIONS[name].request)
+    return _convert(unpack_header(parts[1], name), QUESTIONS[name].request, parts, name, MAX_REQUEST_ROWS)
 
 
 def encode_request(name: str, request: Request[Any]) -> list[bytes]:
@@ -404,7 +403,7 @@ def encode_request(name: str, request: Request[Any]) -> list[bytes]:
         CodecError: too many rows, or a value that cannot be sent.
     """
     parts = _encode(name, {}, request, name)
-    decode_request(parts, type(request))  # as its reader will
+    decode_question(parts)  # as its reader will
     return parts
 
 
@@ -417,16 +416,6 @@ def read_name(parts: Parts) -> str:
     if not 2 <= len(parts) <= 3:
         raise CodecError(f"a question or answer has 2 or 3 parts, got {len(parts)}")
     return bytes(parts[0][:32]).decode("ascii", errors="replace")
-
-
-def decode_request(parts: Parts, kind: type[RequestT]) -> RequestT:
-    """Parts -> question; its arrays are fresh and writable.
-
-    Raises:
-        CodecError: anything that ``encode_request`` would not have made.
-    """
-    name = read_name(parts)
-    return _convert(unpack_header(parts[1], name), kind, parts, name, MAX_REQUEST_ROWS)
 
 
 def encode_answer(name: str, state: MapState, answer: object) -> list[bytes]:

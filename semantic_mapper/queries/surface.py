@@ -164,15 +164,9 @@ def march_rays(
     slots: Int64,
     chosen: Int64,
 ) -> None:
-    """Write distances (N,), 0 = miss, and the observed voxel nearest to each place that was hit, among the eight round
-    it; of those with votes if any has some.
+    """Write distances (N,), 0 = miss, and slot and voxel (N,) of the observed voxel nearest to each place that was hit,
+    among the eight round it; of those with votes if any has some.
 
-    Args:
-        origins: (N, 3) in units of voxels.
-        directions: (N, 3) voxels a unit of the distance.
-        voxels_per_step: Length of one step of the quantised TSDF.
-        max_m: Where rays end, in units of the distance.
-        index, voxels: Of the snapshot.
-        distance, slots, chosen: (N,) written.
+    Origins (N, 3) are in units of voxels, directions (N, 3) in voxels a unit of the distance, which ends at ``max_m``.
     """
     ...
