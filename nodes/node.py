@@ -15,7 +15,6 @@ import structlog
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
 from semantic_mapper.nodes.process import (
@@ -25,6 +24,7 @@ from semantic_mapper.nodes.process import (
     LOSS_EVENT,
     STOP_SIGNAL,
     StopRequest,
+    failure_message,
     prepare_process,
 )
 from semantic_mapper.transport.endpoints import default_endpoint

@@ -24,11 +24,10 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_scale import FIX
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
-from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import BridgeOptions
-from semantic_mapper.nodes.status import publish_status
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.publishing import publish_status
+from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot

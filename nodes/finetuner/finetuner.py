@@ -25,7 +25,7 @@ from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDE
 from semantic_mapper.nodes.mapper.offered_weights import read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions
-from semantic_mapper.nodes.status import publish_status
+from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.keyframe_pool import KeyframePool
 from semantic_mapper.training.online import OnlineResult

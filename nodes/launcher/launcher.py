@@ -22,7 +22,7 @@ from semantic_mapper.nodes.launcher.running import leave_launch_note
 from semantic_mapper.nodes.launcher.systemd import Notifier
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.process_folder import OwnFolder, sweep
-from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import NodeState, Status
 from semantic_mapper.transport.sockets import NewestSubscriber

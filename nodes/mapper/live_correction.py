@@ -15,7 +15,7 @@ from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.mapping.map_types import CorrectedPoses
 from semantic_mapper.mapping.odometry_sessions import OdometrySessions
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries.questions import Correction, CorrectPosesRequest
 from semantic_mapper.replay.corrected_poses import match_frames
 from semantic_mapper.replay.session import MapSession

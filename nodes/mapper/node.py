@@ -32,12 +32,10 @@ from semantic_mapper.nodes.mapper.resume import (
     resume_map,
     stored_settings,
 )
-from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
-from semantic_mapper.nodes.public_publisher import PublicPublisher
-from semantic_mapper.nodes.status import PartStatus, publish_status
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.publishing import PartStatus, PublicPublisher, publish_status
+from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.run_folder import MAP_NAME, map_path, prepare_folder
 from semantic_mapper.replay.session import MapSession, open_recording

@@ -27,7 +27,7 @@ from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
-from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries import questions
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror

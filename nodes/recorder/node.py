@@ -15,11 +15,10 @@ import structlog
 
 from semantic_mapper.errors import CodecError, LogError, TransportError
 from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
-from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import NodeJob, RecorderOptions
-from semantic_mapper.nodes.status import publish_status
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.publishing import publish_status
+from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.mcap_scan import read_payloads, scan_end
 from semantic_mapper.replay.log.reader import LogAttachment

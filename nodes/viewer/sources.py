@@ -16,9 +16,8 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError, SemanticMapperError, TransportError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.bridge.packing import thinned, thinning
-from semantic_mapper.nodes.map_poses import MapPoses
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker, find_graph
 from semantic_mapper.queries.snapshot import BlockAges, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from semantic_mapper.nodes.missing_frames import MAX_MISSED, MissingFrames
+from semantic_mapper.nodes.streams import MAX_MISSED, MissingFrames
 from semantic_mapper.transport.messages import MAX_COUNT
 
 

@@ -68,6 +68,7 @@ def test_tables_json_reports_files_and_logs_are_without_secrets(
     table = Table(url, title=url)
     table.add_row(url)
     output.print(url, table)
+    output.quiet = True
     output.json({"map": url, "logs": [url]})
     write_json(tmp_path / "summary.json", {"source": url})
     write_page(tmp_path / "page.html", url, [Section(url, [url], tables=[table_of((url,), [(url,)])], lines=[url])])

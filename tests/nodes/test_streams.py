@@ -18,13 +18,12 @@ from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions, RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.nodes.recorder.node import run_recorder
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys

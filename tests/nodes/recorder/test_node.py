@@ -30,11 +30,11 @@ from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.nodes.cli.record import _join
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder, read_launch_note
-from semantic_mapper.nodes.missing_frames import MAX_MISSED
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
+from semantic_mapper.nodes.streams import MAX_MISSED
 from semantic_mapper.replay.jobs import EvaluateRequest, ReplayRequest, evaluate_log, replay_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules

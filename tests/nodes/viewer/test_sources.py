@@ -24,7 +24,7 @@ import pytest
 import rerun.chunk
 
 from semantic_mapper.errors import MapError, TransportError
-from semantic_mapper.nodes.cli.options import Remote
+from semantic_mapper.nodes.cli.verb import Remote
 from semantic_mapper.nodes.cli.view import _find_live, _Page
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
@@ -122,14 +122,14 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
         "tcp://10.1.2.3:5570": "without keys",
     }
     for source, reason in words.items():
-        done = run("view", source, "--port", "0", "--data-port", "0")
+        done = run("view", source, "--port", "0")
         assert done.returncode == 1 and reason in error_line(done.stderr)
         assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
 
 
 def test_an_error_while_something_is_shown_is_the_only_one(capfd: pytest.CaptureFixture[str]) -> None:
     def show_and_fail() -> None:
-        with _Page(0, 0, 64, Output.guarded()) as page:
+        with _Page(0, Output.guarded()) as page:
             log = RerunLog(page.begin(), LABELS)
             assert page.alive
             for _ in range(20):
@@ -254,7 +254,7 @@ def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:
         thread.start()
         try:
             assert eventually((Path(folder) / STATUS_SOCKET).exists, 20)
-            live = _find_live(folder, "query", Remote())
+            live = _find_live(folder, Remote())
         finally:
             ended.set()
             thread.join()
