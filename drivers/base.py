@@ -1,43 +1,17 @@
-"""The protocols of sources: of frames, of camera images that have no pose yet, and of poses for them."""
+"""What cameras give (images that have no pose yet), what pose sources give, and the bases of both."""
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self, runtime_checkable
+from typing import Self
 
+from semantic_mapper.errors import CameraError
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
-
-
-@runtime_checkable
-class FrameSource(Protocol):
-    """Something that gives posed frames; used as a context manager, which opens and frees the device or file.
-
-    Iteration ends with the recording, never for a live camera. A frame that is lost or damaged is passed over, and
-    shows as a gap in ``PosedFrame.seq``; a device that is gone raises the driver's error.
-    """
-
-    @property
-    def info(self) -> StreamInfo:
-        """Cameras with their intrinsics, the label set (None without labels), where the frames come from."""
-        ...
-
-    def __enter__(self) -> Self:
-        """Open it."""
-        ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Free it."""
-        ...
-
-    def __iter__(self) -> Iterator[PosedFrame]:
-        """Frames in the order of capture."""
-        ...
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,52 +66,75 @@ class CameraImage:
     tracks_itself: bool = False
 
 
-@runtime_checkable
-class Camera(Protocol):
-    """A device that gives images; otherwise as ``FrameSource``.
+class Camera:
+    """Base of devices that give images; used as a context manager, which opens and frees the device or file.
 
-    A device that goes away and may come back is waited for within the driver: iteration goes on after a gap in
-    ``seq``, and ``warnings`` says what is the matter meanwhile.
+    Iteration ends with a recording, never for a live camera. An image that is lost or damaged is passed over, and shows
+    as a gap in ``seq``. A device that goes away and may come back is waited for within the driver; ``warnings`` says so
+    meanwhile. What no waiting can fix raises ``CameraError``.
+
+    Args:
+        camera_id: What its images are called.
+
+    Attributes:
+        can_wait: Whether its images wait until they are taken, as those of a file do; known before it is open.
     """
+
+    can_wait = False
+
+    def __init__(self, camera_id: str) -> None:
+        self._camera_id = camera_id
+        self._info: StreamInfo | None = None  # known once it is open
+        self._stopping = threading.Event()
+        self._last_poll_time = 0.0
 
     @property
     def info(self) -> StreamInfo:
-        """As of ``FrameSource``; known once it is open."""
-        ...
+        """Its intrinsics, its device, its rate.
+
+        Raises:
+            CameraError: it is not open.
+        """
+        if self._info is None:
+            raise CameraError(f"camera '{self._camera_id}' is not open")
+        return self._info
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence for each thing that does not work as it should now; any thread may ask."""
-        ...
-
-    @property
-    def can_wait(self) -> bool:
-        """Whether its images wait until they are taken, as those of a file do; known before it is open."""
-        ...
+        return ()
 
     @property
     def last_poll_time(self) -> float:
         """When the driver last came round (``time.monotonic``), with an image or without: while it waits for a device
         that is away or gives nothing, too, but not while a call into the device hangs. Any thread may ask."""
-        ...
+        return self._last_poll_time
 
     def __enter__(self) -> Self:
-        """Open it."""
-        ...
+        """Open it.
+
+        Raises:
+            CameraError: it is not there, or cannot do what its config asks for.
+        """
+        raise NotImplementedError
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Free it."""
-        ...
+        self.stop()
 
     def __iter__(self) -> Iterator[CameraImage]:
-        """Images in the order of capture."""
-        ...
+        """Images in the order of capture.
+
+        Raises:
+            CameraError: it is not open, or has failed for good.
+        """
+        raise NotImplementedError
 
     def stop(self) -> None:
         """End the iteration soon, from any thread or signal handler."""
-        ...
+        self._stopping.set()  # no lock: a signal handler may interrupt the thread that holds it
 
 
 class PoseSource:

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from semantic_mapper.backoff import backoff_s
-from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
@@ -28,6 +28,8 @@ MIN_HZ = 1e-3  # of a film or camera: one divided by it is still a time
 DRIFT = 2e-4  # how much faster or slower than ours the sender's clock may run
 LATE_NS = 1_000_000_000  # an image is never so much later than the quickest one: then its clock is not usable
 CLOSE_S = 1.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
+
+NOT_CALIBRATED = "not calibrated: the intrinsics are a guess, good for calibrating only"
 
 _log = get_logger(__name__)
 
@@ -76,7 +78,7 @@ class Device(Protocol):
         ...
 
 
-class LiveCamera:
+class LiveCamera(Camera):
     """A ``Camera`` that OpenCV reads: one thread owns the device, the newest image wins, a lost device is waited for.
 
     The thread is the only one that touches the device, since a read of a stalled stream may hang for seconds.
@@ -97,15 +99,13 @@ class LiveCamera:
         stall_s: float,
         metadata: dict[str, str],
     ) -> None:
-        self._camera_id = camera_id
+        super().__init__(camera_id)
         self._open_device = open_device
         self._measured = measured
         self._stall_s = stall_s
         self._metadata = metadata
-        self._info: StreamInfo | None = None
         self._rectify: Rectifier | None = None
         self._thread: threading.Thread | None = None
-        self._stopping = threading.Event()
         self._changed = threading.Condition()
         self._newest: tuple[int, RawImage] | None = None  # number and image; guarded by _changed
         self._seq = -1  # of the last image; only the thread counts
@@ -115,18 +115,11 @@ class LiveCamera:
         self._device_warnings: tuple[str, ...] = ()
 
     @property
-    def info(self) -> StreamInfo:
-        """As of ``Camera``."""
-        if self._info is None:
-            raise CameraError(f"camera '{self._camera_id}' is not open")
-        return self._info
-
-    @property
     def warnings(self) -> tuple[str, ...]:
         """As of ``Camera``."""
         warnings = list(self._device_warnings)
         if self._measured is None:
-            warnings.append("not calibrated: the intrinsics are a guess, good for calibrating only")
+            warnings.append(NOT_CALIBRATED)
         silent_s = time.monotonic() - self._heard
         if self._lost:
             warnings.append(f"{self._lost}; waited for since {silent_s:.0f} s")
@@ -135,21 +128,12 @@ class LiveCamera:
         return tuple(warnings)
 
     @property
-    def can_wait(self) -> bool:
-        """As of ``Camera``."""
-        return False
-
-    @property
     def last_poll_time(self) -> float:
         """As of ``Camera``."""
         return min(self._read_at, self._last_request)
 
     def __enter__(self) -> Self:
-        """Open the device.
-
-        Raises:
-            CameraError: it is not there, or its images have another size than was calibrated.
-        """
+        """As of ``Camera``."""
         device = self._open()
         intrinsics = self._measured or guess_intrinsics(*device.size)
         rectify = self._rectify = Rectifier(intrinsics)
@@ -172,11 +156,7 @@ class LiveCamera:
             self._thread.join(CLOSE_S)
 
     def __iter__(self) -> Iterator[CameraImage]:
-        """The newest image each time; what was captured meanwhile is a gap in ``seq``.
-
-        Raises:
-            CameraError: not open, or the reading thread has failed.
-        """
+        """The newest image each time; what was captured meanwhile is a gap in ``seq``."""
         rectify, thread = self._rectify, self._thread
         if rectify is None or thread is None:
             raise CameraError(f"camera '{self._camera_id}' is not open")
@@ -193,12 +173,8 @@ class LiveCamera:
             elif not thread.is_alive() and not self._stopping.is_set():
                 raise CameraError(f"camera '{self._camera_id}': its reading thread has failed; the log says why")
 
-    def stop(self) -> None:
-        """As of ``Camera``."""
-        self._stopping.set()  # no lock: a signal handler may interrupt the thread that holds it
-
     def _open(self) -> Device:
-        """Raises: CameraError: see ``__enter__``."""
+        """Raises: CameraError: it is not there, or its images have another size than was calibrated."""
         device = self._open_device()
         expected = device.size if self._measured is None else (self._measured.width, self._measured.height)
         if device.size != expected:
@@ -269,47 +245,15 @@ class StreamEnded(Exception):  # noqa: N818 -- an event, not an error: the camer
     """The device has gone, or gives nothing any more; the text says which."""
 
 
-class PolledCamera:
-    """Base of a ``Camera`` over an SDK that is polled; a device that goes away is looked for until it is back.
-
-    Args:
-        camera_id: What its images are called.
-    """
+class PolledCamera(Camera):
+    """Base of a camera over an SDK that is polled; a device that goes away is looked for until it is back."""
 
     def __init__(self, camera_id: str) -> None:
-        self._camera_id = camera_id
-        self._stopped = threading.Event()
+        super().__init__(camera_id)
         self._connected = False
-        self._info: StreamInfo | None = None
-        self._last_poll_time = 0.0
-
-    @property
-    def info(self) -> StreamInfo:
-        """Name and intrinsics of the device.
-
-        Raises:
-            CameraError: it is not open.
-        """
-        if self._info is None:
-            raise CameraError(f"camera '{self._camera_id}' is not open")
-        return self._info
-
-    @property
-    def can_wait(self) -> bool:
-        """As of ``Camera``."""
-        return False
-
-    @property
-    def last_poll_time(self) -> float:
-        """As of ``Camera``."""
-        return self._last_poll_time
 
     def __enter__(self) -> Self:
-        """Open the device and wait for its first image.
-
-        Raises:
-            CameraError: it is not there, or cannot do what the config asks for.
-        """
+        """Open the device and wait for its first image."""
         self._connect(again=False)
         self._connected = True
         return self
@@ -320,18 +264,10 @@ class PolledCamera:
         """Free the device."""
         self._disconnect()
 
-    def stop(self) -> None:
-        """As of ``Camera``."""
-        self._stopped.set()
-
     def __iter__(self) -> Iterator[CameraImage]:
-        """Images in the order of capture, until ``stop``; a device that goes away is waited for.
-
-        Raises:
-            CameraError: not open, or what comes is not what was requested.
-        """
+        """As of ``Camera``."""
         source = self.info.source
-        while not self._stopped.is_set():
+        while not self._stopping.is_set():
             self._last_poll_time = time.monotonic()
             if self._connected:
                 try:
@@ -341,14 +277,12 @@ class PolledCamera:
                     self._warn_of_device(f"{source}: {end}; it is looked for every {RETRY_S:g} s")
                     _log.warning("camera_lost", camera=self._camera_id, device=source, reason=str(end))
                     self._disconnect()
-            elif not self._stopped.wait(RETRY_S):
+            elif not self._stopping.wait(RETRY_S):
                 try:
                     self._connect(again=True)
                     self._connected = True
                 except CameraError as error:
                     self._warn_of_device(f"{source} is away: {error}")
-                else:
-                    self._check_after_return()
 
     def _connect(self, *, again: bool) -> None:
         """Open the device, start it, and set ``_info``; ``again``: it was away, and is looked for once.
@@ -374,13 +308,47 @@ class PolledCamera:
         """Keep it for ``warnings``, until an image comes."""
         raise NotImplementedError
 
-    def _check_after_return(self) -> None:
-        """Raise ``CameraError`` where the camera must not continue after its device was away."""
-
 
 def nominal_hz(reported: float) -> float:
     """A rate as a container or a device reports it; 0 for what cannot be one."""
     return reported if MIN_HZ <= reported <= 1000 else 0.0
+
+
+class FrameCounter:
+    """Numbers a camera's images from 0, with jumps where images were lost, over all its connections.
+
+    Args:
+        hz: Nominal rate, by which the images that are lost while the device is away are counted.
+    """
+
+    def __init__(self, hz: float) -> None:
+        self._period_ns = 1e9 / hz
+        self._last: tuple[int, int] | None = None  # number and stamp of the last image
+        self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
+
+    def restart(self) -> None:
+        """The device counts again from here."""
+        self._shift = None
+
+    def refusal(self, stamp_ns: int) -> str:
+        """Why an image of this stamp is passed over (not later than the one before, or of the future); or empty."""
+        if stamp_ns > time.monotonic_ns() + FUTURE_NS:
+            return "its stamp is in the future: check the clocks of this machine and of the device"
+        if self._last is not None and stamp_ns <= self._last[1]:
+            return "its stamp is not later than that of the image before"
+        return ""
+
+    def number(self, counted: int, stamp_ns: int) -> int:
+        """Number of the image that the device counts as ``counted``."""
+        number = 0
+        if self._last is not None:
+            last, last_ns = self._last
+            number = counted + self._shift if self._shift is not None else last
+            if number <= last:  # the device counts again: ask the clock
+                number = last + max(2, round((stamp_ns - last_ns) / self._period_ns))
+        self._shift = number - counted
+        self._last = (number, stamp_ns)
+        return number
 
 
 class StreamClock:

@@ -70,18 +70,16 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
 
 UP = (0.0, 0.0, 1.0)  # of the boxes of instances, where nothing else is given
 NO_FLOOR = "no floor was found: too little level surface, or another way is up (--up)"
-CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned"
 
 
-def answer_instances(up: Sequence[float], instances: Sequence[Instance], separated_by: str = "") -> dict[str, Any]:
-    """The things in a map, the surest first, and by which means they were separated; empty = not known.
+def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict[str, Any]:
+    """The things in a map, the surest first.
 
     Those that have gone are ``gone``, the latest first; the key is left out while nothing has gone.
     """
     there = sorted((t for t in instances if t.gone_ns is None), key=lambda thing: -thing.rank)
     gone = sorted((t for t in instances if t.gone_ns is not None), key=lambda thing: thing.gone_ns or 0, reverse=True)
     found: dict[str, Any] = {"question": "instances", "up": list(up)}
-    found |= {"separated_by": separated_by} if separated_by else {}
     found["instances"] = [_describe_thing(thing) for thing in there]
     found |= {"gone": [{**_describe_thing(t), "gone_ns": t.gone_ns} for t in gone]} if gone else {}
     return found

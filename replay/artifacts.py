@@ -16,7 +16,6 @@ from semantic_mapper import __version__
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.evaluation.metrics import confusion_of
-from semantic_mapper.evaluation.overview import ViewStrip, draw_overview, draw_strip
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
@@ -26,9 +25,9 @@ from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import SceneGraph, find_graph
+from semantic_mapper.replay.overview import ViewStrip, draw_overview, draw_strip
 from semantic_mapper.replay.page import (
     Section,
-    class_sections,
     picture,
     picture_files,
     point_view,
@@ -39,7 +38,7 @@ from semantic_mapper.replay.page import (
 from semantic_mapper.replay.run_folder import MAP_NAME
 from semantic_mapper.replay.session import MAX_LISTED, MapSession, Refusal
 from semantic_mapper.replay.stats import LatencyHistogram
-from semantic_mapper.replay.summary import SUMMARY_FILE, dig, notes, summary_table
+from semantic_mapper.replay.summary import SUMMARY_FILE, notes, summary_table
 from semantic_mapper.types import Float64
 
 _log = get_logger(__name__)
@@ -383,7 +382,6 @@ def _write_report(session: MapSession, points: MapPoints, summary: Mapping[str, 
         Section("Figures", tables=[summary_table({out.resolve().name: summary})]),
         *([Section("Frames", pictures=strips)] if strips else []),
         *stage_sections({"this replay": summary}),
-        *class_sections({"this replay": dig(summary, "metrics.per_class") or {}}),
         Section(
             "Frames that came, and what became of them",
             notes=[f"Damaged: {stretch}" for stretch in summary["damaged_stretches"]],

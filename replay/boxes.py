@@ -12,7 +12,7 @@ from __future__ import annotations
 import codecs
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -26,7 +26,7 @@ from msgspec import Meta
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, PoseError
 from semantic_mapper.fields.scene.primitives import Primitive, ShapeName, centred
-from semantic_mapper.files import read_regular, write_bytes
+from semantic_mapper.files import read_regular
 from semantic_mapper.geometry import MAX_TRANSLATION_M, check_pose
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.log_events import get_logger
@@ -69,7 +69,7 @@ class BoxFile:
     Args:
         primitives: In the order of the file, those that move among them.
         merge: By class of the pseudo labels: classes that they cannot tell from it.
-        left_out: How many boxes of the file are of no class at all (KITTI-360's "unknown").
+        left_out: How many boxes of the file are of no class that is known.
         bad: Boxes of XML that cannot be used: number in the file, id and what is wrong.
         is_xml: Whether it is one of KITTI-360.
     """
@@ -113,7 +113,10 @@ def load_boxes(path: Path) -> BoxFile:
         ConfigError: no such file, neither format, or boxes that cannot be used, each with its number in the file. Of
             XML these are left out, and counted in a warning, unless all are.
     """
-    text = _read(path)
+    try:
+        text = read_regular(path, MAX_FILE_BYTES).removeprefix(codecs.BOM_UTF8)
+    except OSError as error:
+        raise ConfigError(f"cannot read boxes from {path}: {error}") from error
     found = _read_xml(text, path) if text.lstrip().startswith(b"<") else _read_json(text, path)
     if not found.bad:
         return found
@@ -126,20 +129,11 @@ def load_boxes(path: Path) -> BoxFile:
     return found
 
 
-def save_boxes(path: Path, boxes: BoxFile) -> None:
-    """Write ``boxes.json``, in one step; reading it gives the same boxes again."""
-    listed = [json.dumps(_to_json(p)) for p in boxes.primitives]
-    merge = json.dumps({name: list(rest) for name, rest in boxes.merge.items()})
-    text = '{"boxes": [\n' + ",\n".join(listed) + f'\n], "merge": {merge}}}\n'
-    write_bytes(path, text.encode())
-
-
 def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFile, LabelSet]:
-    """Boxes that a field can be fitted with, and the label set of the field.
+    """Boxes that a field can be fitted with, and the label set of the field: that of the pseudo labels, and classes of
+    boxes that one of its classes stands for, as ``merge`` says, or else ``MERGE``.
 
-    That is the one of the pseudo labels, and those classes of boxes that it lacks, but that a class of it may stand for
-    as ``merge`` says, or else ``MERGE``. Boxes of XML of KITTI-360 of any other class that it lacks are left out, with
-    a warning.
+    Boxes of XML of any other class that it lacks are left out, with a warning.
 
     Args:
         boxes: Of a file.
@@ -147,8 +141,7 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
         path: Of the file, for errors.
 
     Raises:
-        ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name; or, of XML,
-            the classes of most boxes.
+        ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name.
     """
     boxes = _merged(boxes, label_set)
     merged = {name for others in boxes.merge.values() for name in others}
@@ -210,11 +203,6 @@ def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]
     return replace(boxes, primitives=tuple(kept)), dropped
 
 
-def _is_thing(class_name: str) -> bool:
-    """Whether boxes of a class are things where nothing says so."""
-    return class_name not in BOX_STUFF
-
-
 def _metres(value: Any, name: str) -> Float64:
     """Lengths or places as an array.
 
@@ -247,24 +235,23 @@ def _box_of(box: Primitive) -> Primitive:
     return box
 
 
-def _each_once(
-    good: Iterable[tuple[int, Primitive]], bad: Iterable[tuple[int, int | None, str]]
-) -> tuple[tuple[Primitive, ...], tuple[str, ...]]:
-    """Boxes, each with its number in the file, and bad ones (number, id, problem), as sentences in order; those with
-    the id of an earlier one are bad, too."""
-    seen: dict[int, int] = {}
-    kept: list[Primitive] = []
-    more = list(bad)
-    for number, box in good:
-        first = seen.setdefault(box.id, number)
-        if first == number:
-            kept.append(box)
-        else:
-            more.append((number, box.id, f"id {box.id} is that of box {first}; give it another"))
-    sentences = [
-        f"box {n}{'' if i is None else f' (id {i})'}: {problem}" for n, i, problem in sorted(more, key=lambda b: b[0])
-    ]
-    return tuple(kept), tuple(sentences)
+def _parse_all(
+    entries: Iterable[tuple[int, Any]], parse: Callable[[Any], Primitive], id_of: Callable[[Any], int | None]
+) -> tuple[dict[int, Primitive], dict[int, str]]:
+    """Boxes by their number in the file, and for those that cannot be used a sentence that says why."""
+    good: dict[int, Primitive] = {}
+    bad: dict[int, str] = {}
+    first: dict[int, int] = {}
+    for number, entry in entries:
+        try:
+            box = parse(entry)
+            if box.frames is None and first.setdefault(box.id, number) != number:
+                raise ConfigError(f"id {box.id} is that of box {first[box.id]}; give it another")
+            good[number] = box
+        except (ConfigError, PoseError) as error:
+            known = id_of(entry)
+            bad[number] = f"box {number}{'' if known is None else f' (id {known})'}: {error}"
+    return good, bad
 
 
 def _merged(boxes: BoxFile, label_set: LabelSet) -> BoxFile:
@@ -279,31 +266,14 @@ def _merged(boxes: BoxFile, label_set: LabelSet) -> BoxFile:
 
 
 def _of_known_classes(boxes: BoxFile, known: Collection[str], label_set: LabelSet, path: Path) -> BoxFile:
-    """Boxes of XML of classes that are known; the others are counted.
-
-    Raises:
-        ConfigError: these are more.
-    """
+    """Boxes of XML of classes that are known; the others are counted."""
     kept = tuple(p for p in boxes.primitives if p.class_name in known)
     count = len(boxes.primitives) - len(kept)
-    if not count:
-        return boxes
-    lacking = sorted({p.class_name for p in boxes.primitives} - set(known))
-    reason = f"label set '{label_set.name}' has no class {', '.join(lacking)}"
-    if count > len(kept):
-        raise ConfigError(
-            f"{path}: {reason}, of which {count} of {len(boxes.primitives)} boxes are; it has "
-            f"{', '.join(label_set.names)}"
-        )
-    _log.warning("boxes_left_out", file=str(path), count=count, reason=reason)
+    if count:
+        lacking = ", ".join(sorted({p.class_name for p in boxes.primitives} - set(known)))
+        reason = f"label set '{label_set.name}' has no class {lacking}"
+        _log.warning("boxes_left_out", file=str(path), count=count, reason=reason)
     return replace(boxes, primitives=kept, left_out=boxes.left_out + count)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return read_regular(path, MAX_FILE_BYTES).removeprefix(codecs.BOM_UTF8)
-    except OSError as error:
-        raise ConfigError(f"cannot read boxes from {path}: {error}") from error
 
 
 def _read_json(text: bytes, path: Path) -> BoxFile:
@@ -323,16 +293,14 @@ def _read_json(text: bytes, path: Path) -> BoxFile:
     listed = table.get("boxes")
     table["boxes"] = [] if isinstance(listed, list) else listed  # each is checked by itself
     file = convert_config(table, _File, str(path))
-    good: list[tuple[int, Primitive]] = []
-    bad: list[tuple[int, int | None, str]] = []
-    for number, entry in enumerate(cast("list[Any]", listed), 1):
-        try:
-            good.append((number, (_from_query if of_query else _from_json)(entry)))
-        except (ConfigError, PoseError) as error:
-            box_id: Any = cast("dict[str, Any]", entry).get("id") if isinstance(entry, dict) else None
-            bad.append((number, box_id if type(box_id) is int else None, str(error)))
-    primitives, sentences = _each_once(good, bad)
-    return BoxFile(primitives, file.merge, bad=sentences)
+    numbered = enumerate(cast("list[Any]", listed), 1)
+    good, bad = _parse_all(numbered, _from_query if of_query else _from_json, _id_in_json)
+    return BoxFile(tuple(good.values()), file.merge, bad=tuple(bad.values()))
+
+
+def _id_in_json(entry: Any) -> int | None:
+    found: Any = cast("dict[str, Any]", entry).get("id") if isinstance(entry, dict) else None
+    return found if type(found) is int else None
 
 
 def _from_json(entry: Any) -> Primitive:
@@ -359,7 +327,7 @@ def _from_json(entry: Any) -> Primitive:
             shape=box.shape,
             T_world_box=(stamps or frames or ((0, np.array(box.T_world_box, np.float64)),))[0][1],
             size=size,
-            thing=_is_thing(box.class_name) if box.thing is None else box.thing,
+            thing=box.class_name not in BOX_STUFF if box.thing is None else box.thing,
             polygon=polygon,
             vertices=vertices,
             faces=faces,
@@ -388,25 +356,6 @@ def _poses(known: list[tuple[int, Pose]] | None, name: str) -> tuple[tuple[int, 
     return tuple(sorted(poses.items()))
 
 
-def _to_json(primitive: Primitive) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "id": primitive.id,
-        "class": primitive.class_name,
-        "shape": primitive.shape,
-        "T_world_box": primitive.T_world_box.tolist(),
-        "size": primitive.size.tolist(),
-        "thing": primitive.thing,
-    }
-    for key in ("polygon", "vertices", "faces"):
-        value: Any = getattr(primitive, key)
-        if value is not None:
-            entry[key] = value.tolist()
-    for key, known in (("stamps", primitive.stamps), ("frames", primitive.frames)):
-        if known is not None:
-            entry[key] = [[when, pose.tolist()] for when, pose in known]
-    return entry
-
-
 def _from_query(entry: Any) -> Primitive:
     """One instance of `query MAP instances`."""
     given = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
@@ -419,7 +368,7 @@ def _from_query(entry: Any) -> Primitive:
     size = _metres(found.size, "size")
     if (size < 0).any():
         raise ConfigError(f"size must not be below 0 m, got {size.tolist()}")
-    return _box_of(Primitive(box_id, name, "box", pose, size + 2 * QUERY_MARGIN_M, _is_thing(name)))
+    return _box_of(Primitive(box_id, name, "box", pose, size + 2 * QUERY_MARGIN_M, name not in BOX_STUFF))
 
 
 def _read_xml(text: bytes, path: Path) -> BoxFile:
@@ -442,30 +391,21 @@ def _read_xml(text: bytes, path: Path) -> BoxFile:
     if not nodes:
         raise ConfigError(f"{path} holds no boxes; give XML of KITTI-360's data_3d_bboxes")
     known = [(n, node) for n, node in enumerate(nodes, 1) if not _text(node, "label").lower().startswith("unknown")]
-    good: list[tuple[int, Primitive]] = []
-    bad: list[tuple[int, int | None, str]] = []
-    place: dict[tuple[str, str], int] = {}  # in ``good``, of those that move
+    good, bad = _parse_all(known, _from_node, _id_in_xml)
+    place: dict[tuple[str, str], int] = {}  # of the first node of an object that moves
     for number, node in known:
-        try:
-            box, frame = _from_node(node)
-            if frame < 0:
-                good.append((number, box))
-                continue
-            box = replace(box, frames=((frame, box.T_world_box),))
-            at = place.setdefault(_object_of(node), len(good))
-            if at == len(good):
-                good.append((number, box))
-            else:
-                good[at] = good[at][0], _also(good[at][1], box, frame)
-        except (ConfigError, PoseError) as error:
-            index = _text(node, "index")
-            bad.append((number, int(index) + 1 if index.isdecimal() else None, str(error)))
-    primitives, sentences = _each_once(good, bad)
-    return BoxFile(primitives, left_out=len(nodes) - len(known), bad=sentences, is_xml=True)
+        if number in good and (later := good[number]).frames is not None:
+            first = place.setdefault(_object_of(node), number)
+            if first != number:
+                good[first] = _also(good[first], later)
+                del good[number]
+    return BoxFile(
+        tuple(good.values()), left_out=len(nodes) - len(known), bad=tuple(bad[n] for n in sorted(bad)), is_xml=True
+    )
 
 
-def _from_node(node: ElementTree.Element) -> tuple[Primitive, int]:
-    """One object in axes of its own, and the frame at which it is there; -1 = it does not move."""
+def _from_node(node: ElementTree.Element) -> Primitive:
+    """One object in axes of its own, with its pose at a frame if it moves."""
     transform, local, faces = (_matrix(node, name) for name in ("transform", "vertices", "faces"))
     if transform.shape != (4, 4) or local.shape[1] != 3 or faces.shape[1] not in (3, 4):
         raise ConfigError(
@@ -484,17 +424,24 @@ def _from_node(node: ElementTree.Element) -> tuple[Primitive, int]:
         raise ConfigError("<label> is missing")
     name = _XML_NAMES.get(re.sub(r"\s", "", label).lower(), label)
     corners = faces.astype(np.int64)
+    frame = _whole(node, "timestamp") if _text(node, "timestamp") else -1  # it does not move
     box = Primitive(
         id=_whole(node, "index") + 1,
         class_name=name,
         shape="mesh",
         T_world_box=pose,
         size=np.ptp(vertices, axis=0),
-        thing=_is_thing(name),
+        thing=name not in BOX_STUFF,
         vertices=vertices,
         faces=corners if corners.shape[1] == 3 else np.concatenate((corners[:, :3], corners[:, (0, 2, 3)])),
     )
-    return _box_of(box), _whole(node, "timestamp") if _text(node, "timestamp") else -1
+    box = _box_of(box)
+    return box if frame < 0 else replace(box, frames=((frame, box.T_world_box),))
+
+
+def _id_in_xml(node: ElementTree.Element) -> int | None:
+    index = _text(node, "index")
+    return int(index) + 1 if index.isdecimal() else None
 
 
 def _object_of(node: ElementTree.Element) -> tuple[str, str]:
@@ -503,13 +450,10 @@ def _object_of(node: ElementTree.Element) -> tuple[str, str]:
     return _text(node, "label"), instance if instance.strip("0") else f"index {_text(node, 'index')}"
 
 
-def _also(box: Primitive, later: Primitive, frame: int) -> Primitive:
-    """A box that is also there at another frame, in the shape that it had at first."""
-    frames = dict(box.frames or ())
-    if frame in frames:
-        raise ConfigError(f"the same object is there already at frame {frame}")
-    known = tuple(sorted({**frames, frame: later.T_world_box}.items()))
-    return replace(box, frames=known, T_world_box=known[0][1])
+def _also(box: Primitive, later: Primitive) -> Primitive:
+    """A box that is also there at the frame of another, in the shape that it had at first."""
+    frames = tuple(sorted({**dict(later.frames or ()), **dict(box.frames or ())}.items()))
+    return replace(box, frames=frames, T_world_box=frames[0][1])
 
 
 def _text(node: ElementTree.Element, name: str) -> str:

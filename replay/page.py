@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,22 +17,19 @@ import cv2
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
-from rich.style import Style
 from rich.table import Table
-from rich.text import Text
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.overview import ELEVATION, LabelledPoints
-from semantic_mapper.evaluation.splat import open_side, point_spacing
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.plain_text import visible
-from semantic_mapper.plots import UNKNOWN, Bar, class_rows, draw_bars, png_bytes
+from semantic_mapper.plots import UNKNOWN, class_rows, encode_picture
 from semantic_mapper.redaction import without_secrets
+from semantic_mapper.replay.overview import open_side, point_spacing
 from semantic_mapper.types import Float64, UInt8
 
-JPEG_QUALITY = 88
 MAX_VIEW_POINTS = 300_000  # 10 bytes each
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -47,23 +43,6 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
-    """One of several things next to each other.
-
-    Args:
-        title: Its name.
-        link: Where it leads; empty = nowhere. See ``linked`` for what may be a link.
-        picture: None = no picture.
-        lines: Short texts below.
-    """
-
-    title: str
-    link: str = ""
-    picture: Picture | None = None
-    lines: Sequence[str] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Section:
     """A part of a page; what it has stands in this order.
 
@@ -71,9 +50,7 @@ class Section:
         heading: None of its own where empty.
         notes: Paragraphs that the reader must not miss.
         view: What ``point_view`` returns; at most once a page.
-        pictures, tables: The tables are those that the console shows; cells may be ``linked`` texts.
-        cards: Next to each other.
-        lines: Paragraphs.
+        pictures, tables: The tables are those that the console shows.
         folded: Texts that a click unfolds, by their heads.
     """
 
@@ -81,9 +58,7 @@ class Section:
     notes: Sequence[str] = ()
     view: Mapping[str, Any] | None = None
     pictures: Sequence[Picture] = ()
-    cards: Sequence[Card] = ()
     tables: Sequence[Table] = ()
-    lines: Sequence[str] = ()
     folded: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -127,7 +102,7 @@ def _plain(section: Section) -> dict[str, Any]:
             "title": str(table.title or ""),
             "heads": [str(column.header) for column in table.columns],
             "right": [column.justify == "right" for column in table.columns],
-            "rows": [[_cell(cell) for cell in row] for row in zip(*(c.cells for c in table.columns), strict=True)],
+            "rows": [list(map(str, row)) for row in zip(*(c.cells for c in table.columns), strict=True)],
             "sections": [number for number, row in enumerate(table.rows, 1) if row.end_section],
         }
         for table in section.tables
@@ -135,34 +110,10 @@ def _plain(section: Section) -> dict[str, Any]:
     return {**{name: getattr(section, name) for name in Section.__slots__}, "tables": tables}
 
 
-def _cell(cell: Any) -> dict[str, str]:
-    style = cell.style if isinstance(cell, Text) else ""
-    return {"text": str(cell), "link": style.link or "" if isinstance(style, Style) else ""}
-
-
-def linked(text: str, link: str) -> Text:
-    """A cell of a table that leads somewhere; the page itself fetches nothing.
-
-    Args:
-        text: What is shown.
-        link: A relative path, or a URL of http or https; anything else is left out. Empty = nowhere.
-    """
-    return Text(text, style=Style(link=safe_link(link) or None))
-
-
-def safe_link(link: str) -> str:
-    """The link, or nothing where it would run a program or open something other than a page."""
-    scheme = re.match(r"[^/?#]*:", link)
-    return link if scheme is None or scheme.group().lower() in ("http:", "https:") else ""
-
-
 def picture(pixels: UInt8, caption: str, *, photo: bool = False) -> Picture:
     """(H, W, 3) RGB; ``photo``: as JPEG, which is smaller where there are no sharp lines."""
-    kind, data = "png", b""
-    if photo:
-        options = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-        kind, data = "jpeg", cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), options)[1].tobytes()
-    return Picture(f"data:image/{kind};base64,{_base64(data or png_bytes(pixels))}", caption)
+    data = _base64(encode_picture(pixels, jpeg=photo))
+    return Picture(f"data:image/{'jpeg' if photo else 'png'};base64,{data}", caption)
 
 
 def picture_files(*files: tuple[Path, str]) -> Iterator[Picture]:
@@ -173,7 +124,7 @@ def picture_files(*files: tuple[Path, str]) -> Iterator[Picture]:
             yield picture(np.asarray(cv2.cvtColor(data, cv2.COLOR_BGR2RGB), np.uint8), caption, photo=True)
 
 
-def point_view(points: LabelledPoints, label_set: LabelSet, up: Float64 | None) -> dict[str, Any]:
+def point_view(points: MapPoints, label_set: LabelSet, up: Float64 | None) -> dict[str, Any]:
     """The map for the page's 3D view: ``classes`` as a legend, and ``data`` for ``templates/points.js``.
 
     The points are turned upright. Positions are uint16 fractions of their bounds, below a millimetre in a map of 60 m.
@@ -209,7 +160,7 @@ def point_view(points: LabelledPoints, label_set: LabelSet, up: Float64 | None) 
         "size": max(float(np.linalg.norm(np.ptp(middle, axis=0))), 0.1),
         "spacing": point_spacing(xyz),
         "ceiling": ceiling_height(xyz),
-        "azimuth": open_side(xyz, ELEVATION),
+        "azimuth": open_side(xyz),
         "classes": _base64(table.tobytes()),
         "xyz": _base64(np.round((xyz - low) / extent * 65535).astype("<u2").tobytes()),
         "rgb": _base64(points.rgb[chosen].tobytes()),
@@ -222,7 +173,7 @@ def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
 
 
-def table_of(heads: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> Table:
+def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     """A plain table."""
     table = Table(*heads)
     for row in rows:
@@ -231,34 +182,19 @@ def table_of(heads: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> Tabl
 
 
 def stage_sections(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:
-    """Median and 95th percentile of each stage of a step, as bars and in figures."""
+    """Median and 95th percentile of each stage of a step; a column for each summary's."""
     stages = {name: s.get("stages_ms") or {} for name, s in summaries.items()}
-    several = len(stages) > 1
-    bars = [
-        Bar(f"{name} {share}" if several else share, parts)
-        for name, times in stages.items()
-        for share in ("p50", "p95")
-        if (parts := {stage: t[share] for stage, t in times.items() if t[share]})
-    ]
-    if not bars:
-        return
     rows = [
-        (*[name] * several, stage, *("-" if t[share] is None else f"{t[share]:.2f}" for share in ("p50", "p95")))
-        for name, times in stages.items()
-        for stage, t in times.items()
+        (
+            stage,
+            *(
+                "-" if (ms := times.get(stage, {}).get(p)) is None else f"{ms:.2f}"
+                for times in stages.values()
+                for p in ("p50", "p95")
+            ),
+        )
+        for stage in dict.fromkeys(stage for times in stages.values() for stage in times)
     ]
-    drawn = picture(draw_bars("", bars, "ms, each stage by itself"), "Stages of a step, median and 95th percentile")
-    table = table_of((*[""] * several, "stage", "p50, ms", "p95, ms"), rows)
-    yield Section("Times of the stages of a step", pictures=[drawn], tables=[table])
-
-
-def class_sections(methods: Mapping[str, Mapping[str, float | None]]) -> Iterator[Section]:
-    """IoU of each class, a bar for each method."""
-    bars = [
-        Bar(f"{name}: {method}" if len(methods) > 1 else name, {method: 100 * value})
-        for name in dict.fromkeys(n for scores in methods.values() for n in scores)
-        for method, scores in methods.items()
-        if (value := scores.get(name)) is not None
-    ]
-    if bars:
-        yield Section("Classes", pictures=[picture(draw_bars("", bars, "IoU, %"), "IoU of each class")])
+    if rows:
+        heads = [f"{name} {p}, ms" if len(stages) > 1 else f"{p}, ms" for name in stages for p in ("p50", "p95")]
+        yield Section("Times of the stages of a step", tables=[table_of(("stage", *heads), rows)])

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from semantic_mapper.errors import FrameError, LabelError, PoseError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
-from semantic_mapper.evaluation.segments import Segments
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, Segments, confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger

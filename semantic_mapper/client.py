@@ -194,7 +194,7 @@ class MapClient:
         The mapper begins it once, also where an answer is lost and the request is sent again.
 
         Args:
-            poses, until_ns: As of ``MappingPipeline.correct_poses``, but each pose in the world that its frame came in
+            poses, until_ns: As of ``MapCorrector.start``, but each pose in the world that its frame came in
                 (``PosedFrame.world``), not in the map's; at most 65536 at once.
             within_ns: Poses go to the frames nearest in time, if those are so near, and are left out where none is; 0 =
                 every pose must have the stamp of a frame.

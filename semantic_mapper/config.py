@@ -205,9 +205,6 @@ class VoxelMapConfig(Config, frozen=True):
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
     unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
     clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``fusion/clearing.py``)
-    # Where the sensor gives no depth there is nothing up to here, in metres: for sensors that are to be trusted so.
-    # 0 = no depth says nothing.
-    no_return_range_m: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0
 
     # The same for all maps:
     truncation_voxels: ClassVar[float] = 4.0
@@ -232,8 +229,8 @@ class PoseRefinerConfig(Config, frozen=True):
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
-    # Corrections reach the last this many frames; older ones stay in the map where they are, and are kept in a second
-    # map for that. 0 = keep none.
+    # Corrections reach at least the last this many frames, at most twice as many; older ones stay in the map where they
+    # are. 0 = keep none.
     max_frames: NotNegative = 0
     # In the folder for temporary files; the oldest frames leave earlier for it.
     max_disk_mb: AtLeastOne = 4000

@@ -87,7 +87,7 @@ def test_a_verb_that_may_not_use_enough_memory_says_so() -> None:
 def test_scipy_is_not_loaded_where_its_blas_would_try_for_ever() -> None:
     program = """
 import resource, sys
-from semantic_mapper.evaluation.splat import point_spacing
+from semantic_mapper.replay.overview import point_spacing
 import numpy as np
 size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (size + (90 << 20),) * 2)

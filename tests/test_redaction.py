@@ -20,47 +20,28 @@ def leaks(text: str) -> bool:
     "url",
     [
         f"s3://{PAIR}@bucket/x",
-        f"S3://{PAIR}@bucket/x",
         f"filecache::s3://{PAIR}@bucket/x",
         f"simplecache::filecache::https://{PAIR}@host/x",
-        f"zip://a.mcap::https://{PAIR}@host/x.zip",
         f"s3:/{PAIR}@b",
-        f"filecache::s3:/{PAIR}@b/map.npz",
-        f"s3:///{PAIR}@b",
         f"s3:{PAIR}@b",
         f"s3:\\\\{PAIR}@b",
         f"s3%3A%2F%2F{PAIR.replace(':', '%3A')}%40b",
         f"s3://{PAIR}%40b/x",
-        f"s3://{PAIR}",
         f"s3://AKIA:1234/{SECRET}@b",
-        f"s3://name@c:{SECRET}@d",
-        f"s3://:{SECRET}@b",
         f"s3:// {PAIR}@b",
         f"https://{SECRET[:13]}@host/x",
-        f"https:/{SECRET[:13]}@host/x",
-        f"ftp://{PAIR}@host",
-        f"memory://{PAIR}@b",
         f"https://host/a.mcap;token={SECRET}",
         f"https://host/a.mcap?token={SECRET}",
-        f"https://host/a.mcap?X-Amz-Credential=a&X-Amz-Signature={SECRET}",
         f"https://host/a.mcap#access_token={SECRET}",
-        f"https://host/a%3Ftoken%3D{SECRET}",
-        f"s3:/b/a;token={SECRET}",
         f"s3:/b/a?token={SECRET}",
         f"a.mcap?token={SECRET}",
-        f"a.mcap;sig={SECRET}&x=1",
         f"a.mcap?AWSAccessKeyId=a&aws_secret_access_key={SECRET}",
         f"rtsp://{PAIR}@camera/live?channel=1&password={SECRET}",
         f"rtsp://host/user=admin_password={SECRET}_channel=1",
-        f"rtsp://host/live?user=a&pw={SECRET}",
         f"rtsp://host/live?u=admin&p={SECRET}",
-        f"filecache::s3:/AKIA:pa'{SECRET}@127.0.0.1/map.npz",
-        f"s3:/AKIA:pa({SECRET}@b/x",
         f"opencv:rtsp://admin:pa({SECRET}@h/live",
-        f"https://u:pa){SECRET}@h/x",
         f'https://u:pa"{SECRET}@h/x',
         f"https://u:a b{SECRET}@h/x",
-        f"ftp://{SECRET[:13]}@h",
         f"https://h/x?a='{SECRET}",
         f"s3%253A%252F%252F{PAIR.replace(':', '%253A')}%2540b",
     ],
@@ -95,27 +76,17 @@ def test_messages_without_a_whole_address_do_not_show_its_secret(text: str) -> N
     "text",
     [
         "s3://bucket/a:b@c",
-        "s3://bucket/x: is missing",
-        "abfs://container@account.dfs.core.windows.net/r",
-        "sftp://robot@host/logs",
         "https://host:80/a@b",
         "file:///data/a@b.mcap",
-        "/a:b@c",
         "/data/what?/a#b@c.mcap",
         "/data/run:2026-11-27@lab/x.mcap",
-        "/data/s3/run:2026-11-27@lab/x.mcap",
-        "runs/run:2026-11-27@lab.mcap",
         "/data/run:12:30@lab/token=3/x.mcap: cannot be read",
         "runs/a b;c=1.mcap",
         "tcp://127.0.0.1:PORT; without keys",
         "tcp://robot:5570, which is on another machine",
-        "tcp://[::1]:5570",
-        "tls/robot:7447",
         "ipc:///tmp/semantic-mapper/x: taken",
         "rtsp://camera.local:554/live?channel=2&subtype=0",
-        "http://127.0.0.1:9092/TOKEN-IN-THE-PATH/",
         "node 'eye' (camera) ended: exit code 1; its last words: 12:30:15 [error] x=1 key=7",
-        'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }',
         "user@host:/path and robot@example.org",
         r"C:\Users\a@b",
         "label set 'rooms:v2@train'",
@@ -123,14 +94,6 @@ def test_messages_without_a_whole_address_do_not_show_its_secret(text: str) -> N
 )
 def test_what_holds_no_secret_stays_as_it_is(text: str) -> None:
     assert without_secrets(text) == text
-
-
-@pytest.mark.parametrize(
-    "name", ["run:2026-11-27@lab.mcap", "night:rain1@site", "run:12:30@lab", "runs/a:bcdefghijk@c"]
-)
-def test_names_in_plain_data_stay_as_they_are(name: str) -> None:
-    data = {"log": name, name: [name, f"/data/{name}"]}
-    assert plain_without_secrets(data) == data
 
 
 def test_fields_whose_names_differ_in_secrets_alone_stay_apart() -> None:
@@ -142,31 +105,8 @@ def test_fields_whose_names_differ_in_secrets_alone_stay_apart() -> None:
     }
 
 
-def test_plain_data_keeps_its_form() -> None:
-    data = {"a": 1, "b": [None, True, 0.5, "x"], "c": {"d": "tcp://robot:1"}}
-    assert plain_without_secrets(data) == data
-
-
 def test_long_texts_take_time_in_proportion_to_their_length() -> None:
-    for one in (
-        "a:",
-        "s3://",
-        "+.-a",
-        "x:y",
-        "/",
-        "?key",
-        "@",
-        "%3A",
-        "a:bbbb@",
-        "::s3:",
-        "a@",
-        "'",
-        "p=",
-        "_",
-        "s3:a:",
-        "https://u:p ",
-        "?token='",
-    ):
+    for one in ("a:", "s3://", "x:y", "@", "%3A", "::s3:", "'", "p=", "https://u:p ", "?token='"):
         began = time.process_time()
         without_secrets(one * (200_000 // len(one)))
         assert time.process_time() - began < 5.0, one

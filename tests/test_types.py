@@ -40,6 +40,7 @@ def test_a_whole_frame_and_one_without_depth_and_labels_are_accepted() -> None:
         ("depth_m", np.ones((6, 8), np.uint16)),  # millimetres as the sensor gives them
         ("depth_m", np.ones((6, 8), np.float64)),
         ("depth_m", np.ones((3, 4), np.float32)),
+        ("depth_sigma_m", np.ones((3, 4), np.float32)),
         ("label", np.ones((6, 8), np.int64)),
         ("label", np.ones((6, 9), np.uint8)),
         ("T_world_camera", np.eye(4, dtype=np.float32)),

@@ -28,11 +28,6 @@ Connect = Callable[[Config, Callable[[str], None], float], Sources]
 
 SEARCH_S = 2.0  # how long the device is looked for before it counts as missing
 ODOMETRY_WAIT_S = 0.3  # how long an image waits for its pose; then it goes without
-_TRACKING_RESET = (
-    "odometry began again when the camera came back, in another world than before: images go without a pose. Start the "
-    "node again for a new map, or take poses from elsewhere"
-)
-
 _log = get_logger(__name__)
 
 
@@ -54,7 +49,6 @@ class OakCamera(PolledCamera):
         self._stream: Stream | None = None
         self._odometry: Odometry | None = None
         self._maker: ImageMaker | None = None
-        self._connections = 0
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -68,7 +62,7 @@ class OakCamera(PolledCamera):
 
     def _images(self) -> Iterator[CameraImage]:
         waiting: deque[CameraImage] = deque()  # for their poses
-        while not self._stopped.is_set() and self._stream is not None:
+        while not self._stopping.is_set() and self._stream is not None:
             try:
                 messages = self._stream.read(SLICE_S if not waiting else SLICE_S / 10)
             except StreamEnded:
@@ -102,8 +96,6 @@ class OakCamera(PolledCamera):
         if odometry is None:
             return image
         image = replace(image, tracks_itself=True)
-        if self._connections > 1 and self._config.on_tracking_reset == "no-poses":
-            return image
         late = time.monotonic_ns() - image.stamp_ns > ODOMETRY_WAIT_S * 1e9
         if not late and not odometry.reaches(image.stamp_ns):
             return None
@@ -136,7 +128,6 @@ class OakCamera(PolledCamera):
         else:
             self._maker.reconnected(intrinsics)
         self._stream, self._odometry = stream, odometry
-        self._connections += 1
         self._info = StreamInfo(
             source=sources.name,
             cameras={self._camera_id: intrinsics},
@@ -147,9 +138,7 @@ class OakCamera(PolledCamera):
         self._config = msgspec.structs.replace(config, device=sources.address)
         self._warn("state", "")
         self._warn("notes", "; ".join(sources.notes))
-        withheld = odometry is not None and again and config.on_tracking_reset == "no-poses"
-        self._warn("world", _TRACKING_RESET if withheld else "")
-        _log.info("camera_connected", camera=self._camera_id, device=sources.name, connection=self._connections)
+        _log.info("camera_connected", camera=self._camera_id, device=sources.name)
 
     def _wait_for_first(self, stream: Stream) -> CameraIntrinsics:
         """What the first image says of its intrinsics, else what the calibration says.
@@ -157,7 +146,7 @@ class OakCamera(PolledCamera):
         Raises:
             CameraError, StreamEnded: there is no image, or neither says anything.
         """
-        messages = stream.first(self._stopped)
+        messages = stream.first(self._stopping)
         reported = None if messages is None else reported_intrinsics(messages[0])
         self._warn("geometry", "" if messages is None else geometry_trouble(*messages))
         config = self._config
@@ -170,10 +159,6 @@ class OakCamera(PolledCamera):
             stream.close()
         if odometry is not None:
             odometry.close()
-
-    def _check_after_return(self) -> None:
-        if self._odometry is not None and self._config.on_tracking_reset == "exit":
-            raise CameraError(f"{self.info.source} was away, and its {_TRACKING_RESET}")
 
     def _device_state(self, state: str) -> None:
         """Called by a thread of DepthAI's, where an exception would end the process: nothing here raises."""

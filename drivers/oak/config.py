@@ -37,10 +37,6 @@ class Config(semantic_mapper.config.Config, frozen=True):
     # Visual-inertial odometry (DepthAI's Basalt, on this machine; needs the stereo pair and an IMU) as the images' own
     # pose.
     odometry: bool = False
-    # Where a camera with odometry was away, and its poses begin in another world: give them as they are, and the mapper
-    # finds the camera in its map before it goes on; go on with images that have no pose; or end the node, so that the
-    # program that watches over the launch starts it again with a new map.
-    on_tracking_reset: Literal["relocalize", "no-poses", "exit"] = "relocalize"
     # JSON file (as DepthAI writes it) in place of the calibration that is stored on the device.
     calibration: str = ""
 

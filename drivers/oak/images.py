@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage
-from semantic_mapper.drivers.live import FUTURE_NS
+from semantic_mapper.drivers.live import FrameCounter
 from semantic_mapper.drivers.oak.devices import load_depthai
 from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
@@ -150,14 +150,12 @@ class ImageMaker:
         self._damaged = 0  # in a row
         self._camera_id = camera_id
         self._intrinsics = intrinsics
-        self._period_ns = 1e9 / fps
+        self._counter = FrameCounter(fps)
         self._clock_ns = clock_offset_ns()
-        self._last: tuple[int, int] | None = None  # number and stamp of the last image
-        self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
 
     def reconnected(self, intrinsics: CameraIntrinsics) -> None:
         """The device counts again from here."""
-        self._shift = None
+        self._counter.restart()
         self._intrinsics = intrinsics
 
     def image(self, rgb: Any, depth: Any | None) -> CameraImage | None:
@@ -173,8 +171,8 @@ class ImageMaker:
             CameraError: it is not what was requested of the device, or one of many in a row that are damaged.
         """
         stamp_ns = capture_ns(rgb, self._clock_ns)
-        if stamp_ns > time.monotonic_ns() + FUTURE_NS or (self._last is not None and stamp_ns <= self._last[1]):
-            return self._pass_over("it was out of order or of the future")
+        if refusal := self._counter.refusal(stamp_ns):
+            return self._pass_over(refusal)
         try:
             pixels = rgb_pixels(rgb)
             depth_m = None if depth is None else depth_metres(depth)
@@ -189,26 +187,12 @@ class ImageMaker:
             self._expect_size("depth", depth_m)
         return CameraImage(
             stamp_ns=stamp_ns,
-            seq=self._number(rgb.getSequenceNum(), stamp_ns),
+            seq=self._counter.number(rgb.getSequenceNum(), stamp_ns),
             camera_id=self._camera_id,
             rgb=pixels,
             depth_m=depth_m,
             intrinsics=self._intrinsics,
         )
-
-    def _number(self, counted: int, stamp_ns: int) -> int:
-        """Number of the image that the device counts as ``counted``: from 0, with jumps where images were lost."""
-        if self._last is None:
-            number = 0
-        else:
-            number, last_ns = self._last
-            if self._shift is None or counted + self._shift <= number:  # the device counts again: ask the clock
-                number += max(2, round((stamp_ns - last_ns) / self._period_ns))
-            else:
-                number = counted + self._shift
-        self._shift = number - counted
-        self._last = (number, stamp_ns)
-        return number
 
     def _pass_over(self, reason: str) -> None:
         self.passed_over += 1

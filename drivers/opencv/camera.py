@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -16,7 +15,7 @@ import numpy as np
 
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics, require_calibration
-from semantic_mapper.drivers.live import LiveCamera, RawImage, StreamClock, nominal_hz
+from semantic_mapper.drivers.live import NOT_CALIBRATED, LiveCamera, RawImage, StreamClock, nominal_hz
 from semantic_mapper.drivers.opencv.config import Config
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
@@ -44,7 +43,7 @@ def open_camera(config: Config, camera_id: str = "camera") -> Camera:
     return LiveCamera(camera_id, partial(StreamDevice, config), measured, config.stall_s, metadata)
 
 
-class VideoFile:
+class VideoFile(Camera):
     """Plays a file once.
 
     Args:
@@ -53,39 +52,19 @@ class VideoFile:
         measured: Calibration of the camera that took it; None: guessed, said in ``warnings``.
     """
 
+    can_wait = True
+
     def __init__(self, config: Config, camera_id: str, measured: CameraIntrinsics | None) -> None:
+        super().__init__(camera_id)
         self._config = config
-        self._camera_id = camera_id
         self._measured = measured
         self._capture: cv2.VideoCapture | None = None
         self._rectify: Rectifier | None = None
-        self._info: StreamInfo | None = None
-        self._stopping = threading.Event()
-        self._last_poll_time = 0.0
-
-    @property
-    def info(self) -> StreamInfo:
-        """As of ``Camera``."""
-        if self._info is None:
-            raise CameraError(f"{self._config.source}: is not open yet")
-        return self._info
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """As of ``Camera``."""
-        if self._measured is None:
-            return ("not calibrated: the intrinsics are a guess, good for calibrating only",)
-        return ()
-
-    @property
-    def can_wait(self) -> bool:
-        """As of ``Camera``."""
-        return True
-
-    @property
-    def last_poll_time(self) -> float:
-        """As of ``Camera``."""
-        return self._last_poll_time
+        return () if self._measured is not None else (NOT_CALIBRATED,)
 
     def __enter__(self) -> Self:
         """Open the file.
@@ -129,11 +108,7 @@ class VideoFile:
             self._capture = None
 
     def __iter__(self) -> Iterator[CameraImage]:
-        """Image after image; ends with the file.
-
-        Raises:
-            CameraError: not open.
-        """
+        """Image after image; ends with the file."""
         if self._capture is None or self._rectify is None:
             raise CameraError(f"{self._config.source}: is not open")
         began = time.monotonic()
@@ -147,15 +122,10 @@ class VideoFile:
                 self._stopping.wait(max(0.0, began + since_ns / 1e9 - time.monotonic()))
             if self._stopping.is_set():
                 return
-            stamp_ns = self._config.start_ns + since_ns
-            yield CameraImage(stamp_ns, seq, self._camera_id, self._rectify(bgr), None, self._rectify.intrinsics)
+            yield CameraImage(since_ns, seq, self._camera_id, self._rectify(bgr), None, self._rectify.intrinsics)
         expected = self.info.frame_count or 0
         if seq + 1 < expected - 1:  # some containers count one too many
             _log.warning("video_ended_early", file=self._config.source, images=seq + 1, expected=expected)
-
-    def stop(self) -> None:
-        """As of ``Camera``."""
-        self._stopping.set()
 
 
 def _captures(capture: cv2.VideoCapture) -> Iterator[tuple[int, UInt8]]:

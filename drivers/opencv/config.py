@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from semantic_mapper import config
-from semantic_mapper.config import AtLeastZero, NotNegative, Positive
+from semantic_mapper.config import AtLeastZero, Positive
 
 
 class Config(config.Config, frozen=True):
@@ -16,7 +16,6 @@ class Config(config.Config, frozen=True):
     uncalibrated: bool = False  # images as the lens gives them, for calibrating only
     # A file. Its images are stamped with the time within it; "recorded" gives them in that rhythm, "fast" at once.
     pace: Literal["recorded", "fast"] = "recorded"
-    start_ns: NotNegative = 0  # stamp of its first image, where poses are stamped otherwise
     # A stream. "container": by the sender's clock, whose distance to ours the quickest images give; "arrival": as the
     # images come in. Neither knows how long the quickest one was on its way: that is `latency_s`.
     stamps: Literal["container", "arrival"] = "container"

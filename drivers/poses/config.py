@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import AtLeastOne, Config, NotNegative, Positive
+from semantic_mapper.config import AtLeastOne, Config, Positive
 from semantic_mapper.drivers.calibration import Matrix
 from semantic_mapper.types import Float64
 
@@ -54,7 +54,6 @@ class TopicPoses(Config, frozen=True):
     T_base_camera: Matrix = IDENTITY  # where the camera sits on what the messages are about
     T_base_rig: Matrix | None = None  # in its place: where a rig sits; its cameras have each a T_rig_camera
     clock_offset_ns: int = 0  # added to the stamps of messages, where the robot's clock differs by a known time
-    max_clock_difference_s: Positive = 1.0  # fresh messages whose stamps are further from the images' are refused
 
     def __post_init__(self) -> None:
         if self.T_base_rig is not None and self.T_base_camera != IDENTITY:
@@ -124,12 +123,6 @@ class PoseChecks(Config, frozen=True):
     """Which poses ``PosedCamera`` refuses."""
 
     max_speed_m_s: Positive = 3.0  # faster than this between two images is a jump
-    # A camera's first frames are held back until this many of their poses agree with each other: a single wrong pose,
-    # such as a robot's before it knows where it is, is no place to continue from. 1 = the first is believed.
-    init_consensus: AtLeastOne = 5
-    # After a jump, this many poses in a row that agree with each other are believed. 0 = none: a source that begins in
-    # another world would spoil the map. One that jumps back, or that was only a little too quick, passes again.
-    relocalize_after: NotNegative = 0
 
 
 def gives_metres(config: PoseConfig) -> bool:

@@ -1,7 +1,7 @@
-"""Loop closure: keyframes that show the same place are aligned to each other, and a pose graph follows.
+"""The keyframes that odometry aligns to, the loops that are closed between them, and the poses given along them.
 
-Candidates are the keyframes that a new one should overlap with as the graph stands, and those that look like it
-(``PlaceIndex``, PnP). Each is aligned both ways; the result must fit the surfaces, agree in both directions, and lie
+Loop candidates are the keyframes that a new one should overlap with as the graph stands, and those that look like it
+(place features, PnP). Each is aligned both ways; the result must fit the surfaces, agree in both directions, and lie
 within the drift that the way between them allows. One that would move the map visibly waits until another keyframe says
 the same. One candidate is looked at for each image, so no image waits long, and results do not depend on time.
 
@@ -20,22 +20,22 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from semantic_mapper.bundle.adjustment import minimize
-from semantic_mapper.drivers.poses.keyframe_map import (
-    DRIFT,
-    MAX_KEYFRAMES,
-    MIN_MATCHES,
-    OdometryKeyframe,
-    apart,
-    lies_on,
-)
-from semantic_mapper.geometry import interpolate_pose, invert_pose
+from semantic_mapper.drivers.base import CorrectedWorld
+from semantic_mapper.geometry import interpolate_pose, invert_pose, pose_distance
 from semantic_mapper.localization.depth_alignment import FALSE, POINTS_A_VOTE, Fit, Target, align, fit
-from semantic_mapper.localization.features import pose_from_features
-from semantic_mapper.localization.places import PlaceIndex
+from semantic_mapper.localization.features import Features, pose_from_features
+from semantic_mapper.localization.places import rank_places
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import Float64
 
+MAX_KEYFRAMES = 500  # 0.5 MB each; the younger of the two that are nearest to each other goes
+MIN_MATCHES = 15  # corners that agree, for a guess
+MIN_FITNESS = 0.5  # of the frame's points that the keyframe sees must lie on its surface
+MIN_OVERLAP = 0.35  # of the frame's points that have to be in a keyframe's view
+MAX_RMSE_M = 0.025  # of the distances that count
+DRIFT = 0.05  # of the way: what ``sigma`` grows by with the chain of keyframes
 PLACE_FEATURES = 300
+_REACH_M, _REACH_RAD = 0.6, 0.6  # further away, or turned further, keyframes share too little with a view
 _NEAR = 4  # keyframes that a new one is aligned to because they should overlap
 _LOOK_ALIKE = 2  # of each slice of places, at most
 _SLICE = 10  # places compared at a time (2 ms each)
@@ -53,33 +53,198 @@ _OPEN_M, _OPEN_RAD = 0.1, 0.05  # along what no point shows
 _HUBER_SIGMAS = 1.5  # motions further off than this count less
 _HELD_SIGMA = 1e-4  # radians and metres, of the first keyframe, which stays
 _ITERATIONS = 20
-_MOST_EDGES = 10  # of a keyframe, once keyframes go and leave their edges to others
+_MOST_EDGES = 5  # a keyframe, once keyframes go and leave their edges to others
+_GIVEN = 20_000  # poses that are corrected; 2 x 128 bytes each
+_VISIBLE_M = 0.02  # no correction for less; what is left is given at the end
+_LEFT_M = 0.002
 
 _log = get_logger(__name__)
 
 
+def apart(T_a: Float64, T_b: Float64) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    moved_m, turned = pose_distance(T_a, T_b)
+    return moved_m, float(np.rad2deg(turned))
+
+
+def lies_on(found: Fit) -> bool:
+    """Whether a view lies on the surface of a keyframe."""
+    return found.overlap >= MIN_OVERLAP and found.fitness >= MIN_FITNESS and found.rmse_m <= MAX_RMSE_M
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class _Job:
-    """Align keyframe ``b`` to ``a`` from a guess, or by their features where the guess is missing."""
+class OdometryKeyframe:
+    """A view that others are aligned to.
+
+    Args:
+        number: Counts keyframes.
+        target: What views are aligned to, with its pose.
+        features: For finding back.
+        place: For loop closure.
+        way_m: Length of the shortest chain of keyframes back to the first one: errors add up along it.
+        unsure_m: How far it may be off along what no point showed.
+    """
+
+    number: int
+    target: Target
+    features: Features
+    place: Features
+    way_m: float
+    unsure_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """A measured motion from one keyframe to another.
+
+    Args:
+        a, b: Keyframes by number.
+        T_a_b: (4, 4).
+        covariance: (6, 6) of rotation and position, in the axes of b.
+        chain: Between keyframes that tracking has linked, and measured well: no loop may bend it.
+    """
 
     a: int
     b: int
-    T_a_b: Float64 | None = None
+    T_a_b: Float64
+    covariance: Float64
+    chain: bool = False
+
+    @property
+    def strength(self) -> tuple[bool, float]:
+        """Greater is better."""
+        return self.chain, -float(np.trace(self.covariance[3:, 3:]))
+
+
+class KeyframeGraph:
+    """Keyframes by number, in the order they were made, and measured motions between them. Deterministic."""
+
+    def __init__(self) -> None:
+        self.frames: dict[int, OdometryKeyframe] = {}
+        self.edges: list[Edge] = []
+
+    @property
+    def poses(self) -> dict[int, Float64]:
+        """T_world_camera (4, 4) by number."""
+        return {number: k.target.T_world_camera for number, k in self.frames.items()}
+
+    def move(self, poses: Mapping[int, Float64]) -> None:
+        """Put keyframes at other poses, by number."""
+        for number, pose in poses.items():
+            keyframe = self.frames[number]
+            self.frames[number] = replace(keyframe, target=replace(keyframe.target, T_world_camera=pose))
+
+    def distances(self, T_world_camera: Float64) -> tuple[Float64, Float64]:
+        """Metres (N,) and radians (N,) from a pose to each keyframe's."""
+        return _distances(np.array([*self.poses.values()]), T_world_camera)
+
+    def near(self, T_world_camera: Float64, count: int) -> list[OdometryKeyframe]:
+        """Up to ``count`` keyframes to align a view to: the nearest one first, then the oldest ones within reach.
+
+        Old ones have the least drift, and hold later ones to them where the camera comes back. Where none is within
+        reach, the nearest one alone.
+        """
+        way, turn = self.distances(T_world_camera)
+        spacing = np.hypot(way / _REACH_M, turn / _REACH_RAD)
+        nearest = int(spacing.argmin())
+        others = [i for i in np.flatnonzero(spacing < 1) if i != nearest]
+        frames = [*self.frames.values()]
+        return [frames[i] for i in (nearest, *others[: count - 1])]
+
+    def linked(self, number: int) -> set[int]:
+        """Keyframes that have an edge to this one."""
+        return {e.b if e.a == number else e.a for e in self.edges if number in (e.a, e.b)}
+
+    def way(self, a: int, b: int) -> tuple[float, float]:
+        """Metres along the shortest chain of edges (Dijkstra), and one sigma of all of these together."""
+        links: dict[int, list[tuple[int, float, float]]] = {}
+        for e in self.edges:
+            length, variance = float(np.linalg.norm(e.T_a_b[:3, 3])), float(np.trace(e.covariance[3:, 3:]))
+            links.setdefault(e.a, []).append((e.b, length, variance))
+            links.setdefault(e.b, []).append((e.a, length, variance))
+        done, heap = set[int](), [(0.0, 0.0, a)]
+        while heap:
+            way, variance, here = heapq.heappop(heap)
+            if here == b:
+                return way, float(np.sqrt(variance))
+            if here not in done:
+                done.add(here)
+                for there, length, more in links.get(here, []):
+                    heapq.heappush(heap, (way + length, variance + more, there))
+        return 0.0, 0.0
+
+    def trim(self) -> tuple[int, int, Float64] | None:
+        """With more than ``MAX_KEYFRAMES``, let the younger of the two go that are nearest to each other, never the
+        newest, which is in use. Its edges become those of the other one, as both stand now.
+
+        Returns:
+            Numbers of the one that has gone and of its heir, and T_heir_gone (4, 4).
+        """
+        if len(self.frames) <= MAX_KEYFRAMES:
+            return None
+        numbers, poses = [*self.frames][:-1], np.array([*self.poses.values()])[:-1]
+        way, turn = _distances(poses[:, None], poses[None])
+        crowded = np.hypot(way / _REACH_M, turn / _REACH_RAD) + np.diag(np.full(len(poses), np.inf))
+        first, second = sorted(int(i) for i in np.unravel_index(int(crowded.argmin()), crowded.shape))
+        heir, gone, T_heir_gone = numbers[first], numbers[second], invert_pose(poses[first]) @ poses[second]
+        del self.frames[gone]
+        edges: list[Edge] = []
+        for edge in self.edges:
+            if edge.a == gone:
+                edge = replace(edge, a=heir, T_a_b=T_heir_gone @ edge.T_a_b)
+            elif edge.b == gone:
+                edge = replace(edge, b=heir, T_a_b=edge.T_a_b @ invert_pose(T_heir_gone))
+            if edge.a != edge.b:
+                edges.append(edge)
+        self.edges = self._strongest(edges)
+        return gone, heir, T_heir_gone
+
+    def _strongest(self, edges: list[Edge]) -> list[Edge]:
+        """The strongest edges, so that the graph's size has a bound, with those that keep it in one piece (Kruskal)."""
+        parent = {number: number for number in self.frames}
+
+        def root(number: int) -> int:
+            while parent[number] != number:
+                number = parent[number]
+            return number
+
+        tree: list[Edge] = []
+        others: list[Edge] = []
+        for edge in sorted(edges, key=lambda e: e.strength, reverse=True):
+            a, b = root(edge.a), root(edge.b)
+            parent[b] = a
+            (others if a == b else tree).append(edge)
+        return tree + others[: _MOST_EDGES * len(self.frames) - len(tree)]
+
+    def optimized(self) -> dict[int, Float64]:
+        """Poses that fit all edges best, by number; the first keyframe stays. The graph stays as it is."""
+        graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        noise, poses = gtsam.noiseModel, self.poses
+        for number, pose in poses.items():
+            start.insert(X(number), gtsam.Pose3(pose))
+        first = min(poses)
+        graph.add(gtsam.PriorFactorPose3(X(first), gtsam.Pose3(poses[first]), noise.Isotropic.Sigma(6, _HELD_SIGMA)))
+        huber = noise.mEstimator.Huber.Create(_HUBER_SIGMAS)
+        for edge in self.edges:
+            robust = noise.Robust.Create(huber, noise.Gaussian.Covariance(edge.covariance))
+            graph.add(gtsam.BetweenFactorPose3(X(edge.a), X(edge.b), gtsam.Pose3(edge.T_a_b), robust))
+        found = minimize(graph, start, _ITERATIONS)
+        return {number: found.atPose3(X(number)).matrix() for number in poses}
 
 
 class LoopCloser:
-    """The graph of keyframes, and the search for loops. Not for several threads at once.
+    """Measures motions between keyframes of a graph and searches for loops. Not for several threads at once.
 
     Args:
+        graph: Gets the edges.
         counters: Where "loops_closed" and "loops_refused" are counted.
     """
 
-    def __init__(self, counters: Counter[str]) -> None:
+    def __init__(self, graph: KeyframeGraph, counters: Counter[str]) -> None:
+        self._graph = graph
         self._counters = counters
-        self._graph = PoseGraph()
-        self._keyframes: dict[int, OdometryKeyframe] = {}
-        self._places = PlaceIndex(MAX_KEYFRAMES)
-        self._jobs: deque[_Job] = deque(maxlen=_JOBS)
+        # Keyframes to align, a and b, and a guess of T_a_b; None: by their features.
+        self._jobs: deque[tuple[int, int, Float64 | None]] = deque(maxlen=_JOBS)
         self._looking: tuple[int, list[int]] = -1, []  # a keyframe, and the places that it is still to be compared with
         self._waiting: list[Edge] = []  # loops that need another that agrees with them
         self._new: list[Edge] = []  # loops since the graph was optimised
@@ -89,101 +254,78 @@ class LoopCloser:
         """Whether ``work`` has something to do."""
         return bool(self._jobs or self._looking[1] or self._new)
 
-    def add(self, keyframe: OdometryKeyframe, parent: int | None, before: tuple[int, Float64] | None = None) -> None:
-        """A new keyframe.
-
-        Args:
-            keyframe: The one.
-            parent: The one that it was tracked against; None: it is the first.
-            before: Where tracking has jumped: the keyframe that it went by before, and T_before_keyframe (4, 4) as it
-                should be then.
-        """
-        number, pose = keyframe.number, keyframe.target.T_world_camera
-        self._keyframes[number] = keyframe
-        edges: list[Edge] = []
-        if parent is not None:
-            guess = invert_pose(self._graph.poses[parent]) @ pose
-            edge = self._measure(parent, number, guess)
-            if edge is None:  # the two alone cannot be aligned: what tracking says
-                edge = Edge(parent, number, guess, np.diag([_OPEN_RAD**2] * 3 + [_OPEN_M**2] * 3))
-            edges.append(replace(edge, chain=bool(np.linalg.eigvalsh(edge.covariance[3:, 3:])[-1] < _FIRM_M**2)))
-        self._graph.add(number, pose, edges)
-        near = [] if parent is None else self._near(number)
-        for other in near:
-            if other != parent:
-                self._jobs.append(_Job(other, number, invert_pose(self._graph.poses[other]) @ pose))
-        if before is not None:
-            self._jobs.appendleft(_Job(before[0], number, before[1]))
+    def add(self, keyframe: OdometryKeyframe, parent: int | None) -> None:
+        """The graph has a new keyframe, tracked against ``parent``; None: it is the first."""
+        if parent is None:
+            return
+        number, poses = keyframe.number, self._graph.poses
+        guess = invert_pose(poses[parent]) @ poses[number]
+        edge = self._measure(parent, number, guess)
+        if edge is None:  # the two alone cannot be aligned: what tracking says
+            edge = Edge(parent, number, guess, np.diag([_OPEN_RAD**2] * 3 + [_OPEN_M**2] * 3))
+        firm = bool(np.linalg.eigvalsh(edge.covariance[3:, 3:])[-1] < _FIRM_M**2)
+        self._graph.edges.append(replace(edge, chain=firm))
+        near = self._near(keyframe)
+        self._jobs.extend((k, number, invert_pose(poses[k]) @ poses[number]) for k in near if k != parent)
         if not self._looking[1]:  # else this keyframe is not looked for: the search has to keep up
             known = {number, *near} | self._graph.linked(number)
-            self._looking = number, [key for key in self._places.keys if key not in known]
-        self._places.add(number, keyframe.place)
-
-    def remove(self, number: int, heir: int) -> None:
-        """A keyframe is no longer kept; another one near it takes its edges."""
-        self._graph.remove(number, heir)
-        del self._keyframes[number]
-        self._places.remove(number)
-        seeker, places = self._looking
-        self._looking = seeker, [] if seeker == number else [key for key in places if key != number]
-        self._jobs = deque((j for j in self._jobs if number not in (j.a, j.b)), maxlen=_JOBS)
-        self._waiting = [e for e in self._waiting if number not in (e.a, e.b)]
-        self._new = [e for e in self._new if e in self._graph.edges]
+            self._looking = number, [k for k in self._graph.frames if k not in known]
 
     def work(self, optimize: bool) -> Mapping[int, Float64] | None:
         """Optimise, if allowed and there is something new, else look at one candidate.
 
         Returns:
-            New poses of the keyframes by number; None where they stay.
+            New poses of the keyframes by number, for the graph to be moved to; None where they stay.
         """
+        frames = self._graph.frames
         if self._new and optimize:
             return self._close()
         if self._jobs:
-            self._verify(self._jobs.popleft())
+            a, b, guess = self._jobs.popleft()
+            if a in frames and b in frames:
+                self._verify(a, b, guess)
         elif self._looking[1]:
             number, places = self._looking
-            self._looking = number, places[_SLICE:]
-            others = frozenset(self._places.keys) - frozenset(places[:_SLICE])
-            for key, matches in self._places.candidates(self._keyframes[number].place, _LOOK_ALIKE, exclude=others):
-                if matches >= MIN_MATCHES:
-                    self._jobs.append(_Job(key, number))
+            self._looking = number, places[_SLICE:] if number in frames else []
+            if number in frames:
+                theirs = {k: frames[k].place.descriptors for k in places[:_SLICE] if k in frames}
+                alike = rank_places(frames[number].place, theirs, _LOOK_ALIKE)
+                self._jobs.extend((key, number, None) for key, matches in alike if matches >= MIN_MATCHES)
         return None
 
-    def _near(self, number: int) -> list[int]:
+    def _near(self, new: OdometryKeyframe) -> list[int]:
         """Keyframes that should overlap with one, those from all of its past alike."""
-        own = self._keyframes[number].target
+        pose = new.target.T_world_camera
         found = [
-            other
-            for other, keyframe in self._keyframes.items()
-            if other != number
-            and apart(keyframe.target.T_world_camera, own.T_world_camera)[1] <= 60
-            and fit(own.levels, keyframe.target, own.T_world_camera).overlap > 0.4
+            number
+            for number, keyframe in self._graph.frames.items()
+            if number != new.number
+            and apart(keyframe.target.T_world_camera, pose)[1] <= 60
+            and fit(new.target.levels, keyframe.target, pose).overlap > 0.4
         ]
         steps = np.linspace(0, len(found) - 1, min(_NEAR, len(found)))
         return [found[round(s)] for s in steps]
 
-    def _verify(self, job: _Job) -> None:
-        guess = job.T_a_b
+    def _verify(self, a: int, b: int, guess: Float64 | None) -> None:
+        alike = guess is None
         if guess is None:
-            a, b = self._keyframes[job.a], self._keyframes[job.b]
-            found = pose_from_features(b.place, a.place, b.target.levels[0].intrinsics, MIN_MATCHES)
+            one, other = self._graph.frames[a], self._graph.frames[b]
+            found = pose_from_features(other.place, one.place, other.target.levels[0].intrinsics, MIN_MATCHES)
             if found is None:
                 return
             guess = found[0]
-        edge = self._measure(job.a, job.b, guess)
+        edge = self._measure(a, b, guess)
         if edge is not None:
             self._judge(edge)
-        elif job.T_a_b is None:
+        elif alike:
             self._counters["loops_refused"] += 1
 
     def _measure(self, a: int, b: int, guess: Float64) -> Edge | None:
         """Align b to a and a to b; None where the result does not fit, or both directions differ."""
-        one, other = self._keyframes[a].target.levels, self._keyframes[b].target.levels
+        one, other = self._graph.frames[a].target.levels, self._graph.frames[b].target.levels
         there = align(other, [Target(one, np.eye(4))], guess)
-        if there is None:
-            return None
-        back = align(one, [Target(other, np.eye(4))], invert_pose(there))
-        if back is None:
+        back = None if there is None else align(one, [Target(other, np.eye(4))], invert_pose(there))
+        if there is None or back is None:
             return None
         moved_m, turned_deg = apart(invert_pose(back), there)
         T_a_b = interpolate_pose(there, invert_pose(back), 0.5)
@@ -206,15 +348,15 @@ class LoopCloser:
         if moved_m < _SMALL_M and turned_deg < _SMALL_DEG:
             self._take(edge)
             return
-        for other in self._waiting:
-            if other.b != edge.b and self._agree(other, edge):
-                self._take(edge)
-                self._take(other)
-                self._waiting.remove(other)
-                return
-        expired = [e for e in self._waiting if edge.b - e.b > _PATIENCE]
-        self._counters["loops_refused"] += len(expired)
-        self._waiting = [e for e in self._waiting if edge.b - e.b <= _PATIENCE] + [edge]
+        kept = [e for e in self._waiting if e.a in poses and e.b in poses and edge.b - e.b <= _PATIENCE]
+        self._counters["loops_refused"] += len(self._waiting) - len(kept)
+        other = next((e for e in kept if e.b != edge.b and self._agree(e, edge)), None)
+        if other is None:
+            kept.append(edge)
+        else:
+            self._take(edge, other)
+            kept.remove(other)
+        self._waiting = kept
 
     def _agree(self, one: Edge, other: Edge) -> bool:
         """Whether two loops move the same place to the same place."""
@@ -223,12 +365,13 @@ class LoopCloser:
         moved_m, turned_deg = apart(motions[0] @ poses[other.b], motions[1] @ poses[other.b])
         return moved_m < _AGREE_M and turned_deg < _AGREE_DEG
 
-    def _take(self, edge: Edge) -> None:
-        self._graph.edges.append(edge)
-        self._new.append(edge)
+    def _take(self, *edges: Edge) -> None:
+        self._graph.edges.extend(edges)
+        self._new.extend(edges)
 
     def _close(self) -> Mapping[int, Float64] | None:
-        new, self._new = self._new, []
+        before, new = self._graph.poses, [e for e in self._new if e in self._graph.edges]
+        self._new = []
         poses = self._graph.optimized()
         for e in self._graph.edges:
             moved_m, turned_deg = apart(poses[e.a] @ e.T_a_b, poses[e.b])
@@ -237,12 +380,66 @@ class LoopCloser:
                 self._counters["loops_refused"] += len(new)
                 _log.warning("loops_refused", count=len(new), reason="they bend what tracking found")
                 return None
-        moved_m = max(apart(self._graph.poses[n], pose)[0] for n, pose in poses.items())
-        self._graph.poses = poses
+        moved_m = max(apart(before[n], pose)[0] for n, pose in poses.items())
         self._counters["loops_closed"] += len(new)
         _log.info("loops_closed", count=len(new), keyframes=len(poses), moved_m=round(moved_m, 3))
-        self._keyframes = {n: k.moved(poses[n]) for n, k in self._keyframes.items()}
         return poses
+
+
+@dataclass(slots=True, eq=False)
+class _Given:
+    """A pose that was given: relative to its keyframe, and as of the last correction."""
+
+    stamp_ns: int
+    keyframe: int
+    T_keyframe_camera: Float64
+    T_world_camera: Float64
+
+
+class PoseTrail:
+    """The last poses that a camera was given, oldest first: where keyframes move, they move along."""
+
+    def __init__(self) -> None:
+        self._given: deque[_Given] = deque(maxlen=_GIVEN)
+
+    def add(self, stamp_ns: int, keyframe: OdometryKeyframe, T_world_camera: Float64) -> None:
+        """A pose is given."""
+        relative = invert_pose(keyframe.target.T_world_camera) @ T_world_camera
+        self._given.append(_Given(stamp_ns, keyframe.number, relative, T_world_camera))
+
+    def hand_over(self, gone: int, heir: int, T_heir_gone: Float64) -> None:
+        """A keyframe is no longer kept: poses relative to it are those of another one from now on."""
+        for given in self._given:
+            if given.keyframe == gone:
+                given.keyframe, given.T_keyframe_camera = heir, T_heir_gone @ given.T_keyframe_camera
+
+    def correction(self, T_world_keyframe: Mapping[int, Float64], final: bool) -> CorrectedWorld | None:
+        """All poses as the keyframes stand now, if that moves one visibly.
+
+        Args:
+            T_world_keyframe: (4, 4) of the keyframes that are kept, by number.
+            final: No more poses will come.
+        """
+        if not self._given:
+            return None
+        before = np.array([g.T_world_camera for g in self._given])
+        poses = np.array([T_world_keyframe[g.keyframe] for g in self._given]) @ np.array(
+            [g.T_keyframe_camera for g in self._given]
+        )
+        moved_m = float(np.linalg.norm(poses[:, :3, 3] - before[:, :3, 3], axis=1).max())
+        if moved_m < (_LEFT_M if final else _VISIBLE_M):
+            return None
+        for given, pose in zip(self._given, poses, strict=True):
+            given.T_world_camera = pose
+        until_ns, motion = self._given[-1].stamp_ns, poses[-1] @ invert_pose(before[-1])
+        return CorrectedWorld({g.stamp_ns: g.T_world_camera for g in self._given}, until_ns, motion)
+
+
+def _distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:
+    """Metres and radians between poses (..., 4, 4)."""
+    way = np.linalg.norm(T_world_a[..., :3, 3] - T_world_b[..., :3, 3], axis=-1)
+    trace = (T_world_a[..., :3, :3] * T_world_b[..., :3, :3]).sum(axis=(-2, -1))
+    return way, np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def _covariance(found: Fit) -> Float64:
@@ -251,115 +448,3 @@ def _covariance(found: Fit) -> Float64:
     values = np.maximum(values - FALSE * values[-1], 0.0) / max(found.noise_m, 1e-3) ** 2 / POINTS_A_VOTE
     information = (axes * values) @ axes.T + np.diag([_OPEN_RAD**-2] * 3 + [_OPEN_M**-2] * 3)
     return np.linalg.inv(information) + np.diag([_FLOOR_RAD**2] * 3 + [_FLOOR_M**2] * 3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Edge:
-    """A measured motion from one keyframe to another.
-
-    Args:
-        a, b: Keyframes by number.
-        T_a_b: (4, 4).
-        covariance: (6, 6) of rotation and position, in the axes of b.
-        chain: Between keyframes that tracking has linked, and measured well: no loop may bend it.
-    """
-
-    a: int
-    b: int
-    T_a_b: Float64
-    covariance: Float64
-    chain: bool = False
-
-
-class PoseGraph:
-    """Keyframes by number and edges between them. The first keyframe stays where it is. Deterministic."""
-
-    def __init__(self) -> None:
-        self.poses: dict[int, Float64] = {}
-        self.edges: list[Edge] = []
-
-    def add(self, number: int, T_world_camera: Float64, edges: list[Edge]) -> None:
-        """A keyframe and its edges to earlier ones; without any it would float, so the first alone may have none."""
-        self.poses[number] = T_world_camera
-        self.edges += edges
-
-    def remove(self, number: int, heir: int) -> None:
-        """Take a keyframe out; its edges become those of another one, as both stand now."""
-        T_heir_gone = invert_pose(self.poses[heir]) @ self.poses.pop(number)
-        best: dict[tuple[int, int], Edge] = {}  # one edge for each two keyframes
-        for edge in self.edges:
-            if number in (edge.a, edge.b):
-                if heir in (edge.a, edge.b):
-                    continue
-                if edge.a == number:
-                    edge = replace(edge, a=heir, T_a_b=T_heir_gone @ edge.T_a_b)
-                else:
-                    edge = replace(edge, b=heir, T_a_b=edge.T_a_b @ invert_pose(T_heir_gone))
-            pair = min(edge.a, edge.b), max(edge.a, edge.b)
-            if pair not in best or _strength(edge) > _strength(best[pair]):
-                best[pair] = edge
-        self.edges = list(best.values())
-        self._prune()
-
-    def _prune(self) -> None:
-        """Take the weakest edges from keyframes with too many, so that the graph's size has a bound.
-
-        Only edges whose ends have a neighbour in common go: the graph stays in one piece.
-        """
-        links: dict[int, dict[int, Edge]] = {number: {} for number in self.poses}
-        for edge in self.edges:
-            links[edge.a][edge.b] = links[edge.b][edge.a] = edge
-        dropped: set[int] = set()
-        for number, own in links.items():
-            spare = sorted(own.values(), key=_strength)
-            for edge in spare[: max(0, len(own) - _MOST_EDGES)]:
-                other = edge.b if edge.a == number else edge.a
-                if own.keys() & links[other].keys():
-                    del own[other], links[other][number]
-                    dropped.add(id(edge))
-        self.edges = [edge for edge in self.edges if id(edge) not in dropped]
-
-    def linked(self, number: int) -> frozenset[int]:
-        """Keyframes that have an edge to this one, and itself."""
-        ends = {e.b if e.a == number else e.a for e in self.edges if number in (e.a, e.b)}
-        return frozenset(ends | {number})
-
-    def way(self, a: int, b: int) -> tuple[float, float]:
-        """Metres along the shortest chain of edges (Dijkstra), and one sigma of all of these together."""
-        links: dict[int, list[tuple[int, float, float]]] = {}
-        for e in self.edges:
-            length, variance = float(np.linalg.norm(e.T_a_b[:3, 3])), float(np.trace(e.covariance[3:, 3:]))
-            links.setdefault(e.a, []).append((e.b, length, variance))
-            links.setdefault(e.b, []).append((e.a, length, variance))
-        best, heap = {a: 0.0}, [(0.0, 0.0, a)]
-        while heap:
-            way, variance, here = heapq.heappop(heap)
-            if here == b:
-                return way, float(np.sqrt(variance))
-            if way > best[here]:
-                continue
-            for there, length, more in links.get(here, []):
-                if way + length < best.get(there, np.inf):
-                    best[there] = way + length
-                    heapq.heappush(heap, (way + length, variance + more, there))
-        return 0.0, 0.0
-
-    def optimized(self) -> dict[int, Float64]:
-        """Poses that fit all edges best, by number. The graph stays as it is."""
-        graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        noise = gtsam.noiseModel
-        for number, pose in self.poses.items():
-            start.insert(X(number), gtsam.Pose3(pose))
-        first = min(self.poses)
-        held = noise.Isotropic.Sigma(6, _HELD_SIGMA)
-        graph.add(gtsam.PriorFactorPose3(X(first), gtsam.Pose3(self.poses[first]), held))
-        huber = noise.mEstimator.Huber.Create(_HUBER_SIGMAS)
-        for edge in self.edges:
-            robust = noise.Robust.Create(huber, noise.Gaussian.Covariance(edge.covariance))
-            graph.add(gtsam.BetweenFactorPose3(X(edge.a), X(edge.b), gtsam.Pose3(edge.T_a_b), robust))
-        found = minimize(graph, start, _ITERATIONS)
-        return {number: found.atPose3(X(number)).matrix() for number in self.poses}
-
-
-def _strength(edge: Edge) -> tuple[bool, float]:
-    return edge.chain, -float(np.trace(edge.covariance[3:, 3:]))

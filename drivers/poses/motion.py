@@ -40,9 +40,6 @@ class PoseTrack:
         self._max_gap_ns = max_gap_ns
         self._max_ahead_ns = max_ahead_ns
 
-    def __len__(self) -> int:
-        return len(self._samples)
-
     @property
     def newest_ns(self) -> int:
         """Stamp of the last sample; -1 without any."""
@@ -54,10 +51,6 @@ class PoseTrack:
             return False
         self._samples.append(sample)
         return True
-
-    def clear(self) -> None:
-        """Forget all samples."""
-        self._samples.clear()
 
     def at(self, stamp_ns: int) -> StampedPose | Miss:
         """The pose at a moment, or why it is missing.

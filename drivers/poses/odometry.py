@@ -13,6 +13,7 @@ Same images, same poses and corrections, bit for bit.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -21,17 +22,18 @@ import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage, CorrectedWorld, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import WAYS_OUT, OdometryPoses, can_be_found, matrix
-from semantic_mapper.drivers.poses.keyframe_map import (
+from semantic_mapper.drivers.poses.loop_closure import (
     DRIFT,
     MIN_MATCHES,
     MIN_OVERLAP,
-    KeyframeMap,
+    PLACE_FEATURES,
+    KeyframeGraph,
+    LoopCloser,
     OdometryKeyframe,
     PoseTrail,
     apart,
     lies_on,
 )
-from semantic_mapper.drivers.poses.loop_closure import PLACE_FEATURES, LoopCloser
 from semantic_mapper.drivers.poses.motion import StampedPose
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import interpolate_pose, invert_pose, make_pose, rotation_vector
@@ -99,9 +101,6 @@ class _View:
         return self.found
 
 
-_Guess = tuple[Float64, list[OdometryKeyframe]]  # T_world_camera, and keyframes near it
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
     """Where a view lies on keyframes.
@@ -133,19 +132,23 @@ class OdometryPoseSource(PoseSource):
     def __init__(self, config: OdometryPoses) -> None:
         super().__init__()
         self._config = config
-        self._map = KeyframeMap()
         self._camera: tuple[str, CameraIntrinsics] | None = None
-        self._past: list[StampedPose] = []  # the last two poses
-        self._lost_ns: int | None = None  # since when it is lost
-        self._next_try = 0  # keyframe that is tried next while lost
-        self._closer = LoopCloser(self._counters) if config.loop_closure else None
-        self._trail = PoseTrail()  # stays empty where no loops are closed: nothing moves then
-        self._world = 0
-        self._images = 0  # with a pose in this world
+        # That of another process, or of this one after it, is another world.
+        self._world = time.monotonic_ns() if can_be_found(config) else 0
         self._corrected: CorrectedWorld | None = None
         self._closed_ns = -_PAUSE_NS
-        self._nearest = -1  # keyframe that the last image was aligned to first
-        self._newest: tuple[_View, Float64] | None = None  # the last image with a pose
+        self._lost_ns: int | None = None  # since when it is lost
+        self._begin_world(closes_loops=config.loop_closure)
+
+    def _begin_world(self, closes_loops: bool) -> None:
+        """Forget all keyframes and poses."""
+        self._graph = KeyframeGraph()
+        self._closer = LoopCloser(self._graph, self._counters) if closes_loops else None
+        self._trail = PoseTrail()  # stays empty where no loops are closed: nothing moves then
+        self._past: list[StampedPose] = []  # the last two poses
+        self._before: _View | None = None  # the image of the last pose
+        self._images = 0  # with a pose in this world
+        self._next_try = 0  # keyframe that is tried next while lost
         self._noise_m = 0.0  # mean of the last fits
         self._unsure_m = 0.0  # how far the last pose may be off along what no point shows
 
@@ -159,19 +162,19 @@ class OdometryPoseSource(PoseSource):
         self._close_loops(image.stamp_ns)
         view = self._view(image)
         if view is None:
-            self._lose(image, "it has hardly any depth")
+            self._lose(image.stamp_ns, "it has hardly any depth")
             self._lost_ns = image.stamp_ns  # such images do not mean that the place is another one
             return None
-        if not len(self._map):
+        if not self._past:
             return self._begin(view)
         if image.stamp_ns - self._past[-1].stamp_ns > _AWAY_NS and not self._lost:
             self._lost_ns = image.stamp_ns
             _log.warning("odometry_lost", reason=f"no image came for more than {_AWAY_NS // 10**9} s")
         guesses = self._guesses_while_lost(view) if self._lost else self._guesses(view)
-        found = next((found for guess in guesses if (found := self._try(view, *guess)) is not None), None)
+        found = next((found for guess in guesses if (found := self._try(view, guess)) is not None), None)
         # A result that is not where the last motion leads may be wrong.
         if found is None or not (self._lost or _is_close(self._expected(view.stamp_ns), found.T_world_camera)):
-            found = self._second_look(view, found, [guess for guess, _ in guesses])
+            found = self._second_look(view, found, guesses)
         if found is None:
             return self._lose_or_begin(view, "it lies on no keyframe")
         if found.unsure_m > _UNSURE_M:
@@ -195,24 +198,19 @@ class OdometryPoseSource(PoseSource):
             expected: Poses by corners and the last motion.
         """
         results = [] if found is None else [found]
-        if self._newest is not None and view.stamp_ns - self._past[-1].stamp_ns < _RECENT_NS:
-            before, T_world_before = self._newest
-            corners, turn = self._corner_motion(view), find_turn(view.rgb, before.rgb, view.intrinsics)
-            last = [k for k in self._map.frames if k.number == self._nearest]
-            for motion in (corners, turn, np.eye(4)):
-                if motion is None:
-                    continue
-                guess = T_world_before @ motion
-                for keyframes in (self._map.near(guess, NEIGHBOURS), last):
-                    result = self._try(view, guess, keyframes) if keyframes else None
-                    results += [] if result is None else [result]
-            expected = expected if corners is None else [T_world_before @ corners]
-            turned = None if turn is None else T_world_before @ turn
+        last = self._past[-1]
+        if self._before is not None and view.stamp_ns - last.stamp_ns < _RECENT_NS:
+            corners, turn = self._corner_motion(view), find_turn(view.rgb, self._before.rgb, view.intrinsics)
+            guesses = [last.T @ motion for motion in (corners, turn) if motion is not None]
+            tried = [self._try(view, guess) for guess in (*guesses, last.T)]
+            results += [result for result in tried if result is not None]
+            expected = expected if corners is None else [last.T @ corners]
+            turned = [] if turn is None else [last.T @ turn]
             results = [
                 r
                 for r in results
                 if any(_is_close(pose, r.T_world_camera) for pose in expected)
-                or (turned is not None and _is_close(turned, r.T_world_camera, 2 * _JUMP_M))
+                or any(_is_close(pose, r.T_world_camera, 2 * _JUMP_M) for pose in turned)
             ]
         best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
         noise_m = max(self._noise_m or NOISE_M, _LEAST_NOISE_M)
@@ -220,9 +218,9 @@ class OdometryPoseSource(PoseSource):
 
     def _corner_motion(self, view: _View) -> Float64 | None:
         """T_before_camera (4, 4) from the last image that had a pose, by the corners of both; None without enough."""
-        if self._newest is None:
+        if self._before is None:
             return None
-        match = pose_from_features(view.features, self._newest[0].features, view.intrinsics, MIN_MATCHES)
+        match = pose_from_features(view.features, self._before.features, view.intrinsics, MIN_MATCHES)
         return None if match is None else match[0]
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
@@ -230,7 +228,7 @@ class OdometryPoseSource(PoseSource):
         while final and self._closer is not None and self._closer.busy:
             self._close_loops(None)
         if final:
-            self._corrected = self._trail.correction(self._map.poses, final) or self._corrected
+            self._corrected = self._trail.correction(self._graph.poses, final) or self._corrected
         corrected, self._corrected = self._corrected, None
         return corrected
 
@@ -244,13 +242,11 @@ class OdometryPoseSource(PoseSource):
             return
         self._closed_ns = self._closed_ns if stamp_ns is None else stamp_ns
         self._past = [replace(past, T=self._moved(past.T, poses)) for past in self._past]
-        if self._newest is not None:
-            self._newest = self._newest[0], self._moved(self._newest[1], poses)
-        self._map.move(poses)
-        self._corrected = self._trail.correction(self._map.poses, final=False) or self._corrected
+        self._graph.move(poses)
+        self._corrected = self._trail.correction(self._graph.poses, final=False) or self._corrected
 
     def _moved(self, T_world_camera: Float64, poses: Mapping[int, Float64]) -> Float64:
-        nearest = self._map.near(T_world_camera, 1)[0]
+        nearest = self._graph.near(T_world_camera, 1)[0]
         return poses[nearest.number] @ invert_pose(nearest.target.T_world_camera) @ T_world_camera
 
     def _check(self, image: CameraImage) -> None:
@@ -286,17 +282,20 @@ class OdometryPoseSource(PoseSource):
     def _begin(self, view: _View) -> PoseEstimate:
         pose = matrix(self._config.T_world_start)
         self._add_keyframe(view, pose, 0.0, None)
-        self._past, self._newest = [StampedPose(view.stamp_ns, pose)], (view, pose)
-        self._images = 1
-        self._counters["tracked"] += 1
-        return PoseEstimate(pose, "odometry", 0.0, self._world)
+        return self._given(view, pose, 0.0)
 
-    def _guesses(self, view: _View) -> list[_Guess]:
+    def _given(self, view: _View, pose: Float64, sigma_m: float) -> PoseEstimate:
+        self._past, self._before = [*self._past[-1:], StampedPose(view.stamp_ns, pose)], view
+        self._lost_ns, self._warnings = None, ()
+        self._images += 1
+        self._counters["tracked"] += 1
+        return PoseEstimate(pose, "odometry", sigma_m, self._world)
+
+    def _guesses(self, view: _View) -> list[Float64]:
         """The last motion continued, and what corners say; that first which lies better on the nearest keyframe."""
-        guess = self._expected(view.stamp_ns)
-        near = self._map.near(guess, NEIGHBOURS)
-        guesses = [(guess, near), *self._guesses_of_features(view, near)]
-        return sorted(guesses, key=lambda g: fit(view.levels, g[1][0].target, g[0]).cost_m)
+        expected = self._expected(view.stamp_ns)
+        guesses = [expected, *self._guesses_of_features(view, self._graph.near(expected, NEIGHBOURS))]
+        return sorted(guesses, key=lambda T: fit(view.levels, self._graph.near(T, 1)[0].target, T).cost_m)
 
     def _expected(self, stamp_ns: int) -> Float64:
         """Where the last motion leads."""
@@ -305,33 +304,30 @@ class OdometryPoseSource(PoseSource):
         a, b = self._past
         return interpolate_pose(a.T, b.T, min((stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
 
-    def _guesses_while_lost(self, view: _View) -> list[_Guess]:
+    def _guesses_while_lost(self, view: _View) -> list[Float64]:
         """What corners say of keyframes near the last pose, then of the others, this many an image in turn."""
         last = self._past[-1]
-        near = self._map.near(last.T, NEIGHBOURS)
-        guesses: list[_Guess] = []
-        if view.stamp_ns - last.stamp_ns < _RECENT_NS:
-            guesses.append((last.T, near))
-        count = min(len(self._map), RELOCALISE_KEYFRAMES)
-        turn = [self._map.frames[(self._next_try + i) % len(self._map)] for i in range(count)]
-        self._next_try = (self._next_try + count) % len(self._map)
-        return guesses + self._guesses_of_features(view, near + [k for k in turn if k not in near])
+        near = self._graph.near(last.T, NEIGHBOURS)
+        frames = [*self._graph.frames.values()]
+        count = min(len(frames), RELOCALISE_KEYFRAMES)
+        turn = [frames[(self._next_try + i) % len(frames)] for i in range(count)]
+        self._next_try = (self._next_try + count) % len(frames)
+        guesses = self._guesses_of_features(view, near + [k for k in turn if k not in near])
+        return [last.T, *guesses] if view.stamp_ns - last.stamp_ns < _RECENT_NS else guesses
 
-    def _guesses_of_features(self, view: _View, keyframes: list[OdometryKeyframe]) -> list[_Guess]:
+    def _guesses_of_features(self, view: _View, keyframes: list[OdometryKeyframe]) -> list[Float64]:
         """Those with the most corners in agreement first."""
-        features = view.features
-        found: list[tuple[int, Float64, OdometryKeyframe]] = []
+        found: list[tuple[int, Float64]] = []
         for keyframe in keyframes:
-            match = pose_from_features(features, keyframe.features, view.intrinsics, MIN_MATCHES)
+            match = pose_from_features(view.features, keyframe.features, view.intrinsics, MIN_MATCHES)
             if match is not None:
-                found.append((match[1], keyframe.target.T_world_camera @ match[0], keyframe))
-        found.sort(key=lambda item: -item[0])
-        return [(pose, self._map.near(pose, NEIGHBOURS)) for _, pose, _ in found]
+                found.append((match[1], keyframe.target.T_world_camera @ match[0]))
+        return [pose for _, pose in sorted(found, key=lambda item: -item[0])]
 
-    def _try(self, view: _View, guess: Float64, keyframes: list[OdometryKeyframe]) -> _Found | None:
-        """Align a view to keyframes; None where the result cannot be believed."""
-        others = [k for k in keyframes[1:] if fit(view.levels, k.target, guess).overlap >= MIN_OVERLAP]
-        used = [keyframes[0], *others]
+    def _try(self, view: _View, guess: Float64) -> _Found | None:
+        """Align a view to the keyframes near a guess; None where the result cannot be believed."""
+        nearest, *others = self._graph.near(guess, NEIGHBOURS)
+        used = [nearest, *(k for k in others if fit(view.levels, k.target, guess).overlap >= MIN_OVERLAP)]
         targets = [k.target for k in used]
         pose = align(view.levels, targets, guess)
         if pose is None:
@@ -345,7 +341,7 @@ class OdometryPoseSource(PoseSource):
         if flat is not None:
             pose, unsure_m = self._go_on(view, pose, flat, guess)
             fits = [fit(view.levels, t, pose) for t in targets]
-        return _Found(pose, used[0], fits, unsure_m) if lies_on(fits[0]) else None
+        return _Found(pose, nearest, fits, unsure_m) if lies_on(fits[0]) else None
 
     def _go_on(
         self, view: _View, pose: Float64, flat: tuple[Float64, Float64], guess: Float64
@@ -362,11 +358,11 @@ class OdometryPoseSource(PoseSource):
             The pose, and how far it may be off in these directions, metres.
         """
         corners = None if self._lost else self._corner_motion(view)
-        wanted = guess if self._newest is None or corners is None else self._newest[1] @ corners
+        last = self._past[-1].T
+        wanted = guess if corners is None else last @ corners
         moved = pose @ make_pose(flat[0] @ rotation_vector(invert_pose(pose) @ wanted), np.zeros(3))
         shifts = pose[:3, :3] @ flat[1] @ pose[:3, :3].T
         moved[:3, 3] += shifts @ (wanted[:3, 3] - pose[:3, 3])
-        last = self._past[-1].T
         step_m = float(np.linalg.norm(shifts @ (moved[:3, 3] - last[:3, 3])))
         step_m += _LEVER_M * float(np.linalg.norm(flat[0] @ rotation_vector(invert_pose(last) @ moved)))
         if corners is None and step_m > _STANDING_M:
@@ -379,61 +375,35 @@ class OdometryPoseSource(PoseSource):
             self._counters["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
             self._past = []
-        jumped = self._jump(view, nearest, pose)
-        self._lost_ns, self._warnings = None, ()
-        self._images += 1
-        self._counters["tracked"] += 1
-        self._newest, self._unsure_m = (view, pose), found.unsure_m
+        self._unsure_m = found.unsure_m
         self._noise_m += _NOISE_GAIN * (fits[0].noise_m - self._noise_m) if self._noise_m else fits[0].noise_m
-        self._past = [*self._past[-1:], StampedPose(view.stamp_ns, pose)]
-        way, turn = self._map.distances(pose)
+        way, turn = self._graph.distances(pose)
         reach = np.maximum(way / KEYFRAME_M, np.rad2deg(turn) / KEYFRAME_DEG)
-        way_m = float(min(k.way_m + d for k, d in zip(self._map.frames, way, strict=True)))
-        if reach.min() > 1 or fits[0].overlap < KEYFRAME_OVERLAP or jumped is not None:
-            self._add_keyframe(view, pose, way_m, nearest.number, jumped)
+        way_m = float(min(k.way_m + d for k, d in zip(self._graph.frames.values(), way, strict=True)))
+        if reach.min() > 1 or fits[0].overlap < KEYFRAME_OVERLAP:
+            self._add_keyframe(view, pose, way_m, nearest.number)
         elif self._closer is not None:
-            self._trail.add(view.stamp_ns, nearest.number, nearest.target.T_world_camera, pose)
-        sigma = _sigma(fits, float(np.hypot(DRIFT * way_m, found.unsure_m)))
-        return PoseEstimate(pose, "odometry", sigma, self._world)
+            self._trail.add(view.stamp_ns, nearest, pose)
+        return self._given(view, pose, _sigma(fits, float(np.hypot(DRIFT * way_m, found.unsure_m))))
 
-    def _jump(self, view: _View, nearest: OdometryKeyframe, pose: Float64) -> tuple[int, Float64] | None:
-        """Where another keyframe has taken the camera off its way: the one before, and the way expected from it."""
-        before, self._nearest = self._nearest, nearest.number
-        known = self._map.poses
-        if self._closer is None or self._lost or before == nearest.number or before not in known or not self._past:
-            return None
-        expected = self._expected(view.stamp_ns)
-        if apart(expected, pose)[0] < _JUMP_M:
-            return None
-        return before, invert_pose(known[before]) @ expected
-
-    def _add_keyframe(
-        self,
-        view: _View,
-        pose: Float64,
-        way_m: float,
-        parent: int | None,
-        before: tuple[int, Float64] | None = None,
-    ) -> None:
+    def _add_keyframe(self, view: _View, pose: Float64, way_m: float, parent: int | None) -> None:
         number = self._counters["keyframes"]
         self._counters["keyframes"] += 1
         place = view.features
         if self._closer is not None:
             place = find_place_features(view.rgb, view.depth_m, PLACE_FEATURES)
         keyframe = OdometryKeyframe(number, Target(view.levels, pose), view.features, place, way_m, self._unsure_m)
-        known = self._map.poses
-        gone = self._map.add(keyframe)
-        if self._closer is None:
-            return
-        self._closer.add(keyframe, parent, before)
-        self._trail.add(view.stamp_ns, number, pose, pose)
+        self._graph.frames[number] = keyframe
+        if self._closer is not None:
+            self._closer.add(keyframe, parent)
+            self._trail.add(view.stamp_ns, keyframe, pose)
+        gone = self._graph.trim()
         if gone is not None:
-            self._trail.hand_over(*gone, invert_pose(known[gone[1]]) @ known[gone[0]])
-            self._closer.remove(*gone)
+            self._trail.hand_over(*gone)
 
-    def _lose(self, image: CameraImage | _View, reason: str) -> None:
+    def _lose(self, stamp_ns: int, reason: str) -> None:
         if self._lost_ns is None:
-            self._lost_ns = image.stamp_ns
+            self._lost_ns = stamp_ns
             _log.warning("odometry_lost", reason=reason)
         ways_on = "show the camera a place that it has seen before"
         if can_be_found(self._config):
@@ -445,19 +415,13 @@ class OdometryPoseSource(PoseSource):
         """No pose, or the first one of a new world."""
         lost_ns = 0 if self._lost_ns is None else view.stamp_ns - self._lost_ns
         if not can_be_found(self._config) or (self._images >= _YOUNG and lost_ns < _LOST_NS):
-            return self._lose(view, reason)
+            return self._lose(view.stamp_ns, reason)
         self._counters["new_sessions"] += 1
         if is_power_of_two(self._counters["new_sessions"]):
-            _log.warning("odometry_begins_new_world", reason=reason, images=self._images, keyframes=len(self._map))
-        if self._images >= _YOUNG:  # the map is of the world before: it would take no corrections of this one
-            self._corrected = self._trail.correction(self._map.poses, final=True) or self._corrected
-            self._closer = None
-        elif self._closer is not None:
-            self._closer = LoopCloser(self._counters)
-        self._map, self._trail = KeyframeMap(), PoseTrail()
-        self._lost_ns, self._warnings = None, ()
-        self._noise_m = self._unsure_m = 0.0
-        self._nearest, self._images, self._next_try = -1, 0, 0
+            _log.warning("odometry_begins_new_world", reason=reason, images=self._images)
+        self._corrected = self._trail.correction(self._graph.poses, final=True) or self._corrected
+        # The map is of a world that has lasted: it would take no corrections of the next one.
+        self._begin_world(closes_loops=self._closer is not None and self._images < _YOUNG)
         self._world += 1
         return self._begin(view)
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import msgspec
 import numpy as np
@@ -27,16 +26,18 @@ REASONS = ("no_pose", "stale", "not_rotation", "outliers", "uninitialized")
 MAX_TURN_DEG_S = 360.0  # faster than this between two images is a jump
 SLACK_M, SLACK_DEG = 0.05, 3.0  # a pose may be off by so much at any rate
 FAR = 2.0  # times what is allowed: a jump, whatever comes after it
-HELD = 3  # times ``init_consensus``: this many frames are held back at most while the first poses do not agree
+# A camera's first frames are held back until this many of their poses in a row agree with each other: a single wrong
+# pose, such as a robot's before it knows where it is, is no place to continue from.
+INIT_CONSENSUS = 5
 
 _log = get_logger(__name__)
 
 
 class PosedCamera:
-    """A ``FrameSource``: the images of a camera, each with its pose.
+    """The images of a camera, each with its pose.
 
     An image that gets none is left out, which shows as a gap in ``seq``. A camera's first frames are held back until
-    some of their poses agree with each other (``init_consensus``), and are given then.
+    some of their poses agree with each other, and are given then.
 
     Args:
         camera: Gives the images.
@@ -44,7 +45,6 @@ class PosedCamera:
         checks: What to refuse.
         T_rig_camera: (4, 4) where the poses are those of a rig, and the camera sits there.
         scale_known: Whether poses are in metres.
-        begins_world: The world of the poses begins with this source, and is another one each time.
 
     Attributes:
         counters: "frames" given; images left out: "no_pose" (the source has none), "stale" (the image is not later than
@@ -61,17 +61,14 @@ class PosedCamera:
         *,
         T_rig_camera: Float64 | None = None,
         scale_known: bool = True,
-        begins_world: bool = False,
     ) -> None:
-        self._world = time.monotonic_ns() if begins_world else 0
-        self._world_by_camera: dict[str, int] = {}  # of each camera's last pose
         self._camera = camera
         self._scale_known = scale_known
         self._poses = poses
         self._checks = checks
         self._T_rig_camera = T_rig_camera
         self._counts: Counter[str] = Counter()
-        self._filters: dict[str, PoseOutlierFilter] = {}
+        self._filters: dict[str, tuple[int, PoseOutlierFilter]] = {}  # by camera, with the world of its poses
         self._last_ns: dict[str, int] = {}
         self._trouble = ""
         self._corrected: CorrectedWorld | None = None
@@ -140,26 +137,26 @@ class PosedCamera:
             CameraError: the camera is gone, or it cannot have poses from this source.
         """
         for image in self._camera:
-            camera_id = image.camera_id
             estimate = self._checked_pose(image)
             self._follow_correction()
             if estimate is None:
                 continue
-            if self._world_by_camera.setdefault(camera_id, estimate.world) != estimate.world:
-                self._world_by_camera[camera_id] = estimate.world
-                if (old := self._filters.pop(camera_id, None)) is not None:
-                    yield from self._passed(old.abandon(), camera_id)
-            if camera_id not in self._filters:
-                self._filters[camera_id] = PoseOutlierFilter(self._checks, exact=estimate.source in EXACT)
-            yield from self._passed(self._filters[camera_id].take(_frame(image, estimate)), camera_id)
-        for camera_id, outlier_filter in self._filters.items():
-            yield from self._passed(outlier_filter.end(), camera_id)
+            world, outlier_filter = self._filters.get(image.camera_id, (0, None))
+            if outlier_filter is None or world != estimate.world:
+                if outlier_filter is not None:
+                    yield from self._passed(outlier_filter.abandon())
+                needed = 1 if estimate.source in EXACT else INIT_CONSENSUS
+                outlier_filter = PoseOutlierFilter(self._checks.max_speed_m_s, needed)
+                self._filters[image.camera_id] = estimate.world, outlier_filter
+            yield from self._passed(outlier_filter.take(_frame(image, estimate)))
+        for _, outlier_filter in self._filters.values():
+            yield from self._passed(outlier_filter.end())
 
     def _follow_correction(self, final: bool = False) -> None:
         corrected = self._poses.correction(final)
         if corrected is None:
             return
-        for outlier_filter in self._filters.values():
+        for _, outlier_filter in self._filters.values():
             outlier_filter.follow(corrected.motion)
         if self._T_rig_camera is not None:
             cameras = {stamp_ns: pose @ self._T_rig_camera for stamp_ns, pose in corrected.poses.items()}
@@ -175,7 +172,6 @@ class PosedCamera:
             self._counts["no_pose"] += 1
             self._trouble = ""  # the source says why
             return None
-        estimate = replace(estimate, world=self._world + estimate.world)
         if self._T_rig_camera is not None:
             estimate = replace(estimate, T_world_camera=estimate.T_world_camera @ self._T_rig_camera)
         try:
@@ -186,14 +182,10 @@ class PosedCamera:
             return self._refuse(image, "not_rotation", f"its pose has an uncertainty of {estimate.sigma} m")
         return estimate
 
-    def _passed(self, result: FilterResult, camera_id: str) -> Iterator[PosedFrame]:
-        for frame, why in result.outliers:
-            self._refuse(frame, "outliers", why)
-        for frame, why in result.uninitialized:
-            self._refuse(frame, "uninitialized", why)
-        if result.waiting:
-            self._trouble = f"frames of '{camera_id}' are held back: {result.waiting}"
-        elif result.passed:
+    def _passed(self, result: FilterResult) -> Iterator[PosedFrame]:
+        for frame, reason, why in result.refused:
+            self._refuse(frame, reason, why)
+        if result.passed:
             self._trouble = ""
         for frame in result.passed:
             self._counts["frames"] += 1
@@ -224,53 +216,52 @@ def _frame(image: CameraImage, estimate: PoseEstimate) -> PosedFrame:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FilterResult:
+class FilterResult(NamedTuple):
     """What becomes of a frame, and of those that were held back before it.
 
     Args:
         passed: Frames to give, in the order of capture.
-        outliers, uninitialized: Frames to leave out, each with why: it cannot have been reached from poses that are
-            believed; or no poses are believed yet, and it did not agree with those around it.
-        waiting: Why frames are held back though they contradict each other; empty where they do not.
+        refused: Frames to leave out, each with the counter's name and why: "outliers" cannot have been reached from
+            poses that are believed; "uninitialized" did not agree with those after it while none was believed.
     """
 
-    passed: tuple[PosedFrame, ...] = ()
-    outliers: tuple[tuple[PosedFrame, str], ...] = ()
-    uninitialized: tuple[tuple[PosedFrame, str], ...] = ()
-    waiting: str = ""
+    passed: list[PosedFrame]
+    refused: list[tuple[PosedFrame, str, str]]
 
 
 class PoseOutlierFilter:
-    """Which poses of one camera are believed: the first ones once some agree, then those that can have been reached.
+    """Which poses of one camera are believed: the first ones once some in a row agree, then those within reach.
 
-    First frames stand in chains, in each of which a pose can be reached from the one before. A chain is believed when
-    it is ahead of every other by ``init_consensus``: a wrong first pose loses against what follows it, and of two
-    odometry sessions that take turns none is believed. From there, what is within reach grows with the time since
-    the last pose that passed. A source that has jumped far and continues from there must not pass because of that; one
-    that jumps back may.
+    What is within reach grows with the time since the last pose that passed. A source that has jumped far and
+    continues from there must not pass because of that; one that jumps back may.
 
     Args:
-        checks: The limits.
-        exact: The first pose is right.
+        max_speed_m_s: Of the camera.
+        needed: So many first poses in a row have to agree.
     """
 
-    def __init__(self, checks: PoseChecks, exact: bool = False) -> None:
-        self._checks = checks
-        self._agree = 1 if exact else checks.init_consensus
-        self._chains: list[list[PosedFrame]] = []  # the one that was last added to is the last
+    def __init__(self, max_speed_m_s: float, needed: int) -> None:
+        self._max_speed_m_s = max_speed_m_s
+        self._needed = needed
+        self._held: list[PosedFrame] = []  # first frames, each of which can have been reached from the one before
+        self._contradicted = False  # others were given up before these
         self._last: StampedPose | None = None  # that was believed; None while first frames are held back
-        self._elsewhere: StampedPose | None = None  # the last refused pose, and ...
-        self._agreeing = 0  # ... how many in a row agree with it, and ...
-        self._far = False  # ... whether the first of them was so far that no quick movement explains it
+        self._elsewhere: StampedPose | None = None  # the last refused pose of those that go on from a far jump
 
     def take(self, frame: PosedFrame) -> FilterResult:
         """Judge the next frame."""
-        sample = _sample(frame)
-        if self._last is None:
-            return self._take_first(frame, sample)
-        reason = self._refusal(self._last, sample)
-        return FilterResult(outliers=((frame, reason),)) if reason else FilterResult((frame,))
+        sample = StampedPose(frame.stamp_ns, frame.T_world_camera)
+        if self._last is not None:
+            why = self._refusal(self._last, sample)
+            return FilterResult([], [(frame, "outliers", why)]) if why else FilterResult([frame], [])
+        before = self._held[-1] if self._held else None
+        jump = before is not None and self._jump(StampedPose(before.stamp_ns, before.T_world_camera), sample)
+        refused = self._give_up(f"the first poses do not agree with each other: {jump}") if jump else []
+        self._held.append(frame)
+        if len(self._held) < self._needed:
+            return FilterResult([], refused)
+        passed, self._held, self._last = self._held, [], sample
+        return FilterResult(passed, refused)
 
     def follow(self, motion: Float64) -> None:
         """The world of the poses to come is another one: ``motion`` (4, 4) takes the last pose there."""
@@ -279,113 +270,50 @@ class PoseOutlierFilter:
         if self._elsewhere is not None:
             self._elsewhere = replace(self._elsewhere, T=motion @ self._elsewhere.T)
 
-    def abandon(self) -> FilterResult:
-        """The world of the poses has ended: what is held back is left out."""
-        why = "the camera began another world before its first poses were sure"
-        return FilterResult() if self._last is not None else self._give_up(why)
-
     def end(self) -> FilterResult:
         """No more will come: what is held back passes where no pose has contradicted it."""
-        if self._last is None and len(self._chains) == 1:
-            return FilterResult(tuple(self._chains[0]))
-        return FilterResult() if self._last is not None else self._give_up(self._contradiction())
+        if self._contradicted:
+            return FilterResult([], self._give_up("too few of the last poses agree with each other"))
+        return FilterResult(self._held, [])
 
-    def _take_first(self, frame: PosedFrame, sample: StampedPose) -> FilterResult:
-        """The frames of the chain that is believed now, or none."""
-        # The chain that the frame follows most closely; not the longest: what is within reach of a chain grows while
-        # another one grows.
-        fractions = [(_reach(self._checks, _sample(chain[-1]), sample), chain) for chain in self._chains]
-        fraction, chain = min(fractions, key=lambda found: found[0], default=(np.inf, []))
-        chain = chain if fraction <= 1 else []
-        chain.append(frame)
-        others = [c for c in self._chains if c is not chain]
-        self._chains = [*others, chain]
-        if len(chain) - max((len(c) for c in others), default=0) >= self._agree:
-            why = f"its pose does not agree with {len(chain)} others that agree with each other"
-            self._last = sample
-            return FilterResult(tuple(chain), outliers=tuple((f, why) for f in _in_order(others)))
-        waiting = self._contradiction()
-        if sum(len(c) for c in self._chains) < HELD * self._agree:
-            return FilterResult(waiting=waiting)
-        return self._give_up(waiting)
+    def abandon(self) -> FilterResult:
+        """The world of the poses has ended: what is held back is left out."""
+        return FilterResult([], self._give_up("the camera began another world before its first poses were sure"))
 
-    def _give_up(self, why: str) -> FilterResult:
-        held, self._chains = _in_order(self._chains), []
-        return FilterResult(uninitialized=tuple((f, why) for f in held), waiting=why)
-
-    def _contradiction(self) -> str:
-        if len(self._chains) < 2:
-            return ""
-        before, after = sorted((_sample(chain[-1]) for chain in self._chains[-2:]), key=lambda s: s.stamp_ns)
-        return (
-            f"the first poses do not agree with each other ({_jump(self._checks, before, after)}); "
-            f"none is believed before {self._agree} agree (init_consensus)"
-        )
+    def _give_up(self, why: str) -> list[tuple[PosedFrame, str, str]]:
+        held, self._held, self._contradicted = self._held, [], True
+        return [(frame, "uninitialized", why) for frame in held]
 
     def _refusal(self, last: StampedPose, sample: StampedPose) -> str:
         """Why a pose is refused; empty where it passes."""
-        reason = _jump(self._checks, last, sample)
-        follows = self._elsewhere is not None and not _jump(self._checks, self._elsewhere, sample)
-        needed = self._checks.relocalize_after
-        if follows and self._far:
+        if self._elsewhere is not None and not self._jump(self._elsewhere, sample):
+            self._elsewhere = sample
             moved_m, turned_deg, seconds = _way(last, sample)
-            way_out = (
-                f"after {needed} of them that agree with each other they are believed (relocalize_after)"
-                if needed
-                else "if they are right now, start the launch again, or set checks = { relocalize_after = N } in the "
-                "table `poses`: after a jump, N poses in a row that agree with each other are believed then, such as "
-                "N = 30"
-            )
-            reason = (
+            return (
                 f"the poses have jumped and continue from there, now {moved_m:.2f} m and {turned_deg:.0f} degrees from "
                 f"the last one that was believed, {seconds:.1f} s ago; they are left out, since those of another world "
-                f"would spoil the map; {way_out}"
+                "would spoil the map; if they are right now, start the launch again"
             )
-        if reason:
-            self._agreeing = self._agreeing + 1 if follows else 1
-            if not follows:
-                self._far = bool(_jump(self._checks, last, sample, FAR))
-            self._elsewhere = sample
-            if not 0 < needed < self._agreeing:
-                return reason
-            _log.warning("jump_accepted", reason=reason, agreeing=self._agreeing)
-        self._last, self._elsewhere, self._agreeing = sample, None, 0
-        return ""
+        why = self._jump(last, sample)
+        if not why:
+            self._last = sample
+        self._elsewhere = sample if why and self._jump(last, sample, FAR) else None
+        return why
 
-
-def _sample(frame: PosedFrame) -> StampedPose:
-    return StampedPose(frame.stamp_ns, frame.T_world_camera)
+    def _jump(self, a: StampedPose, b: StampedPose, times: float = 1.0) -> str:
+        """Why b cannot have been reached from a, with this many times the limits; empty where it can."""
+        moved_m, turned_deg, seconds = _way(a, b)
+        allowed_m = times * (SLACK_M + self._max_speed_m_s * seconds)
+        allowed_deg = times * (SLACK_DEG + MAX_TURN_DEG_S * seconds)
+        if moved_m <= allowed_m and turned_deg <= allowed_deg:
+            return ""
+        return (
+            f"the pose jumps by {moved_m:.2f} m and {turned_deg:.0f} degrees in {seconds:.3f} s; at most "
+            f"{allowed_m:.2f} m and {allowed_deg:.0f} degrees are believed (max_speed_m_s)"
+        )
 
 
 def _way(a: StampedPose, b: StampedPose) -> tuple[float, float, float]:
     """Metres, degrees and seconds from a to b."""
     moved_m, turned = pose_distance(a.T, b.T)
     return moved_m, float(np.rad2deg(turned)), (b.stamp_ns - a.stamp_ns) / 1e9
-
-
-def _in_order(chains: list[list[PosedFrame]]) -> list[PosedFrame]:
-    return sorted((frame for chain in chains for frame in chain), key=lambda f: f.stamp_ns)
-
-
-def _allowed(checks: PoseChecks, seconds: float) -> tuple[float, float]:
-    """Metres and degrees that are believed in that time."""
-    return SLACK_M + checks.max_speed_m_s * seconds, SLACK_DEG + MAX_TURN_DEG_S * seconds
-
-
-def _reach(checks: PoseChecks, a: StampedPose, b: StampedPose) -> float:
-    """The way from a to b by what is allowed in that time; above 1 it is a jump."""
-    moved_m, turned_deg, seconds = _way(a, b)
-    allowed_m, allowed_deg = _allowed(checks, seconds)
-    return max(moved_m / allowed_m, turned_deg / allowed_deg)
-
-
-def _jump(checks: PoseChecks, a: StampedPose, b: StampedPose, times: float = 1.0) -> str:
-    """Why b cannot have been reached from a, with this many times the limits; empty where it can."""
-    if _reach(checks, a, b) <= times:
-        return ""
-    moved_m, turned_deg, seconds = _way(a, b)
-    allowed_m, allowed_deg = (times * limit for limit in _allowed(checks, seconds))
-    return (
-        f"the pose jumps by {moved_m:.2f} m and {turned_deg:.0f} degrees in {seconds:.3f} s; at most "
-        f"{allowed_m:.2f} m and {allowed_deg:.0f} degrees are believed (max_speed_m_s)"
-    )

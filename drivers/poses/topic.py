@@ -18,15 +18,13 @@ from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.endpoints import check_connect
 from semantic_mapper.transport.keys import ServerIdentity, load_keys, secure_client
 from semantic_mapper.transport.pose_message import MAX_POSE_BYTES, decode_pose
-from semantic_mapper.transport.sockets import receive_bounded
+from semantic_mapper.transport.sockets import MAX_PART_BYTES, receive_bounded
 
 WAIT_S = 0.05  # how long an image waits for a pose at or after it, before the motion is extrapolated
 _KEPT = 2000  # poses
 _MAX_GAP_NS = 300_000_000  # between two poses further apart nothing is interpolated
 _MAX_AHEAD_NS = 50_000_000  # beyond the last pose; an image that is further ahead has none
 _POLL_MS = 50
-_SILENCE_S = 1.0  # after so long without a message the connection is made again
-_FRESH_NS = 500_000_000  # a message that came so long ago was sent just now, as far as clocks go
 # A pose cannot be of a moment that has not come. So much is left to publishers that predict where the robot will be
 # when the message arrives, and to an offset between two clocks that is not exact.
 _FUTURE_NS = 50_000_000
@@ -35,6 +33,7 @@ _MISSES = {
     "gap": "falls into a gap between two poses",
     "stale": "is too far ahead of the newest pose",
 }
+_CLOCKS = "stamp poses with CLOCK_MONOTONIC of this machine, or set clock_offset_ns if the difference is constant"
 
 _log = get_logger(__name__)
 
@@ -54,7 +53,7 @@ class TopicPoseSource(PoseSource):
     Attributes:
         counters: Messages ("messages"), those that were no pose ("rejected"), of a moment that has not come
             ("future"), not later than the one before ("out_of_order"), and images without a pose by reason ("empty",
-            "before", "gap", "stale", "clock": messages are far from the images' clock).
+            "before", "gap", "stale").
     """
 
     def __init__(self, config: TopicPoses, wait_s: float = WAIT_S) -> None:
@@ -73,16 +72,13 @@ class TopicPoseSource(PoseSource):
         self._changed = threading.Condition()
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
-        self._arrived_ns = 0  # on this machine's clock
-        self._connection_trouble = ""
         self._message_trouble = ""
         self._image_trouble = ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with the connection and with messages, and why the last image had no pose."""
-        troubles = (self._connection_trouble, self._message_trouble, self._image_trouble)
-        return tuple(text for text in troubles if text)
+        """What is wrong with messages, and why the last image had no pose."""
+        return tuple(text for text in (self._message_trouble, self._image_trouble) if text)
 
     def __enter__(self) -> Self:
         """Connect.
@@ -108,28 +104,20 @@ class TopicPoseSource(PoseSource):
         """Pose at the image's stamp; None, with the reason in ``warnings``, where the messages do not give it."""
         stamp_ns, endpoint = image.stamp_ns, self._config.endpoint
         with self._changed:
-            self._changed.wait_for(lambda: self._track.newest_ns >= stamp_ns or self._is_off(stamp_ns), self._wait_s)
+            self._changed.wait_for(lambda: self._track.newest_ns >= stamp_ns, self._wait_s)
             newest_ns = self._track.newest_ns
-            found = "clock" if self._is_off(stamp_ns) else self._track.at(stamp_ns)
+            found = self._track.at(stamp_ns)
         if isinstance(found, StampedPose):
             self._image_trouble = ""
             return PoseEstimate(found.T @ self._mount, "topic", found.sigma)
-        if found == "clock":
-            trouble = (
-                f"poses of {endpoint} that come now are stamped {(newest_ns - stamp_ns) / 1e9:+.3f} s from the images "
-                f"of '{image.camera_id}': they are of another clock; stamp both with CLOCK_MONOTONIC of one machine, "
-                f"or set clock_offset_ns (now {self._config.clock_offset_ns}) if the difference is constant; on a "
-                "machine that is too slow for its camera, and has its images so late, raise max_clock_difference_s "
-                f"(now {self._config.max_clock_difference_s:g})"
-            )
-        elif found == "empty" and self._message_trouble:
+        if found == "empty" and self._message_trouble:
             trouble = f"no pose that came from {endpoint} could be used"
         elif found == "empty":
             trouble = f"no pose has come from {endpoint}; is its publisher running?"
         else:
             trouble = (
                 f"the last image of '{image.camera_id}' {_MISSES[found]} of {endpoint}: the newest one is "
-                f"{(stamp_ns - newest_ns) / 1e9:.3f} s older"
+                f"{(stamp_ns - newest_ns) / 1e9:.3f} s older; if both are of different clocks, {_CLOCKS}"
             )
         if not self._image_trouble:
             _log.warning("image_without_pose", reason=found, detail=trouble)
@@ -137,19 +125,12 @@ class TopicPoseSource(PoseSource):
         self._counters[found] += 1
         return None
 
-    def _is_off(self, stamp_ns: int) -> bool:
-        """Whether messages come now whose stamps are of another clock than the image's."""
-        fresh = time.monotonic_ns() - self._arrived_ns < _FRESH_NS
-        difference_s = abs(self._track.newest_ns - stamp_ns) / 1e9
-        return bool(len(self._track)) and fresh and difference_s > self._config.max_clock_difference_s
-
     def _connect(self) -> zmq.Socket[bytes]:
         socket = zmq.Context.instance().socket(zmq.SUB)
         try:
             socket.setsockopt(zmq.LINGER, 0)
             socket.setsockopt(zmq.RCVHWM, 1000)
-            socket.setsockopt(zmq.MAXMSGSIZE, MAX_POSE_BYTES)
-            socket.setsockopt(zmq.RECONNECT_IVL, 50)
+            socket.setsockopt(zmq.MAXMSGSIZE, MAX_PART_BYTES)
             socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
             socket.subscribe(self._config.topic.encode())
             if self._identity is not None:
@@ -164,65 +145,31 @@ class TopicPoseSource(PoseSource):
         return socket
 
     def _run(self, socket: zmq.Socket[bytes]) -> None:
-        heard = time.monotonic()
-        try:
+        with socket:
             while not self._closed.is_set():
                 if socket.poll(_POLL_MS):
                     self._take(*receive_bounded(socket, max_parts=2, max_bytes=2 * MAX_POSE_BYTES))
-                    heard = time.monotonic()
-                elif time.monotonic() - heard > _SILENCE_S:
-                    # ZeroMQ gives a connection up for good after a message beyond MAXMSGSIZE, without a word.
-                    socket = self._reconnect(socket)
-                    heard = time.monotonic()
-        finally:
-            socket.close(linger=0)
-
-    def _reconnect(self, old: zmq.Socket[bytes]) -> zmq.Socket[bytes]:
-        """A new socket; the old one, to be tried again later, while there can be none, such as for want of a key."""
-        try:
-            new = self._connect()
-        except (CameraError, zmq.ZMQError) as error:
-            if not self._connection_trouble:
-                _log.warning("pose_topic_lost", detail=str(error))
-            self._connection_trouble = str(error)
-            return old
-        self._connection_trouble = ""
-        old.close(linger=0)
-        return new
 
     def _take(self, parts: list[bytes], trouble: str) -> None:
         """A message, or why it is not kept as a whole."""
-        if trouble:
-            self._drop("rejected", trouble)
-            return
         try:
+            if trouble:
+                raise CodecError(trouble)
             message = decode_pose(parts)
         except CodecError as error:
             self._drop("rejected", str(error))
             return
-        offset_ns, now_ns = self._config.clock_offset_ns, time.monotonic_ns()
-        sample = StampedPose(message.stamp_ns + offset_ns, message.matrix, message.sigma)
-        ahead_ns = sample.stamp_ns - now_ns
+        sample = StampedPose(message.stamp_ns + self._config.clock_offset_ns, message.matrix, message.sigma)
+        ahead_ns = sample.stamp_ns - time.monotonic_ns()
         if ahead_ns > _FUTURE_NS:
-            self._drop(
-                "future",
-                f"it is stamped {ahead_ns / 1e9:.3f} s ahead of this machine's CLOCK_MONOTONIC, so it is of another "
-                "clock; stamp poses with CLOCK_MONOTONIC of this machine, or set clock_offset_ns (now "
-                f"{offset_ns}) if the difference is constant",
-            )
+            ahead = f"it is stamped {ahead_ns / 1e9:.3f} s ahead of this machine's CLOCK_MONOTONIC"
+            self._drop("future", f"{ahead}, so it is of another clock; {_CLOCKS}")
             return
         with self._changed:
-            newest_ns = self._track.newest_ns
-            # A publisher that was started again, or its clock set back; not while others keep coming that are not
-            # behind: then the message is of a second publisher, on another clock.
-            silent = now_ns - self._arrived_ns > _FRESH_NS
-            if silent and newest_ns - sample.stamp_ns > self._config.max_clock_difference_s * 1e9:
-                self._track.clear()
             if not self._track.add(sample):
-                self._drop("out_of_order", f"stamp {sample.stamp_ns} is not after {newest_ns}")
+                self._drop("out_of_order", f"stamp {sample.stamp_ns} is not after {self._track.newest_ns}")
                 return
-            self._arrived_ns = now_ns
-            self._connection_trouble = self._message_trouble = ""
+            self._message_trouble = ""
             self._counters["messages"] += 1
             self._changed.notify_all()
 

@@ -49,7 +49,7 @@ class RealSenseCamera(PolledCamera):
         return tuple(f"camera '{self._camera_id}': {text}" for text in texts)
 
     def _images(self) -> Iterator[CameraImage]:
-        while not self._stopped.is_set() and self._stream is not None and self._maker is not None:
+        while not self._stopping.is_set() and self._stream is not None and self._maker is not None:
             self._last_poll_time = time.monotonic()
             frames, self._first = self._first, None
             frames = frames or self._stream.read(SLICE_S)
@@ -65,14 +65,14 @@ class RealSenseCamera(PolledCamera):
         stream = Stream(self._find(self._serial, SLICE_S if again else SEARCH_S), self._config)
         try:
             frames = None  # the first ones, whose profile has the intrinsics
-            while frames is None and not self._stopped.is_set():
+            while frames is None and not self._stopping.is_set():
                 self._last_poll_time = time.monotonic()
                 frames = stream.read(SLICE_S)
             if frames is None:
                 raise CameraError(f"{stream.name}: a stop was requested before its first image")
             lens = frames.color.profile.as_video_stream_profile().get_intrinsics()
             if self._maker is None:
-                self._maker = ImageMaker(self._camera_id, lens)
+                self._maker = ImageMaker(self._camera_id, lens, self._config.fps)
             else:
                 self._maker.connected(lens)
         except StreamEnded as end:

@@ -11,7 +11,7 @@ import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.calibration import Rectifier
-from semantic_mapper.drivers.live import FUTURE_NS, StreamClock, StreamEnded
+from semantic_mapper.drivers.live import FrameCounter, StreamClock, StreamEnded
 from semantic_mapper.drivers.realsense.config import Config
 from semantic_mapper.drivers.realsense.devices import about, load_realsense
 from semantic_mapper.errors import CameraError, FrameError
@@ -209,18 +209,18 @@ class ImageMaker:
     Args:
         camera_id: Name in the images.
         reported: The SDK's ``intrinsics`` of the colour images.
+        hz: Rate of the images.
 
     Attributes:
         passed_over: Images that could not be used: out of order, or stamped in the future.
         reason: Why the last of them could not.
     """
 
-    def __init__(self, camera_id: str, reported: Any) -> None:
+    def __init__(self, camera_id: str, reported: Any, hz: float) -> None:
         self.passed_over = 0
         self.reason = ""
         self._camera_id = camera_id
-        self._last: tuple[int, int] | None = None  # number and stamp of the last image
-        self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
+        self._counter = FrameCounter(hz)
         self.connected(reported)
 
     @property
@@ -232,17 +232,13 @@ class ImageMaker:
         """The device counts again from here, and its clock may have started again."""
         self._rectify = Rectifier(read_intrinsics(reported))
         self._lens = any(reported.coeffs)
-        self._shift = None
+        self._counter.restart()
         self._clock = StreamClock()
 
     def image(self, frames: FrameSet) -> CameraImage | None:
         """The image of a set; None for one that is not later than the one before, or claims to be of the future."""
         stamp_ns = self._stamp_ns(frames)
-        self.reason = ""
-        if stamp_ns > time.monotonic_ns() + FUTURE_NS:
-            self.reason = "its stamp is in the future: check the clocks of this machine and of the device"
-        elif self._last is not None and stamp_ns <= self._last[1]:
-            self.reason = "its stamp is not later than that of the image before"
+        self.reason = self._counter.refusal(stamp_ns)
         if self.reason:
             self.passed_over += 1
             return None
@@ -255,8 +251,7 @@ class ImageMaker:
         if self._lens:
             rgb = self._rectify(np.ascontiguousarray(rgb[..., ::-1]))
             depth_m = None if depth_m is None else self._rectify.nearest(depth_m)
-        number = self._number(int(frames.color.get_frame_number()))
-        self._last = (number, stamp_ns)
+        number = self._counter.number(int(frames.color.get_frame_number()), stamp_ns)
         return CameraImage(stamp_ns, number, self._camera_id, rgb, depth_m, self.intrinsics)
 
     def _stamp_ns(self, frames: FrameSet) -> int:
@@ -265,10 +260,3 @@ class ImageMaker:
         if frames.color.get_frame_timestamp_domain() == load_realsense().timestamp_domain.hardware_clock:
             return self._clock.stamp_ns(sent_ns, frames.arrived_ns)
         return sent_ns - time.time_ns() + time.monotonic_ns()
-
-    def _number(self, counted: int) -> int:
-        """From 0, with jumps where images were lost."""
-        last = -1 if self._last is None else self._last[0]
-        if self._shift is None or counted + self._shift <= last:
-            self._shift = last + (1 if self._last is None else 2) - counted  # a gap shows that it was away
-        return counted + self._shift

@@ -13,17 +13,17 @@ import msgspec
 from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import load_stereo
+from semantic_mapper.drivers.live import NOT_CALIBRATED
 from semantic_mapper.drivers.stereo.config import Config
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.drivers.v4l2 import devices
 from semantic_mapper.errors import CameraError
-from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import UInt8
 
 _OURS = ("device", "calibration", "uncalibrated", "width", "height")  # of the device's driver, set here
 
 
-class StereoCamera:
+class StereoCamera(Camera):
     """The left camera of a pair, with depth.
 
     Args:
@@ -55,29 +55,17 @@ class StereoCamera:
         self._depth = StereoDepth(pair, config.width, config.min_depth_m, config.max_depth_m)
         self._size = (2 * pair.left.width, pair.left.height)
         self._swapped = pair.swapped
-        self._camera_id = camera_id
+        super().__init__(camera_id)
         kind, settings = source_of(config.device, *self._size)
         # Its own rectification is off: that of one lens would be wrong for both.
         settings |= {**config.source, "uncalibrated": True}
-        self._source: Camera = registry.open_camera(kind, settings, camera_id, f"stereo pair at {config.device}")
-        self._info: StreamInfo | None = None
-
-    @property
-    def info(self) -> StreamInfo:
-        """As of ``Camera``."""
-        if self._info is None:
-            raise CameraError(f"camera '{self._camera_id}' is not open")
-        return self._info
+        self._source = registry.open_camera(kind, settings, camera_id, f"stereo pair at {config.device}")
+        self.can_wait = self._source.can_wait
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """As of ``Camera``."""
-        return tuple(text for text in self._source.warnings if not text.startswith("not calibrated"))
-
-    @property
-    def can_wait(self) -> bool:
-        """As of ``Camera``."""
-        return self._source.can_wait
+        return tuple(text for text in self._source.warnings if text != NOT_CALIBRATED)
 
     @property
     def last_poll_time(self) -> float:
@@ -85,11 +73,7 @@ class StereoCamera:
         return self._source.last_poll_time
 
     def __enter__(self) -> Self:
-        """Open the device.
-
-        Raises:
-            CameraError: it is not there, or its images have another size than both of the calibration side by side.
-        """
+        """As of ``Camera``; images of another size than both of the calibration side by side are refused."""
         self._source.__enter__()
         source = self._source.info
         (given,) = source.cameras.values()

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import structlog
 
 from semantic_mapper.backoff import backoff_s
 from semantic_mapper.config import convert_config
-from semantic_mapper.drivers.base import Camera, CorrectedWorld, FrameSource
+from semantic_mapper.drivers.base import Camera
 from semantic_mapper.drivers.mounts import Mount, mount_of
-from semantic_mapper.drivers.poses.config import OdometryPoses, PoseChecks, begins_world, can_be_found, gives_metres
+from semantic_mapper.drivers.poses.config import PoseChecks, begins_world, can_be_found, gives_metres
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 from semantic_mapper.drivers.registry import open_camera
@@ -40,38 +40,6 @@ FIRST_PAUSE_S = 0.2  # before a camera that could not be opened is tried again; 
 MAX_PAUSE_S = 2.0
 
 _log = structlog.get_logger(__name__)
-
-
-class LiveSource(FrameSource, Protocol):
-    """A camera with poses, such as ``semantic_mapper.drivers.poses.PosedCamera``."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """As of ``Camera``."""
-        ...
-
-    @property
-    def can_wait(self) -> bool:
-        """As of ``Camera``."""
-        ...
-
-    @property
-    def last_poll_time(self) -> float:
-        """As of ``Camera``."""
-        ...
-
-    @property
-    def counters(self) -> Mapping[str, int]:
-        """Images that got no pose, by reason, and what else it counts."""
-        ...
-
-    def stop(self) -> None:
-        """As of ``Camera``."""
-        ...
-
-    def correction(self, final: bool = False) -> CorrectedWorld | None:
-        """As of ``PosedCamera``."""
-        ...
 
 
 def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCamera) -> None:
@@ -123,7 +91,7 @@ def check_world(name: str, live: LiveCamera) -> None:
         )
 
 
-def make_source(live: LiveCamera) -> LiveSource:
+def make_source(live: LiveCamera) -> PosedCamera:
     """The camera with its poses, not open yet.
 
     Raises:
@@ -135,7 +103,7 @@ def make_source(live: LiveCamera) -> LiveSource:
     return with_poses(camera, table_of(live.poses, "camera.poses")[0], mount)
 
 
-def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSource:
+def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> PosedCamera:
     """A camera whose frames get their poses from the source that a config names; its ``checks`` say what is refused.
 
     Raises:
@@ -150,11 +118,10 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
         checks=checks,
         T_rig_camera=mount.for_poses(poses),
         scale_known=gives_metres(poses),
-        begins_world=isinstance(poses, OdometryPoses) and can_be_found(poses),  # a device tells it itself
     )
 
 
-def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, stack: ExitStack) -> LiveSource | None:
+def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, stack: ExitStack) -> PosedCamera | None:
     """An open source, which ``stack`` closes; None where a stop request came first.
 
     Raises:
@@ -209,7 +176,7 @@ def _publish(
     options: CameraOptions,
     publisher: Publisher,
     reporter: _StatusReporter,
-    source: LiveSource,
+    source: PosedCamera,
     sender: CorrectionSender | None,
 ) -> None:
     publisher.publish(encode(source.info, sender=context.name))
@@ -237,7 +204,7 @@ def _publish(
         _log.info("published", frames=reporter.published, reason=reason)
 
 
-def _correct(source: LiveSource, sender: CorrectionSender | None, *, final: bool = False) -> None:
+def _correct(source: PosedCamera, sender: CorrectionSender | None, *, final: bool = False) -> None:
     """Hand on what closed loops have changed, if anything."""
     if sender is None:
         return
@@ -286,7 +253,7 @@ class _StatusReporter:
         self.sender: CorrectionSender | None = None
         self._context = context
         self._publisher = publisher
-        self._source: LiveSource | None = None
+        self._source: PosedCamera | None = None
         self._first_seq = self._last_seq = -1
         self._sent_at: float | None = None
         self._in_driver = False
@@ -314,7 +281,7 @@ class _StatusReporter:
         finally:
             self._in_driver = False
 
-    def watch(self, source: LiveSource) -> None:
+    def watch(self, source: PosedCamera) -> None:
         """The camera is open."""
         self.waiting_for = ""
         self._source = source
@@ -339,7 +306,7 @@ class _StatusReporter:
                 last_sent = time.monotonic()
                 self._tell(self._state())
 
-    def _comes_round(self, source: LiveSource | None) -> bool:
+    def _comes_round(self, source: PosedCamera | None) -> bool:
         if not self._in_driver:
             return True
         before, self._last_poll_time = self._last_poll_time, source.last_poll_time if source is not None else 0.0

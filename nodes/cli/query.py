@@ -87,7 +87,7 @@ def query(
     info: size, classes and how much surface each has. at X Y Z: class and confidence of the surface at a point, and
     whether the point is free, occupied or unknown. nearest CLASS X Y Z: the surface of a class that is nearest to a
     point. instances: all things, that is, connected pieces of one class that is not wall, floor or the like, with
-    upright boxes; of a map in which `refine` has separated things, those. graph: floors, their rooms, which part at
+    upright boxes. graph: floors, their rooms, which part at
     doors, the doors between them, and the same things with their rooms.
 
     correct FILE moves the map of a running mapper to corrected poses (TUM: stamp tx ty tz qx qy qz qw), such as after a
@@ -172,11 +172,6 @@ class SavedMap:
         except MapError:
             return map_answers.UP
 
-    @property
-    def separated_by(self) -> str:
-        """By which means its things were separated."""
-        return map_answers.CONNECTED if self._snapshot.instances is None else map_answers.LEARNED
-
 
 def answer(
     answering: MapClient | SavedMap,
@@ -202,10 +197,8 @@ def answer(
         case Question.NEAREST:
             return map_answers.answer_nearest(class_name, point, answering.nearest(class_name, point, min_confidence))
         case Question.INSTANCES:
-            saved = isinstance(answering, SavedMap)
-            axis = up or (answering.up() if saved else map_answers.UP)
-            by = answering.separated_by if saved else map_answers.CONNECTED
-            return map_answers.answer_instances(axis, answering.instances(axis, gone=gone), by)
+            axis = up or (answering.up() if isinstance(answering, SavedMap) else map_answers.UP)
+            return map_answers.answer_instances(axis, answering.instances(axis, gone=gone))
         case _:  # the graph
             graph = answering.graph(up)
             if picture is not None:
@@ -332,8 +325,7 @@ def _instance_table(found: dict[str, Any]) -> Table:
         for thing in things
     ]
     names = ("id", "class", "confidence", "voxels", "measured", "centroid, m", "box, m", "gone at, s")
-    by = found.get("separated_by")
-    return table(rows, names, title=f"{found['map']}, things by {by}" if by else found["map"])
+    return table(rows, names, title=found["map"])
 
 
 def _graph_table(found: dict[str, Any]) -> Table:

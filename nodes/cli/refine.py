@@ -62,6 +62,4 @@ def refine(
     else:
         output.print(f"refined by the weights {weights or SHIPPED}")
     output.print(f"{out}: {percent(report.relabelled)} of the surface relabelled, {percent(report.filled)} filled")
-    if report.things is not None:
-        output.print(f"{report.things} separated pieces of things; `query {out} instances` leaves out the smallest")
     output.json(asdict(report) | {"weights": result.weights, "out": str(out)})

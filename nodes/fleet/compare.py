@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import bootstrap, false_discovery_control, t
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.bootstrap import miou_of_sums
+from semantic_mapper.evaluation.metrics import miou_of_sums
 from semantic_mapper.nodes.fleet.store import Failure, Store, TaskResult
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-import numpy as np
 
 from semantic_mapper.config import (
     Config,
@@ -22,8 +21,7 @@ from semantic_mapper.config import (
     parse_assignments,
     read_toml,
 )
-from semantic_mapper.evaluation.bootstrap import class_sums
-from semantic_mapper.evaluation.segments import Segments
+from semantic_mapper.evaluation.metrics import Segments, class_sums
 from semantic_mapper.files import write_json
 from semantic_mapper.nodes.fleet.store import Event, Findings, MethodScores
 from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
@@ -252,7 +250,7 @@ def _scores(method: str, iou: dict[str, float | None], segments: Segments | None
     if segments is None:
         return MethodScores(method, iou)
     parts = segments.all()
-    sums = [class_sums(np.asarray(part.confusion.counts, np.float64)[None])[0].astype(np.int64) for part in parts]
+    sums = [class_sums(part.confusion.counts) for part in parts]
     return MethodScores(
         method,
         iou,

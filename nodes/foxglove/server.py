@@ -23,7 +23,7 @@ from semantic_mapper.nodes.foxglove.scene import WORLD, camera_frame, draw_graph
 from semantic_mapper.nodes.foxglove.sdk import channels, foxglove, messages
 from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import SceneGraph
-from semantic_mapper.replay.exporters.camera_path import CameraPath
+from semantic_mapper.replay.exporters.base import CameraPath
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.files.map_saving import MapSaving
+from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.publishing import PartStatus
 
@@ -68,8 +68,8 @@ class Autosave:
             return
         self._begun = time.monotonic()
         self._begins = min(self._begins + 1, 30)
-        saving = self._map.begin_save()
-        self._thread = threading.Thread(target=self._save, args=(saving, version), name="autosave", daemon=True)
+        snapshot = self._map.snapshot()
+        self._thread = threading.Thread(target=self._save, args=(snapshot, version), name="autosave", daemon=True)
         self._thread.start()
 
     def end(self, why: str) -> None:
@@ -84,7 +84,7 @@ class Autosave:
         if self._thread is not None:
             self._thread.join()
 
-    def _save(self, saving: MapSaving, version: int) -> None:
+    def _save(self, snapshot: MapSnapshot, version: int) -> None:
         worked_since = time.monotonic()
 
         def rest() -> None:
@@ -94,7 +94,7 @@ class Autosave:
             worked_since = time.monotonic()
 
         try:
-            saving.write(self._path, rest)
+            snapshot.write(self._path, rest)
         except _GivenUpError:
             _log.info("autosave_given_up", reason="the mapper ends")
         except MapError as error:

@@ -63,7 +63,7 @@ class LiveCorrection:
         return PartStatus(counters, failed)
 
     def begin(self, request: CorrectPosesRequest) -> Correction:
-        """Begin a correction, unless this very request has done so before; see ``MappingPipeline.correct_poses``.
+        """Begin a correction, unless this very request has done so before; see ``MapCorrector.start``.
 
         Raises:
             CodecError: arrays that do not go together.
@@ -135,7 +135,7 @@ class LiveCorrection:
         known = self._pipeline.corrector.poses()
         stamps = {stamp_ns for _, stamp_ns in known}
         used = sum((key in known) if isinstance(key, tuple) else (key in stamps) for key in poses)
-        self._pipeline.correct_poses(poses, until_ns=request.until_ns)
+        self._pipeline.corrector.start(poses, until_ns=request.until_ns)
         return used, len(request.stamps_ns) - used
 
     def _to_frames(self, request: CorrectPosesRequest) -> CorrectedPoses:
@@ -180,7 +180,7 @@ class LiveCorrection:
 
     def _advance(self, frames: int) -> None:
         try:
-            self._pipeline.advance_correction(frames)
+            self._pipeline.corrector.advance(frames)
         except MapError as error:  # given up and kept as ``failure``; mapping continues
             _log.warning("map_stays_uncorrected", reason=str(error))
 

@@ -20,7 +20,7 @@ from semantic_mapper.nodes.options import NodeJob, RecorderOptions
 from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.log.mcap_scan import read_payloads, scan_end
+from semantic_mapper.replay.log.mcap_scan import read_payloads, scan
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.recording import Recording, RecordingRules, make_way
 from semantic_mapper.replay.log.sequence import parts_on_disk
@@ -38,7 +38,7 @@ MAX_EARLY = 1000  # messages kept while no stream has begun
 STATUS_PERIOD_S = 1.0
 DRAIN_S = 5.0  # after a stop, for what has come before it; less than the `stop_s` of launches
 COUNT_S = 1.0  # then, for counting what is left
-END_BYTES = 1 << 24  # of a log, in which the last frame of each camera is looked for
+LAST_MESSAGES = 100  # of a log, in which the last frame of each camera is looked for
 DRAINED_S = 0.005  # nothing for so long: all is written; what a camera that runs on sends comes later
 NOTE = "recording"  # the name of the recording, for the process that replaces this one
 
@@ -319,9 +319,9 @@ def _last_frames(path: Path) -> dict[str, int]:
     """
     found: dict[str, int] = {}
     for part in reversed(parts_on_disk(path).values()):
-        with part.open("rb") as file:
-            for offset, length in scan_end(file.fileno(), END_BYTES).chunks:
-                with suppress(LogError, CodecError):  # cut off
+        with suppress(LogError), part.open("rb") as file:  # not even its head was written
+            for offset, length in scan(file.fileno(), str(part)).chunks[-LAST_MESSAGES:]:
+                with suppress(LogError, CodecError):  # damaged
                     envelopes = map(read_envelope, map(unpack_parts, read_payloads(file.fileno(), offset, length)))
                     found |= {e.source: e.seq for e in envelopes if e.topic == "frame"}
         if found:

@@ -10,10 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.evaluation.metrics import map_miou
-from semantic_mapper.labels import LabelSet
+from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.mapping.map_scale import require_metres
-from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float32
@@ -50,7 +48,7 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
     if not len(points.xyz):
         raise MapError(f"{folder / 'map.npz'}: the map is empty")
     distance = _distance_to_mesh(points.xyz, vertices, faces)
-    nearest, _ = cKDTree(points.xyz).query(vertices, workers=-1)
+    nearest, index = cKDTree(points.xyz).query(vertices, workers=-1)
     found: dict[str, Any] = {
         "median_m": round(float(np.median(distance)), 5),
         "p95_m": round(float(np.percentile(distance, 95)), 4),
@@ -60,7 +58,10 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
         "mesh_miou": None,
     }
     if label is not None:
-        found["mesh_miou"] = _label_score(vertices, label, points, voxel_map.label_set)
+        labels = voxel_map.label_set
+        truth = np.where(np.isin(label, labels.ids), label, labels.ignore_id).astype(np.uint8)
+        mapped = np.where(nearest < NEAR_M, points.label[index], np.uint8(labels.ignore_id))
+        found["mesh_miou"] = confusion_of(truth, mapped, labels, str(mesh)).metrics().miou
     return found
 
 
@@ -69,9 +70,3 @@ def _distance_to_mesh(xyz: Float32, vertices: Float32, faces: Any) -> Float32:
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces.astype(np.uint32)))
     return scene.compute_distance(o3d.core.Tensor(np.ascontiguousarray(xyz))).numpy()
-
-
-def _label_score(vertices: Float32, label: Any, points: MapPoints, label_set: LabelSet) -> float | None:
-    known = np.isin(label, label_set.ids)
-    truth = np.where(known, label, label_set.ignore_id).astype(np.uint8)
-    return map_miou(vertices, truth, points.xyz, points.label, label_set, max_distance_m=NEAR_M)

@@ -14,9 +14,8 @@ from torch.nn import functional
 
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import FrameError, LabelError
-from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, confusion_of
+from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, Segments, confusion_of
 from semantic_mapper.evaluation.panoptic import PanopticImage
-from semantic_mapper.evaluation.segments import Segments
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
@@ -226,7 +225,7 @@ def _panoptic(tell: ThingTeller, frame: PosedFrame, opinion: Opinion) -> Panopti
 def _of_confidence(scores: ConfidenceScores) -> dict[str, float | None]:
     sure, right = scores.above(SURE)
     auroc = scores.open_set_auroc
-    return {"ece": scores.calibration.ece, "sure": sure, "sure_right": right, "open_set_auroc": auroc}
+    return {"ece": scores.calibration_error, "sure": sure, "sure_right": right, "open_set_auroc": auroc}
 
 
 def _with_current_view(config: MapperConfig, use: bool) -> MapperConfig:

@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.table import Table
 
-from semantic_mapper.replay.page import Section, class_sections, picture_files, stage_sections, table_of, write_page
-from semantic_mapper.replay.summary import dig, notes, percent, summary_table
+from semantic_mapper.replay.page import Section, picture_files, stage_sections, table_of, write_page
+from semantic_mapper.replay.summary import notes, percent, summary_table
 
 
 def write_eval_report(
@@ -33,18 +33,13 @@ def write_eval_report(
     """
     sections: list[Section] = []
     if summaries:
-        scores = {name: dig(s, "metrics.per_class") or {} for name, s in summaries.items()}
-        sections += [Section(tables=[summary_table(summaries)]), *stage_sections(summaries), *class_sections(scores)]
+        sections += [Section(tables=[summary_table(summaries)]), *stage_sections(summaries)]
     for (name, summary), folder in zip(summaries.items(), folders, strict=True):
         pictures = list(picture_files((folder / "overview.png", f"{name}: frames and map")))
         settings = {"Settings that were in force": json.dumps(summary.get("config"), indent=1)}
         sections.append(Section(name, notes(summary), pictures=pictures, folded=settings))
     for log, table in logs.items():
-        methods = found["logs"][log]["methods"]
-        sections += [
-            Section(Path(log).name, found["logs"][log]["notes"], tables=[table]),
-            *class_sections({n: m["per_class"] for n, m in methods.items()}),
-        ]
+        sections.append(Section(Path(log).name, found["logs"][log]["notes"], tables=[table]))
     if found.get("surface"):
         rows = [
             (

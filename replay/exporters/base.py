@@ -1,4 +1,4 @@
-"""What all exporters of logs fraction: the frame they get, and files that are there only once they are whole."""
+"""What exporters share: the frame that they get, formats of numbers, the way of a camera."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import encode_rgb
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
+
+MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,3 +87,21 @@ def quaternion(T_a_b: Float64) -> Float64:
 def seconds(stamp_ns: int) -> str:
     """Nanoseconds as seconds with nine places, exactly."""
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+
+
+class CameraPath:
+    """A bounded, evenly spread sample of a camera's poses, whatever their number. One thread adds; any may read."""
+
+    def __init__(self) -> None:
+        self.poses: list[Float64] = []
+        self._seen = -1
+        self._stride = 1
+
+    def add(self, T_world_camera: Float64) -> None:
+        """The next pose (4, 4)."""
+        self._seen += 1
+        if self._seen % self._stride == 0:
+            self.poses.append(T_world_camera.copy())
+        if len(self.poses) > MAX_PATH:
+            self.poses = self.poses[::2]
+            self._stride *= 2

@@ -13,12 +13,13 @@ import msgspec
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import open_regular
-from semantic_mapper.replay.log.mcap_scan import Scan, payload_heads, read_attachment, read_payloads, scan
+from semantic_mapper.replay.log.mcap_scan import Scan, read_attachment, read_payloads, scan
 from semantic_mapper.transport.codec import Envelope, decode_as, read_envelope, unpack_parts
 from semantic_mapper.transport.messages import StreamInfo, parse_topic
 from semantic_mapper.types import PosedFrame
 
 INFO_ATTACHMENT = "stream_info"
+HEAD_BYTES = 128  # of a message, which tell its topic
 MAX_INFOS = 1024  # messages that describe a stream; a recording has one a camera and restart
 
 
@@ -49,7 +50,7 @@ class _Entry:
 
 
 class LogReader:
-    """A recorded log, open for reading; a ``FrameSource``. Iterate it as often as you like, also from several threads.
+    """A recorded log, open for reading. Iterate it as often as you like, also from several threads.
 
     A message that is damaged or cannot be decoded becomes a ``LogError`` in ``errors`` (each once) and goes to
     ``on_error``; iteration goes on with the next. A message whose checksum is wrong is never used.
@@ -170,7 +171,11 @@ class LogReader:
     def _make_index(self, found: Scan) -> list[_Entry]:
         entries: list[_Entry] = []
         for offset, length in found.chunks:
-            topics = [_topic_name(head) for head in payload_heads(self._file.fileno(), offset, length)]
+            try:
+                heads = read_payloads(self._file.fileno(), offset, length, HEAD_BYTES)
+            except LogError:  # reported when its turn comes
+                heads = []
+            topics = [_topic_name(head) for head in heads]
             if not any(topics):
                 topics = [""]  # nothing of ours in it: reported once
             entries += [
@@ -221,15 +226,10 @@ class LogReader:
         )
 
     def _report_damages(self, found: Scan) -> None:
-        for damage in found.damages:
-            before = bisect_left(self._index, damage.offset, key=lambda entry: entry.offset)
-            frames = bisect_left(self._frames, before)
-            self._report(
-                LogError(
-                    f"{self.path}: bytes {damage.offset} to {damage.end}, after message {before - 1} (frame "
-                    f"{frames - 1}): {damage.reason}; passed over"
-                )
-            )
+        if found.damaged_from is not None:
+            offset, reason = found.damaged_from
+            after = f"after message {len(self._index) - 1} (frame {len(self._frames) - 1})"
+            self._report(LogError(f"{self.path}: from byte {offset}, {after}: {reason}; what follows is passed over"))
         if not found.finished:
             self.notices.append(
                 f"{self.path} was not closed by its writer; the {len(self._frames)} frames that are whole are read. "

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from research.bench.walk import SETTLED_MINUTE
-from semantic_mapper.plots import Curve, Panel, draw_panels
+from research.plots import Curve, Panel, draw_panels
 from semantic_mapper.types import UInt8
 
 _WALK_PANELS = (

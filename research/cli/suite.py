@@ -13,6 +13,7 @@ from rich.table import Table
 
 from research.cli.suite_table import difference_lines, map_rows_table, rows_table, suite_table
 from research.evaluation.sheet import draw_sheet
+from research.plots import cannot_draw
 from research.scenes.suite import ROOMS_SUITE
 from research.suites.config import SuiteConfig, own_image_suite, settings_digest, suite_seeds
 from research.suites.entries import load_entries
@@ -43,7 +44,7 @@ from semantic_mapper.files import write_json
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.plots import cannot_draw, write_picture
+from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.page import Section, picture_files, write_page
 from semantic_mapper.replay.run_folder import prepare_file
 
@@ -342,6 +343,6 @@ def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures:
     Raises:
         ConfigError: it cannot be written.
     """
-    figures = Section(tables=[table], lines=lines)
+    figures = Section(notes=lines, tables=[table])
     drawn = Section(pictures=list(picture_files(*((path, path.name) for path in pictures))))
     write_page(path, found["title"], [figures, drawn, Section(folded={"All figures": json.dumps(found, indent=1)})])

@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from research.evaluation.instances import FoundInstances, match_instances
+from research.evaluation.points import nearest_labels, nearest_points
 from research.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, render_view, room_frames
 from research.suites.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
 from research.suites.records import InstanceRecord, MapRecord
@@ -19,14 +21,10 @@ from research.suites.scoring import as_calibration, as_panoptic, as_rows
 from research.train.computed_depth import DELAY_FRAMES
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import MapError
-from semantic_mapper.evaluation.instances import FoundInstances, match_instances
 from semantic_mapper.evaluation.metrics import (
     ConfusionMatrix,
+    ImageMeans,
     confusion_of,
-    map_confusion,
-    metrics_per_image,
-    nearest_labels,
-    nearest_points,
 )
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
 from semantic_mapper.fields.nesf import NesfWeights
@@ -184,8 +182,13 @@ def _compare(room: FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, s
         raise MapError(f"room {scene.seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
     label = in_rooms(points.label, voxel_map.label_set)
     truth = nearest_labels(points.xyz, surface.xyz, surface.label, ROOMS, max_distance_m=NEAR_M)
-    at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
+    at_surface = confusion_of(
+        surface.label, nearest_labels(surface.xyz, points.xyz, label, ROOMS, max_distance_m=NEAR_M), ROOMS, "map"
+    )
     rendered = [confusion_of(v.truth, v.label, ROOMS, f"room {scene.seed}") for v in views]
+    means = ImageMeans()
+    for image in rendered:
+        means.add(image)
     camera = camera_of_width(MAP_WIDTH)
     casts = [voxel_map.ray_cast(view.T_world_camera, camera) for view in views]
     cast, cast_views = _seen_from_its_frames(casts, voxel_map.label_set, views)
@@ -202,7 +205,7 @@ def _compare(room: FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, s
         confusion=as_rows(confusion_of(truth, label, ROOMS, "map")),
         surface_confusion=as_rows(at_surface),
         view_confusion=as_rows(sum(rendered, ConfusionMatrix(ROOMS))),
-        view_miou=metrics_per_image(rendered).miou,
+        view_miou=means.metrics().miou,
         cast_confusion=as_rows(cast),
         cast_view_confusion=as_rows(cast_views),
         seen_confusion=as_rows(confusion_of(seen, label, ROOMS, "map")),

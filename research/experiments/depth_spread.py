@@ -1,4 +1,4 @@
-"""Fits the spread of computed depth to rooms of training seeds: the factors in depth_from_motion/spread.py.
+"""Fits the spread of computed depth to rooms of training seeds: the factors in depth_from_motion/estimate.py.
 
 Example: python -m research.experiments.depth_spread --rooms 10
 """
@@ -17,10 +17,17 @@ import torch
 from research.experiments.motion_depth import Walk, room_walk
 from research.scenes import TRAIN_SEEDS
 from semantic_mapper.config import DepthFromMotionConfig
-from semantic_mapper.depth_from_motion.agreement import Agreement, find_agreement
-from semantic_mapper.depth_from_motion.smooth import smooth_planes
-from semantic_mapper.depth_from_motion.sources import choose_sources
-from semantic_mapper.depth_from_motion.spread import LEAST, MOST, match_terms, spread_of_match, surface_terms
+from semantic_mapper.depth_from_motion.estimate import (
+    LEAST,
+    MOST,
+    Agreement,
+    find_agreement,
+    match_terms,
+    smooth_planes,
+    spread_of_match,
+    surface_terms,
+)
+from semantic_mapper.depth_from_motion.stream import choose_sources
 from semantic_mapper.depth_from_motion.sweep import SweepResult, inverse_depths, sweep_and_match
 from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView, prepare_view
 from semantic_mapper.types import Float32, UInt8

@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -17,7 +16,7 @@ import pytest
 from research.experiments.fault_table import Outcome
 from research.experiments.long_log import INTRINSICS, distinct_frames
 from semantic_mapper.config import load_mapper_config
-from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses.config import DevicePoses, FixedPose
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses
@@ -62,30 +61,19 @@ def unplugged_cameras(rounds: int) -> Iterator[Outcome]:
                 )
 
 
-class _ListCamera:
+class _ListCamera(Camera):
     """Gives images of a list; its device tracks itself."""
 
-    warnings: tuple[str, ...] = ()
-    can_wait = False
-    last_poll_time = 0.0
-    info = StreamInfo("scrambled", {"rooms": INTRINSICS}, ROOMS)
-
     def __init__(self, images: Iterable[CameraImage]) -> None:
+        super().__init__("rooms")
         self._images = list(images)
+        self._info = StreamInfo("scrambled", {"rooms": INTRINSICS}, ROOMS)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
-
     def __iter__(self) -> Iterator[CameraImage]:
         return iter(self._images)
-
-    def stop(self) -> None:
-        """Nothing to stop."""
 
 
 def scrambled_streams(weights: str, config: str, rounds: int) -> Iterator[Outcome]:

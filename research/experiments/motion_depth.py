@@ -22,12 +22,10 @@ import torch
 from research.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig
 from research.scenes.sequence import room_views
 from semantic_mapper.config import DepthFromMotionConfig, convert_config, read_toml
-from semantic_mapper.depth_from_motion.enlarge import enlarge_estimate
 from semantic_mapper.depth_from_motion.estimate import estimate_depth
-from semantic_mapper.depth_from_motion.sources import choose_sources
-from semantic_mapper.depth_from_motion.stream import DepthFromMotion
+from semantic_mapper.depth_from_motion.stream import DepthFromMotion, choose_sources
 from semantic_mapper.depth_from_motion.sweep import inverse_depths, sweep_and_match
-from semantic_mapper.depth_from_motion.views import prepare_view
+from semantic_mapper.depth_from_motion.views import enlarge_estimate, prepare_view
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame, UInt8

@@ -32,7 +32,6 @@ from research.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig, RoomConfi
 from research.scenes.moving import make_moving_room, moving_views
 from research.scenes.primitives import PERSON
 from semantic_mapper.config import MapperConfig, convert_config
-from semantic_mapper.evaluation.splat import draw_points, from_above
 from semantic_mapper.evaluation.upright import camera_up, upright_rotation
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.geometry import transform, unproject
@@ -41,6 +40,7 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.overview import draw_points, from_above
 from semantic_mapper.types import (
     Bool,
     CameraIntrinsics,

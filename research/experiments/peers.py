@@ -42,7 +42,6 @@ class Run:
         images: Trained on single images, not on rays.
         fraction: Of the recipe's steps.
         encoder_rate: Other than the recipe's; 0 = the recipe's.
-        settings: Of the field, other than the default ones; the encoder's are not among them.
     """
 
     kind: str
@@ -51,7 +50,6 @@ class Run:
     images: bool = False
     fraction: float = 1.0
     encoder_rate: float = 0.0
-    settings: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ RUNS = {
     "sray-colours": Run("sray", depth=False, encoder="unet"),
     "neuray-depth": Run("neuray", depth=True, encoder="unet-depth"),
     "mvsnerf-depth": Run("mvsnerf", depth=True, encoder="unet-depth", encoder_rate=1.0),
-    "sray-paper": Run("sray-paper", depth=True, encoder="unet-depth", settings={"occlusion": False}),
+    "sray-paper": Run("sray-paper", depth=True, encoder="unet-depth"),
 }
 
 
@@ -106,7 +104,7 @@ def recipe(name: str, budget: Budget) -> str:
     plain |= {"kind": run.kind, "seed": budget.seed, "steps": steps}
     if run.encoder_rate:
         plain["encoder_rate"] = run.encoder_rate
-    plain["field"] = run.settings | {"encoder": {"depth": run.depth} | budget.encoder}
+    plain["field"] = {"encoder": {"depth": run.depth} | budget.encoder}
     return "\n".join(_lines(plain, "")) + "\n"
 
 

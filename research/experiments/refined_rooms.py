@@ -15,14 +15,15 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from research.evaluation.bootstrap import paired_bootstrap
+from research.evaluation.instances import InstanceMatch, InstanceMatches, average_precision
+from research.evaluation.points import nearest_points
 from research.evaluation.room_map import NEAR_M, UP, TrueSurface, compare_instances, fuse_room, in_rooms
 from research.suites.config import SuiteConfig, settings_digest, suite_seeds
 from research.suites.records import CalibrationRecord, InstanceRecord, Rows
 from research.suites.scoring import as_calibration, as_rows, from_rows
 from semantic_mapper.config import Config
-from semantic_mapper.evaluation.bootstrap import paired_bootstrap
-from semantic_mapper.evaluation.instances import InstanceMatch, InstanceMatches, average_precision
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_of_bins, confusion_of, nearest_points
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_error, confusion_of
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, find_checkpoint
 from semantic_mapper.fields.nesf import NesfWeights, load_nesf, smoothed_votes
 from semantic_mapper.labels import ROOMS
@@ -87,7 +88,7 @@ def show(name: str, scored: Sequence[Scored], plain: Sequence[Scored]) -> None:
     calibration = [
         np.sum([getattr(s.calibration, key) for s in scored], axis=0) for key in CalibrationRecord.__struct_fields__
     ]
-    ece = calibration_of_bins(*calibration).ece
+    ece = calibration_error(*calibration)
     ap = average_precision([_matches(s) for s in scored], ROOMS)
     print(
         f"{name}, {len(scored)} rooms: mIoU of points {100 * found[0]:.1f}, true surface {100 * found[1]:.1f}, ECE "

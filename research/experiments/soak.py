@@ -25,7 +25,8 @@ import numpy as np
 
 from research.experiments.live_launch import NODES, PATIENCE_S, LiveLaunch
 from research.experiments.long_log import write_long_log
-from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
+from research.plots import Curve, Panel, draw_panels
+from semantic_mapper.plots import write_picture
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import Float64

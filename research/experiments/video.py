@@ -25,6 +25,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from research.plots import draw_paths
 from research.scenes.camera import camera_path
 from research.scenes.config import CameraPathConfig, NoiseConfig
 from research.scenes.render import render_view
@@ -32,7 +33,7 @@ from research.scenes.room import make_room
 from research.scenes.shots import sequence_shots
 from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import interpolate_pose, transform
-from semantic_mapper.plots import draw_paths, write_picture
+from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.importers import ImportOptions
 from semantic_mapper.replay.importers.folder import FolderRecording
 from semantic_mapper.replay.log.format import atomic_log

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from research.evaluation.bootstrap import miou_of_counts
 from research.suites.aerial import AGREEMENT, DARK, DAY, FIT, LOW
 from research.suites.aerial_arms import BRIDGE, ROOF
 from research.suites.claims import Claim, Measure, miou_measure
-from semantic_mapper.evaluation.bootstrap import miou_of_counts
 from semantic_mapper.types import Float64
 
 

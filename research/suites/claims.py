@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.evaluation.bootstrap import miou_of_counts
+from research.evaluation.bootstrap import miou_of_counts
 from semantic_mapper.types import Float64
 
 RESAMPLES = 2000

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from research.evaluation.bootstrap import paired_bootstrap
 from research.evaluation.consistency import Agreement
 from research.evaluation.depth_error import DepthErrors
+from research.evaluation.instances import InstanceMatch, InstanceMatches, average_precision
+from research.plots import Curve, Panel, draw_panels
 from research.scenes.suite import ROOMS_SUITE
 from research.suites.records import BaselineRecord, CurvePoint, ImageRecord, MapRecord, RoomRecord
 from research.suites.scoring import as_counts, from_rows
-from semantic_mapper.evaluation.bootstrap import paired_bootstrap
-from semantic_mapper.evaluation.instances import InstanceMatch, InstanceMatches, average_precision
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_of_bins
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_error
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticMetrics
-from semantic_mapper.plots import Curve, Panel, draw_panels
 from semantic_mapper.types import UInt8
 
 ONE_ROOM = "no interval: a bootstrap needs at least 2 rooms"
@@ -239,7 +239,7 @@ def _ece(records: Sequence[RoomRecord] | Sequence[MapRecord] | Sequence[Baseline
     count = np.array([r.calibration.count for r in records], np.int64)
     confidence = np.array([r.calibration.confidence for r in records], np.float64)
     right = np.array([r.calibration.right for r in records], np.float64)
-    return calibration_of_bins(count.sum(axis=0), confidence.sum(axis=0), right.sum(axis=0)).ece
+    return calibration_error(count.sum(axis=0), confidence.sum(axis=0), right.sum(axis=0))
 
 
 def _surest(records: Sequence[RoomRecord]) -> dict[str, float | None]:

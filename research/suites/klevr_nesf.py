@@ -39,7 +39,7 @@ from research.suites.klevr import (
     train_seeds,
 )
 from research.suites.klevr_grids import NEAR_M, KlevrGridConfig, SceneDensity, grid_digest, scene_densities
-from research.suites.plateau import PLATEAU, fit_to_plateau
+from research.suites.plateau import fit_to_plateau
 from research.train.grid_nesf import (
     GridNesfTraining,
     LabelledScene,
@@ -192,18 +192,6 @@ def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, 
     write_bytes(path.with_suffix(".json"), msgspec.json.encode(curve))
     write_bytes(path, save(model.state_dict()))
     return model
-
-
-def nesf_curve(config: KlevrConfig, name: str, folder: Path) -> list[TrainingPoint]:
-    """How the kept network of an arm was trained, that with the most steps before its plateau; empty without one."""
-    own, training = arm_settings(config, name)
-    found: list[TrainingPoint] = []
-    for k in range(config.doublings + 1):
-        settings = msgspec.structs.replace(training, steps=training.steps << k)
-        found = read_curve(own, settings, folder, NESF_ARMS[name]) or found
-        if found and abs(last_fifth(found)) < PLATEAU:
-            break
-    return found
 
 
 def read_curve(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> list[TrainingPoint]:

@@ -25,11 +25,12 @@ from research.suites.records import (
 )
 from research.suites.rooms import BenchmarkRoom
 from research.suites.views import Sources
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration, confusion_of
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
 from semantic_mapper.evaluation.panoptic import PanopticCounts
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, UInt8
 
+CONFIDENCE_BINS = 15
 BORDER_PX = 2  # pixels at most this far from another label are not interior
 
 
@@ -131,13 +132,10 @@ def _calibration(room: BenchmarkRoom, predictions: Mapping[int, Prediction | Bas
 
 def as_calibration(confidence: Float32, right: NDArray[np.bool_]) -> CalibrationRecord:
     """Sums by bin of the confidence (N,) of answers that are right or not (N,)."""
-    found = calibration(confidence, right)
-    count = found.count.astype(np.float64)
-    return CalibrationRecord(
-        count=tuple(int(n) for n in found.count),
-        confidence=tuple(float(x) for x in np.nan_to_num(found.confidence) * count),
-        right=tuple(float(x) for x in np.nan_to_num(found.accuracy) * count),
-    )
+    index = np.clip(np.ceil(confidence.astype(np.float64) * CONFIDENCE_BINS).astype(np.int64) - 1, 0, None)
+    sums = (np.bincount(index, weights, CONFIDENCE_BINS).tolist() for weights in (None, confidence, right))
+    count, of_confidence, of_right = map(tuple, sums)
+    return CalibrationRecord(count=count, confidence=of_confidence, right=of_right)
 
 
 def room_agreement(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> Agreement:

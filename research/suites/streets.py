@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from research.evaluation.points import nearest_points
 from research.scenes.sequence import RoomView
 from research.scenes.streets.boxes import THINGS, StreetBox, street_boxes
 from research.scenes.streets.layout import IGNORED
@@ -38,7 +39,7 @@ from research.suites.store import RecordStore
 from research.train.label_transfer import Transferred, box_crf, nearest_labels
 from semantic_mapper.config import AtLeastOne, Config, Fraction, NotNegative, Positive, to_plain
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, nearest_points
+from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
 from semantic_mapper.fields.scene.boxes import PrimitiveSet
 from semantic_mapper.fields.scene.primitives import Primitive, ShapeName

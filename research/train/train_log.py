@@ -11,9 +11,10 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Self
 
+from research.plots import Curve, Panel, cannot_draw, draw_panels
 from semantic_mapper.files import open_unlinked, write_bytes
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.plots import Curve, Panel, cannot_draw, draw_panels, write_picture
+from semantic_mapper.plots import write_picture
 from semantic_mapper.types import UInt8
 
 HISTORY_FILE = "history.jsonl"

@@ -1,18 +1,56 @@
-"""Depth of one view from several others."""
+"""Depth of one view from several others: matched, compared with its neighbours' depth, smoothed; and how sure it is.
+
+Spreads, in planes of the sweep, are the exponential of a sum of terms, whose factors
+`research.experiments.depth_spread` fits so that 68 % of the errors are within one spread: rooms of training seeds,
+every second with poses that are off by 0.06 degrees and 1.5 mm.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.config import DepthFromMotionConfig
-from semantic_mapper.depth_from_motion.agreement import find_agreement
-from semantic_mapper.depth_from_motion.smooth import smooth_planes
-from semantic_mapper.depth_from_motion.spread import spread_of_match, spread_of_surface
-from semantic_mapper.depth_from_motion.sweep import inverse_depths, sweep_and_match
+from semantic_mapper.depth_from_motion.sweep import (
+    SweepResult,
+    inverse_depths,
+    relative_projections,
+    stack_images,
+    sweep_and_match,
+)
 from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView
-from semantic_mapper.geometry import expect_shape
+from semantic_mapper.kernels import kernel, parallel_kernel
+from semantic_mapper.types import Float32, Int64, UInt8
+
+TOLERANCE = 0.04  # fraction of the depth by which two estimates of one surface may differ
+
+TIE = 8.0  # between pixels of one colour, where a pixel that is sure to a plane counts 1
+COLOUR_SCALE = 10.0  # 8-bit steps, by which a tie falls by a factor of e
+LEAST_TIE = 0.01  # fraction of it at the strongest edge
+OUTLIER = 2.0  # times its spread, by which a pixel may be off before it counts less
+ROUNDS, ITERATIONS, RELAXATION = 3, 50, 1.9
+
+MATCHED = (-0.19, -0.66, -0.47, 0.32, 0.09, -0.63)  # factors of the terms of a spread
+SMOOTHED = (0.02, 0.04, 0.94, 0.33, 0.19, 0.24)
+LEAST, MOST = 0.1, 40.0  # planes
+AROUND = 9  # pixels a side in which other pixels support one
+
+
+class Agreement(NamedTuple):
+    """What neighbours say of a depth image.
+
+    Args:
+        agree, visible: (h, w) uint8 neighbours whose depth agrees; that have a depth there.
+        mean_m: (h, w) float32 depth averaged with those that agree, in inverse depth; 0 = none.
+    """
+
+    agree: UInt8
+    visible: UInt8
+    mean_m: Float32
 
 
 def estimate_depth(
@@ -27,19 +65,10 @@ def estimate_depth(
     What is not sure is filled from what is, along the surfaces that the image shows.
 
     Args:
-        sources: Views with some way between, see ``choose_sources``; without any there is no depth.
+        sources: Views with some way between, at least one; see ``choose_sources``.
         hint: Depth of the reference as a map has it, at the reference's size. Breaks ties of the pictures.
         neighbours: Views whose ``estimate`` is compared: agreement makes a depth surer and more exact.
-
-    Raises:
-        ShapeError: a hint of another size.
     """
-    size = reference.gray.shape
-    if hint is not None:
-        expect_shape(hint.depth_m, f"{size[0]} {size[1]}", "hint depth")
-        expect_shape(hint.sigma_m, f"{size[0]} {size[1]}", "hint sigma")
-    if not sources:
-        return no_depth(size)
     inverse_depth = inverse_depths(config.planes, config.near_m, config.far_m)
     swept = sweep_and_match(reference, sources, inverse_depth, hint)
     first, step = float(inverse_depth[0]), float(inverse_depth[1] - inverse_depth[0])
@@ -49,10 +78,127 @@ def estimate_depth(
     matched = spread_of_match(swept, agreement)
     surface = np.clip(smooth_planes(plane, matched, reference.rgb), 0, config.planes - 1)
     depth = (1 / (first + surface * step)).astype(np.float32)
-    sigma = spread_of_surface(plane, surface, matched, agreement, depth)
+    sigma = _spread(surface_terms(plane, surface, matched, agreement, depth), SMOOTHED)
     return DepthEstimate(depth, (depth**2 * step * sigma).astype(np.float32))
 
 
-def no_depth(size: tuple[int, int]) -> DepthEstimate:
-    """No depth at all, for an image of ``size``."""
-    return DepthEstimate(np.zeros(size, np.float32), np.zeros(size, np.float32))
+def find_agreement(reference: PreparedView, depth_m: Float32, neighbours: Sequence[PreparedView]) -> Agreement:
+    """Compare ``depth_m`` (h, w) of a view with the depths that were estimated for others."""
+    known = [(n, n.estimate) for n in neighbours if n.estimate is not None]
+    ways = relative_projections(reference, [(n.intrinsics, n.T_world_camera) for n, _ in known])
+    depths = stack_images([estimate.depth_m for _, estimate in known], np.float32)
+    shape = depth_m.shape
+    found = Agreement(np.empty(shape, np.uint8), np.empty(shape, np.uint8), np.empty(shape, np.float32))
+    count_agreement(len(depth_m), depth_m, *depths, *ways, *found, TOLERANCE)
+    return found
+
+
+def smooth_planes(plane: Float32, sigma: Float32, rgb: UInt8) -> Float32:
+    """A membrane (h, w) through what matching is sure of, in planes of the sweep, that tears at edges of the image.
+
+    A membrane of inverse depth is plane where the surface is: plain walls take the plane of what surrounds them.
+
+    Args:
+        plane: (h, w) best plane; sigma: (h, w) its spread, in planes.
+        rgb: (h, w, 3) uint8.
+    """
+    right, below = np.zeros_like(plane), np.zeros_like(plane)
+    right[:, :-1], below[:-1] = _ties(rgb[:, 1:], rgb[:, :-1]), _ties(rgb[1:], rgb[:-1])
+    sure = 1 / np.maximum(sigma, 0.1) ** 2
+    weight, out = sure.astype(np.float32), plane.copy()
+    for _ in range(ROUNDS):
+        relax_membrane(plane, weight, right, below, out, ITERATIONS, RELAXATION)
+        off = (plane - out) / (OUTLIER * sigma)
+        weight = (sure / (1 + off**2)).astype(np.float32)
+    return out
+
+
+def _ties(one: UInt8, other: UInt8) -> Float32:
+    step = np.abs(one.astype(np.float32) - other.astype(np.float32)).max(axis=2)
+    return (TIE * np.maximum(np.exp(-step / COLOUR_SCALE), LEAST_TIE)).astype(np.float32)
+
+
+def spread_of_match(swept: SweepResult, agreement: Agreement) -> Float32:
+    """Spread (h, w) in planes of what was matched."""
+    return _spread(match_terms(swept, agreement), MATCHED)
+
+
+def match_terms(swept: SweepResult, agreement: Agreement) -> Float32:
+    """Terms (h, w, 6) that the logarithm of ``spread_of_match`` is a sum of."""
+    agree, visible = agreement.agree.astype(np.float32), agreement.visible.astype(np.float32)
+    return _stack(
+        np.ones_like(agree),
+        np.log(swept.confidence + 0.02),
+        np.log1p(agree),
+        (visible - agree) / 6,
+        (swept.seen < 2).astype(np.float32),
+        np.log(agreement.mean_m),
+    )
+
+
+def surface_terms(plane: Float32, smooth: Float32, sigma: Float32, agreement: Agreement, depth_m: Float32) -> Float32:
+    """Terms (h, w, 6) that the logarithm of the spread of a surface is a sum of.
+
+    Args:
+        plane, smooth: (h, w) planes as matched, and of the surface that was laid through them.
+        sigma: (h, w) of ``spread_of_match``.
+        depth_m: (h, w) of the surface.
+    """
+    around = cv2.blur(1 / sigma**2, (AROUND, AROUND)) ** -0.5
+    return _stack(
+        np.ones_like(sigma),
+        np.log(sigma),
+        np.log(around),
+        np.log(np.abs(plane - smooth) + 0.1),
+        np.log1p(agreement.agree.astype(np.float32)),
+        np.log(depth_m),
+    )
+
+
+def _stack(*terms: NDArray[np.floating]) -> Float32:
+    return np.stack(terms, axis=-1).astype(np.float32, copy=False)
+
+
+def _spread(terms: Float32, factors: tuple[float, ...]) -> Float32:
+    return np.clip(np.exp(terms @ np.array(factors, np.float32)), LEAST, MOST).astype(np.float32)
+
+
+@parallel_kernel()
+def count_agreement(
+    count: int,
+    depth: Float32,
+    neighbour_depth: Float32,
+    neighbour_size: Int64,
+    rotation: Float32,
+    translation: Float32,
+    agree: UInt8,
+    visible: UInt8,
+    mean: Float32,
+    tolerance: float,
+) -> None:
+    """Count neighbours whose depth agrees.
+
+    Args:
+        count: h, rows.
+        depth: (h, w) float32, 0 = none.
+        neighbour_depth: (n, H, W) float32, 0 = none; neighbour_size: (n, 2) int64 height and width.
+        rotation, translation: (n, 3, 3), (n, 3) of `relative_projections`.
+        agree, visible, mean: (h, w), written; see `Agreement`.
+        tolerance: Fraction of the depth.
+    """
+    ...
+
+
+@kernel
+def relax_membrane(
+    data: Float32, weight: Float32, right: Float32, below: Float32, out: Float32, iterations: int, relaxation: float
+) -> None:
+    """Minimise sum weight (out - data)^2 + sum tie (difference of neighbours)^2.
+
+    Args:
+        data, weight: (h, w) float32.
+        right, below: (h, w) ties to the pixel to the right, and below; those of the last column and row are not used.
+        out: (h, w) first guess, then the solution.
+        iterations: Of red-black over-relaxation by ``relaxation``.
+    """
+    ...

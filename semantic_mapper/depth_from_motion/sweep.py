@@ -21,6 +21,8 @@ UNSEEN_COST = 14
 # Of a plane far from the hint. More helps a right hint, but a wrong one then outweighs what the pictures show.
 HINT_COST = 3.0
 PATH_GROUPS = 3  # paths to the sides, down and up
+# P2 by the difference of gray: depth leaps where the image has an edge.
+_LARGE_STEPS = np.maximum(LARGE_STEP / (1 + np.arange(256) / EDGE_GRAY), 2 * SMALL_STEP).astype(np.int16)
 
 Int16 = NDArray[np.int16]
 UInt16 = NDArray[np.uint16]
@@ -64,26 +66,14 @@ def sweep_and_match(
     height, width = reference.gray.shape
     volume = (height, width, len(inverse_depth))
     cost, seen = np.empty(volume, np.uint8), np.empty((height, width), np.uint8)
-    rotation, translation = relative_projections(reference, [(s.intrinsics_double, s.T_world_camera) for s in sources])
-    stacked, sizes = stack_images([s.census for s in sources], np.int32)
-    planes_of_hint, rate = _hint_planes(hint, inverse_depth, (height, width))
-    sweep_planes(
-        height,
-        reference.census,
-        stacked,
-        sizes,
-        rotation,
-        translation,
-        inverse_depth,
-        planes_of_hint,
-        rate,
-        cost,
-        seen,
-        UNSEEN_COST,
-        HINT_COST,
-    )
+    ways = relative_projections(reference, [(s.intrinsics_double, s.T_world_camera) for s in sources])
+    stacked = stack_images([s.census for s in sources], np.int32)
+    hints = _hint_planes(hint, inverse_depth, (height, width))
+    census = reference.census
+    sweep_planes(height, census, *stacked, *ways, inverse_depth, *hints, cost, seen, UNSEEN_COST, HINT_COST)
     total = np.empty((PATH_GROUPS, *volume), np.uint16)
-    sum_paths(PATH_GROUPS, cost, reference.gray, _LARGE_STEPS, total, _path_buffer(width, volume[2]), SMALL_STEP)
+    states = np.empty((PATH_GROUPS, 2 * (6 * width + 1) * (volume[2] + 4)), np.uint8)
+    sum_paths(PATH_GROUPS, cost, reference.gray, _LARGE_STEPS, total, states, SMALL_STEP)
     plane, confidence, match = (np.empty((height, width), np.float32) for _ in range(3))
     pick_planes(height, total, cost, plane, confidence, match)
     return SweepResult(cost, total[0], plane, confidence, match, seen)
@@ -130,19 +120,6 @@ def _hint_planes(hint: DepthEstimate | None, inverse_depth: Float32, size: tuple
     return np.clip(plane, -1, len(inverse_depth) - 1).astype(np.float32), (1 / off).astype(np.float32)
 
 
-def _path_buffer(width: int, planes: int) -> UInt8:
-    return np.empty((PATH_GROUPS, 2 * (6 * width + 1) * (planes + 4)), np.uint8)
-
-
-def _large_steps() -> Int16:
-    """P2 by the difference of gray: depth leaps where the image has an edge."""
-    difference = np.arange(256)
-    return np.maximum(LARGE_STEP / (1 + difference / EDGE_GRAY), 2 * SMALL_STEP).astype(np.int16)
-
-
-_LARGE_STEPS = _large_steps()
-
-
 @parallel_kernel()
 def sweep_planes(
     count: int,
@@ -169,8 +146,7 @@ def sweep_planes(
         inverse_depth: (D,).
         hint, hint_rate: (h, w) plane, < 0 = none, and 1 / planes by which it may be off.
         cost, seen: (h, w, D) and (h, w) uint8, written.
-        unseen: Cost where no source sees a plane.
-        hint_cost: Of a plane far from the hint.
+        unseen, hint_cost: Cost where no source sees a plane, and of a plane far from the hint.
     """
     ...
 

@@ -1,4 +1,4 @@
-"""A frame prepared for matching: small images, their census, and the depth that was found for it."""
+"""From a frame to what is matched, small images and their census; and from the depth of these to that of the frame."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, PosedFrame, UInt8
+
+SAME_SURFACE = 0.05  # fraction of the depth by which neighbouring pixels of one surface differ at most
+COLOUR_RATE = 1 / (2 * 20.0**2)  # sigma of 20 8-bit steps
 
 
 class DepthEstimate(NamedTuple):
@@ -56,24 +59,20 @@ def prepare_view(frame: PosedFrame, width: int) -> PreparedView:
     The census is that of the image at twice the size, smoothed over 2x2 pixels: every second one is then a pixel of the
     working size, and sources are looked up at half pixels.
     """
-    intrinsics = working_intrinsics(frame.intrinsics, width)
-    double = scale_intrinsics(frame.intrinsics, 2 * intrinsics.width, 2 * intrinsics.height)
-    size = (double.width, double.height)
+    k = working_intrinsics(frame.intrinsics, width)
+    double = scale_intrinsics(frame.intrinsics, 2 * k.width, 2 * k.height)
     gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-    if size != (frame.intrinsics.width, frame.intrinsics.height):
-        larger = double.width > frame.intrinsics.width
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA)
+    if (double.width, double.height) != (frame.intrinsics.width, frame.intrinsics.height):
+        way = cv2.INTER_LINEAR if double.width > frame.intrinsics.width else cv2.INTER_AREA
+        gray = cv2.resize(gray, (double.width, double.height), interpolation=way)
     smooth = np.asarray(cv2.blur(gray, (2, 2), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE), np.uint8)
-    small = (intrinsics.width, intrinsics.height)
-    shrinks = intrinsics.width < frame.intrinsics.width
+    rgb = cv2.resize(frame.rgb, (k.width, k.height), interpolation=cv2.INTER_AREA)
     return PreparedView(
         stamp_ns=frame.stamp_ns,
-        intrinsics=intrinsics,
+        intrinsics=k,
         intrinsics_double=double,
         T_world_camera=frame.T_world_camera,
-        rgb=np.asarray(cv2.resize(frame.rgb, small, interpolation=cv2.INTER_AREA), np.uint8)
-        if shrinks
-        else np.ascontiguousarray(frame.rgb),
+        rgb=np.asarray(rgb, np.uint8),
         gray=np.ascontiguousarray(smooth[::2, ::2]),
         census=census_transform(smooth, 2),
     )
@@ -87,6 +86,24 @@ def census_transform(gray: UInt8, spacing: int) -> Int32:
     return out
 
 
+def enlarge_estimate(estimate: DepthEstimate, coarse_rgb: UInt8, rgb: UInt8) -> DepthEstimate:
+    """Bring an estimate (h, w) to the size of ``rgb``, its borders to the image's edges; no depth lies between two
+    surfaces.
+
+    Within a surface inverse depth is interpolated, which keeps planes plane. Where the coarse pixels round a pixel
+    belong to several surfaces, it takes the one that looks most like it.
+
+    Args:
+        estimate: Of the size of ``coarse_rgb``.
+        coarse_rgb: (h, w, 3) uint8; rgb: (H, W, 3) uint8.
+    """
+    full = DepthEstimate(np.zeros(rgb.shape[:2], np.float32), np.zeros(rgb.shape[:2], np.float32))
+    depth_m, sigma_m = np.ascontiguousarray(estimate.depth_m), np.ascontiguousarray(estimate.sigma_m)
+    images = np.ascontiguousarray(coarse_rgb), np.ascontiguousarray(rgb)
+    enlarge_depth(len(rgb), depth_m, sigma_m, *images, *full, SAME_SURFACE, COLOUR_RATE)
+    return full
+
+
 @parallel_kernel()
 def compare_with_middle(count: int, padded: UInt8, census: Int32, spacing: int) -> None:
     """The transform of `census_transform`.
@@ -95,5 +112,28 @@ def compare_with_middle(count: int, padded: UInt8, census: Int32, spacing: int) 
         count: H, rows.
         padded: (H + 4 * spacing, W + 4 * spacing) image with a margin of 2 * spacing on each side.
         census: (H, W) int32, written.
+    """
+    ...
+
+
+@parallel_kernel()
+def enlarge_depth(
+    count: int,
+    depth: Float32,
+    sigma: Float32,
+    coarse_rgb: UInt8,
+    rgb: UInt8,
+    out_depth: Float32,
+    out_sigma: Float32,
+    same: float,
+    colour_rate: float,
+) -> None:
+    """The upsampling of `enlarge_estimate`, row by row of ``rgb``.
+
+    Args:
+        count: H, rows.
+        out_depth, out_sigma: (H, W) float32 zeros, written.
+        same: Fraction of the depth by which pixels of one surface differ at most.
+        colour_rate: A coarse pixel counts by exp(-rate * squared distance of the colours).
     """
     ...

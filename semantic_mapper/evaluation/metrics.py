@@ -7,13 +7,12 @@ One implementation for everything the project reports. Rules, the same everywher
   IoU of the true class, and raises no other class's union. A method gains nothing by staying silent.
 - Means over classes run over the classes that occur in the truth. A class that is only predicted lowers the others
   by the pixels it took from them and adds no term of its own.
-- Figures of a data set come from one confusion matrix over all its pixels; ``metrics_per_image`` are another number
-  and are always named so.
+- Figures of a data set come from one confusion matrix over all its pixels; means over images (``ImageMeans``) are
+  another number and are always named so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +21,6 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.types import Float32, Float64, UInt8
 
 
@@ -131,19 +129,8 @@ def confusion_of(truth: UInt8, predicted: UInt8, label_set: LabelSet, where: str
     return matrix
 
 
-def metrics_per_image(images: Iterable[ConfusionMatrix]) -> SegmentationMetrics:
-    """Mean over images of each image's own figures.
-
-    Images without a labelled pixel are left out; a class's figure is the mean over the images that show it.
-    """
-    means = ImageMeans()
-    for image in images:
-        means.add(image)
-    return means.metrics()
-
-
 class ImageMeans:
-    """``metrics_per_image`` of images that come one by one and are not kept."""
+    """Means over images of each image's own figures; of a class, over the images that show it."""
 
     def __init__(self) -> None:
         self._sums = np.zeros(4)  # of the figures of an image
@@ -172,144 +159,8 @@ class ImageMeans:
         return SegmentationMetrics(*means, per_class=per_class, pixels=self._pixels)
 
 
-def nearest_labels(
-    at_xyz: Float32 | Float64,
-    from_xyz: Float32 | Float64,
-    from_label: UInt8,
-    label_set: LabelSet,
-    *,
-    max_distance_m: float = 0.05,
-) -> UInt8:
-    """Carry labels from one set of points to another: each point takes the label of the nearest one.
-
-    Args:
-        at_xyz: (N, 3) metres, the points that ask.
-        from_xyz: (M, 3) metres, in the same frame; M may be 0.
-        from_label: (M,) uint8 class ids.
-        label_set: Gives the ignore id.
-        max_distance_m: Farther than this there is no answer.
-
-    Returns:
-        (N,) uint8 class ids; the ignore id where no point is near enough.
-
-    Raises:
-        ShapeError: not (N, 3), or as many labels as points.
-    """
-    if from_label.shape != (len(from_xyz),):
-        raise ShapeError(
-            f"from_label: expected shape ({len(from_xyz)},) as from_xyz has points, got {from_label.shape}"
-        )
-    nearest = nearest_points(at_xyz, from_xyz, max_distance_m=max_distance_m)
-    return np.append(from_label, np.uint8(label_set.ignore_id))[nearest]
-
-
-def nearest_points(
-    at_xyz: Float32 | Float64, from_xyz: Float32 | Float64, *, max_distance_m: float = 0.05
-) -> NDArray[np.int64]:
-    """Which (N,) of M points is nearest to each of N others, (N, 3) and (M, 3) in metres; M = none is near enough.
-
-    Raises:
-        ShapeError: not (N, 3).
-    """
-    for name, xyz in (("at_xyz", at_xyz), ("from_xyz", from_xyz)):
-        if xyz.ndim != 2 or xyz.shape[1] != 3:
-            raise ShapeError(f"{name}: expected shape (N, 3), got {xyz.shape}")
-    if not len(from_xyz) or not len(at_xyz):
-        return np.full(len(at_xyz), len(from_xyz), np.int64)
-    check_room_for_scipy()
-    from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
-
-    _, nearest = KDTree(from_xyz).query(at_xyz, distance_upper_bound=max_distance_m, workers=-1)
-    return np.asarray(nearest, np.int64)
-
-
-def map_confusion(
-    truth_xyz: Float32 | Float64,
-    truth_label: UInt8,
-    map_xyz: Float32 | Float64,
-    map_label: UInt8,
-    label_set: LabelSet,
-    *,
-    max_distance_m: float = 0.05,
-) -> ConfusionMatrix:
-    """Confusion matrix of a map against a labelled mesh: each vertex of the truth asks the nearest map point.
-
-    A vertex that the map does not reach within ``max_distance_m`` counts as "unknown", that is wrong, so holes in the
-    map cost as much as wrong labels, and maps of different density are judged at the same places.
-
-    Args:
-        truth_xyz, truth_label: (V, 3) vertices in metres and their (V,) uint8 ids; the ignore id is not counted.
-        map_xyz, map_label: (N, 3) map points in the same frame and their (N,) uint8 ids.
-        label_set: Of both.
-        max_distance_m: How far a map point may be from a vertex to speak for it.
-
-    Raises:
-        ShapeError, LabelError: as ``nearest_labels`` and ``ConfusionMatrix.update``.
-    """
-    found = nearest_labels(truth_xyz, map_xyz, map_label, label_set, max_distance_m=max_distance_m)
-    return confusion_of(truth_label, found, label_set, "map")
-
-
-def map_miou(
-    truth_xyz: Float32 | Float64,
-    truth_label: UInt8,
-    map_xyz: Float32 | Float64,
-    map_label: UInt8,
-    label_set: LabelSet,
-    *,
-    max_distance_m: float = 0.05,
-) -> float | None:
-    """mIoU of ``map_confusion``; ``None`` where no vertex has a truth."""
-    matrix = map_confusion(truth_xyz, truth_label, map_xyz, map_label, label_set, max_distance_m=max_distance_m)
-    return matrix.metrics().miou
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
-    """How confidence and accuracy agree, in bins of equal width.
-
-    Args:
-        ece: Expected calibration error: mean over the samples of |accuracy - confidence| of their bin.
-        confidence: (B,) mean confidence of each bin, NaN where it is empty.
-        accuracy: (B,) fraction of each bin that is right, NaN where it is empty.
-        count: (B,) int64 samples of each bin.
-    """
-
-    ece: float | None
-    confidence: Float64
-    accuracy: Float64
-    count: NDArray[np.int64]
-
-
-def calibration(confidence: Float32 | Float64, correct: NDArray[np.bool_], *, bins: int = 15) -> Calibration:
-    """Measure whether predictions of confidence p are right in a share p of the cases.
-
-    Args:
-        confidence: (...) in [0, 1], of the predicted class; only samples that have a truth.
-        correct: (...) bool, the same shape.
-        bins: How many bins of equal width; a sample on an edge belongs to the lower one.
-
-    Raises:
-        ShapeError: the shapes differ, or a confidence is outside [0, 1] or NaN.
-    """
-    if confidence.shape != correct.shape:
-        raise ShapeError(f"confidence has shape {confidence.shape}, correct {correct.shape}; give one per sample")
-    p = confidence.astype(np.float64).ravel()
-    if not np.all((p >= 0) & (p <= 1)):
-        raise ShapeError("confidence must lie in [0, 1] and hold no NaN; give probabilities, not logits")
-    index = np.clip(np.ceil(p * bins).astype(np.int64) - 1, 0, bins - 1)
-    count = np.bincount(index, minlength=bins)
-    confidence_sum = np.bincount(index, weights=p, minlength=bins).astype(np.float64)
-    right = np.bincount(index, weights=correct.ravel(), minlength=bins).astype(np.float64)
-    return calibration_of_bins(count, confidence_sum, right)
-
-
 class ConfidenceScores:
-    """Whether confidence means something, over any number of images: calibration, and what it says of strange things.
-
-    Args:
-        bins: Of confidence; calibration joins them to 15.
-    """
+    """Whether confidence means something, over any number of images: of calibration, and of strange things."""
 
     _BINS = 15
     _FINE = 100  # fine bins in one of calibration
@@ -338,13 +189,10 @@ class ConfidenceScores:
         self._strange += np.bincount(index[~known], minlength=size)
 
     @property
-    def calibration(self) -> Calibration:
-        """Of the pixels whose class can be predicted."""
-
-        def joined(values: NDArray[Any]) -> NDArray[Any]:
-            return values.reshape(self._BINS, self._FINE).sum(1)
-
-        return calibration_of_bins(joined(self._count), joined(self._sum), joined(self._right))
+    def calibration_error(self) -> float | None:
+        """Of the pixels whose class can be predicted, in 15 bins."""
+        joined = (of.reshape(self._BINS, self._FINE).sum(1) for of in (self._count, self._sum, self._right))
+        return calibration_error(*joined)
 
     def above(self, confidence: float) -> tuple[float | None, float | None]:
         """Fraction of the pixels, of classes that can be predicted, that are surer than this; and how many of those
@@ -364,18 +212,84 @@ class ConfidenceScores:
         return float((self._count * (below + 0.5 * self._strange)).sum() / known / strange)
 
 
-def calibration_of_bins(count: NDArray[np.int64], confidence_sum: Float64, right: Float64) -> Calibration:
-    """Calibration from sums a bin, which add up over images and data sets.
+def calibration_error(count: NDArray[np.int64], confidence_sum: Float64, right: Float64) -> float | None:
+    """Expected calibration error: mean over the samples of |accuracy - confidence| of their bin; None without samples.
 
     Args:
-        count: (B,) samples of each bin.
+        count: (B,) samples of each bin of confidence.
         confidence_sum: (B,) sum of their confidences.
         right: (B,) how many of them are right.
     """
-    filled = count > 0
-    empty = np.full(len(count), np.nan)
-    mean_p = np.divide(confidence_sum, count, out=empty.copy(), where=filled)
-    accuracy = np.divide(right, count, out=empty.copy(), where=filled)
     total = int(count.sum())
-    ece = float((count[filled] * np.abs(accuracy - mean_p)[filled]).sum() / total) if total else None
-    return Calibration(ece, mean_p, accuracy, count)
+    return float(np.abs(right - confidence_sum).sum() / total) if total else None
+
+
+def class_sums(counts: NDArray[Any]) -> NDArray[Any]:
+    """What IoU needs of confusion matrices, and what adds up: (..., L, L + 1) -> (..., 3, L) hits, truth and union."""
+    hits = np.diagonal(counts, axis1=-2, axis2=-1)
+    occurring = counts.sum(axis=-1)
+    union = occurring + counts[..., :-1].sum(axis=-2) - hits
+    return np.stack((hits, occurring, union), axis=-2)
+
+
+def miou_of_sums(sums: NDArray[Any]) -> Float64:
+    """(..., 3, L) of ``class_sums`` -> (...,) mIoU by the rules of ``ConfusionMatrix``, NaN without a truth."""
+    hits, occurring, union = np.moveaxis(sums.astype(np.float64), -2, 0)
+    iou = np.divide(hits, union, out=np.zeros_like(hits), where=occurring > 0)
+    present = (occurring > 0).sum(axis=-1)
+    return np.divide(iou.sum(axis=-1), present, out=np.full(present.shape, np.nan), where=present > 0)
+
+
+MAX_SEGMENTS = 64
+
+
+@dataclass(slots=True, eq=False)
+class Segment:
+    """Consecutive scored frames.
+
+    Args:
+        first: Number of its first frame among those that were scored.
+        frames: How many there are.
+        confusion: Of all their pixels.
+    """
+
+    first: int
+    frames: int
+    confusion: ConfusionMatrix
+
+
+class Segments:
+    """Up to 64 stretches of equal length, whatever the length of the run: neighbours are joined as it grows.
+
+    Frames one after the other are nearly the same picture, so that a bootstrap over single frames would be too sure.
+    The same frames scored give the same stretches.
+    """
+
+    def __init__(self, label_set: LabelSet) -> None:
+        self.label_set = label_set
+        self._frames_each = 1
+        self._segments: list[Segment] = []
+
+    def add(self, image: ConfusionMatrix) -> None:
+        """Count the next scored frame."""
+        last = self._segments[-1] if self._segments else None
+        if last is not None and last.frames < self._frames_each:
+            last.frames += 1
+            last.confusion += image
+            return
+        first = 0 if last is None else last.first + last.frames
+        self._segments.append(Segment(first, 1, ConfusionMatrix(self.label_set) + image))
+        if len(self._segments) > MAX_SEGMENTS:
+            self._join_neighbours()
+
+    def _join_neighbours(self) -> None:
+        """Half as many stretches, each twice as long; the last one stays short where it has no neighbour."""
+        self._frames_each *= 2
+        for one, other in zip(self._segments[::2], self._segments[1::2], strict=False):
+            one.frames += other.frames
+            one.confusion += other.confusion
+        self._segments = self._segments[::2]
+
+    def all(self) -> list[Segment]:
+        """All stretches so far, in order."""
+        return list(self._segments)

@@ -1,5 +1,7 @@
 """Weights files: safetensors with everything needed to use them (model config, label set, recipe, anchors).
 
+Weights that ship may name others that ship as their ``base``, and then hold only the tensors that differ from those.
+
 A finetuned checkpoint carries its *anchors*: the labelled keyframes it was finetuned on, as images at working
 resolution with depth, labels and pose. They are source views of every later render in the same scene.
 """
@@ -178,10 +180,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Tensors and metadata of a weights file of this project, of any kind.
+    """Tensors and metadata of a weights file of this project, of any kind, joined with those of its base.
 
     Raises:
-        WeightsError: missing, damaged, of another format or version.
+        WeightsError: missing, damaged, of another format or version, or its base is.
     """
     if path.exists() and not path.is_file():
         raise WeightsError(f"{path}: is no regular file; copy its content to one")
@@ -199,6 +201,14 @@ def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
         )
     if metadata.get("version") != str(VERSION):
         raise WeightsError(f"{path}: weights format {metadata.get('version')}, this version reads {VERSION}")
+    if "base" in metadata:
+        base = shipped_checkpoint(Path(metadata["base"]))
+        if base is None or base == path:
+            raise WeightsError(
+                f"{path}: holds what differs from the weights '{metadata['base']}', which do not ship with this "
+                "version; install the package again, or use another file"
+            )
+        tensors = open_weights(base)[0] | tensors
     return tensors, metadata
 
 

@@ -20,56 +20,17 @@ MAX_FEATURES = 400  # of each: 140 bytes a feature
 _SPACING_M, _SPACING_RAD = 0.2, np.deg2rad(12.0)  # a view this far from all places is a new one
 
 
-class PlaceIndex:
-    """Descriptors of places, by number. Deterministic.
+def rank_places(features: Features, descriptors: Mapping[int, UInt8], count: int) -> list[tuple[int, int]]:
+    """The places most like an image, best first, as (key, number of features that match); in their order if equal.
 
     Args:
-        capacity: Places that are kept; one more takes the place of the oldest.
+        features: Of the image (``find_place_features``), as those of the places.
+        descriptors: (N, 128) of each place, by key.
+        count: At most this many, each with at least one match.
     """
-
-    def __init__(self, capacity: int = MAX_PLACES) -> None:
-        self._capacity = capacity
-        self._descriptors: dict[int, UInt8] = {}
-
-    def __len__(self) -> int:
-        return len(self._descriptors)
-
-    @property
-    def keys(self) -> tuple[int, ...]:
-        """Of the places that are kept, oldest first."""
-        return tuple(self._descriptors)
-
-    def add(self, key: int, features: Features) -> None:
-        """Keep a place; one of the same key is replaced. Features without depth count, too."""
-        self.add_descriptors(key, features.descriptors)
-
-    def add_descriptors(self, key: int, descriptors: UInt8) -> None:
-        """As ``add``, of descriptors (N, 128) alone."""
-        self._descriptors.pop(key, None)
-        self._descriptors[key] = descriptors
-        if len(self._descriptors) > self._capacity:
-            del self._descriptors[next(iter(self._descriptors))]
-
-    def remove(self, key: int) -> None:
-        """Forget a place, if it is there."""
-        self._descriptors.pop(key, None)
-
-    def candidates(
-        self, features: Features, count: int, exclude: frozenset[int] = frozenset()
-    ) -> list[tuple[int, int]]:
-        """The places most like an image, best first, as (key, number of features that match); older first if equal.
-
-        Args:
-            features: Of the image (``find_place_features``), as those that were added.
-            count: At most this many, each with at least one match.
-            exclude: Keys that do not count, such as those of the last seconds.
-        """
-        scored: list[tuple[int, int]] = []
-        for key, descriptors in self._descriptors.items():
-            if key not in exclude:
-                scored.append((key, len(match_features(features.descriptors, descriptors))))
-        scored.sort(key=lambda item: -item[1])
-        return [(key, score) for key, score in scored[:count] if score > 0]
+    scored = [(key, len(match_features(features.descriptors, theirs))) for key, theirs in descriptors.items()]
+    scored.sort(key=lambda item: -item[1])
+    return [(key, score) for key, score in scored[:count] if score > 0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,7 @@ from semantic_mapper.localization.depth_fit import (
     small_depth,
 )
 from semantic_mapper.localization.features import Features, find_place_features, match_features, pose_from_points
-from semantic_mapper.localization.places import MAX_FEATURES, Place, PlaceIndex
+from semantic_mapper.localization.places import MAX_FEATURES, Place, rank_places
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 Reason = Literal[
@@ -129,9 +129,6 @@ class Relocalizer:
         self._places = places
         self._surface = surface
         self._ignore_id = ignore_id
-        self._index = PlaceIndex(max(1, len(places)))
-        for number, place in enumerate(places):
-            self._index.add_descriptors(number, place.descriptors)
 
     def find(
         self, rgb: UInt8, depth_m: Float32 | None, intrinsics: CameraIntrinsics, label: UInt8 | None = None
@@ -242,7 +239,8 @@ class Relocalizer:
 
     def _guesses(self, features: Features, intrinsics: CameraIntrinsics) -> list[_Guess]:
         """Poses that features lead to, those with the most of them first."""
-        ranked = [key for key, _ in self._index.candidates(features, _CANDIDATES)]
+        descriptors = {key: place.descriptors for key, place in enumerate(self._places)}
+        ranked = [key for key, _ in rank_places(features, descriptors, _CANDIDATES)]
         pairs = {key: match_features(features.descriptors, self._places[key].descriptors) for key in ranked}
         limit_px = _REPROJECTION * intrinsics.fx
         guesses: list[_Guess] = []

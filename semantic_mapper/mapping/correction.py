@@ -7,15 +7,14 @@ where the two motions take the camera, not their translations, makes the result 
 blended translations would be off by (turn)^2 / 8 times the distance to the origin. A frame before the first given one
 moves with the first. A frame after the last moves with it only where the caller says so (``until_ns``).
 
-The map is built again from the frames that were fused into it, which are kept on disk, lossless: with the same poses it
-is the same map, bit for bit. The rebuild goes on in batches, between steps or from another thread, next to the map in
-use, which it replaces once it has caught up. Class probabilities are not rendered again: they came from source views
-near the frame in time, and a correction changes where these are relative to each other far less than where all of them
-are in the world.
+The map is built again from a snapshot of itself and the frames that were fused since, which are kept on disk, lossless:
+with the same poses it is the same map, bit for bit. The rebuild goes on in batches, between steps or from another
+thread, next to the map in use, which it replaces once it has caught up. Class probabilities are not rendered again:
+they came from source views near the frame in time, and a correction changes where these are relative to each other far
+less than where all of them are in the world.
 
-Frames are kept in a ring. Those that leave it are fused into a second map, the base, and stay where they are: every
-rebuild starts from a copy of it. So once the ring is full a frame is fused twice, and memory holds two maps, during a
-rebuild three.
+Frames are kept in two halves of ``history.max_frames`` each. When the newer one is full, the older one leaves, and the
+snapshot that was made between them is the one that rebuilds begin with. So corrections reach at least one half back.
 """
 
 from __future__ import annotations
@@ -35,13 +34,14 @@ from semantic_mapper.config import HistoryConfig
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.geometry import check_pose, interpolate_pose, invert_pose, move, transform
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.map_types import ALWAYS, CorrectedPoses, CorrectionStatus
 from semantic_mapper.mapping.storage.scratch import ScratchFile
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 
-FRAMES_A_STEP = 4  # of a rebuild, that a step itself fuses where the ring is full
+FRAMES_A_STEP = 4  # of a rebuild, that a step itself fuses where the history is full
 
 _log = get_logger(__name__)
 
@@ -161,6 +161,7 @@ class _Rebuild:
     """A map on its way; corrections are applied one after the other."""
 
     voxel_map: VoxelMap
+    snapshots: list[MapSnapshot]  # see ``MapCorrector``
     corrections: tuple[PoseCorrection, ...]
     done: int = 0  # frames of the history that are in it
 
@@ -179,7 +180,7 @@ class MapCorrector:
         voxel_map: In use; becomes the corrected one at the end of a rebuild.
         keyframes: Move with their frames then.
         fuse: Upsamples a frame of the history and integrates it into the map given.
-        on_exchange: Called when the map has moved.
+        on_move: Called when a correction begins, and when the map has moved.
 
     Attributes:
         lock: Held by a step, by a frame of a rebuild, and where the maps are exchanged: one at a time.
@@ -194,20 +195,20 @@ class MapCorrector:
         voxel_map: VoxelMap,
         keyframes: KeyframeStore,
         fuse: Callable[[VoxelMap, FusedFrame], None],
-        on_exchange: Callable[[], None] = lambda: None,
+        on_move: Callable[[], None],
     ) -> None:
         self.lock = threading.RLock()
         self._config = config
         self._map = voxel_map
         self._keyframes = keyframes
         self._fuse = fuse
-        self._on_exchange = on_exchange
+        self._on_move = on_move
         self._scratch = ScratchFile("frames", "lower history.max_frames or max_disk_mb") if config.max_frames else None
         self._why_none = "no frames are kept; set history.max_frames in the mapper's config"
         self._entries: list[_Entry] = []  # oldest first; the number of the first one is ``_left``
         self._left = 0  # frames that have left the history
-        self._bytes = 0
-        self._base: VoxelMap | None = None  # what is in the map besides the history; from the first frame on
+        self._older = 0  # entries of the older half
+        self._snapshots: list[MapSnapshot] = []  # of the map before the older half, and between the two
         self._rebuild: _Rebuild | None = None
         self._lost = self._completed = self._poses = 0
         self._failure = ""
@@ -222,12 +223,12 @@ class MapCorrector:
     @property
     def status(self) -> CorrectionStatus:
         """Where corrections stand."""
-        rebuild = self._rebuild
+        rebuild, entries = self._rebuild, self._entries
         return CorrectionStatus(
             running=rebuild is not None,
             done=0 if rebuild is None else rebuild.done,
-            total=len(self._entries),
-            disk_bytes=self._bytes,
+            total=len(entries),
+            disk_bytes=sum(entry.bytes for entry in entries),
             completed=self._completed,
             poses=self._poses,
             frozen=self._left,
@@ -252,6 +253,41 @@ class MapCorrector:
         pose = move(self.motion(frame.world), frame.T_world_camera)
         return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
 
+    def make_room(self) -> None:
+        """Make a snapshot where a half of the history is full, before a step.
+
+        During a rebuild, which may still need all frames, none leaves, but the step continues it, so that it ends.
+        """
+        if self._scratch is None:
+            return
+        try:
+            if not self._snapshots:  # now, as the map may have become a saved one
+                self._snapshots = [self._map.snapshot()]
+            if self._rebuild is not None and self._is_full:
+                with suppress(MapError):  # is logged, and it is not this step that has failed
+                    self.advance(FRAMES_A_STEP)
+            if self._rebuild is None and self._is_full:
+                self._begin_half(self._scratch)
+        except SemanticMapperError as error:
+            self._end_history(str(error))
+
+    @property
+    def _is_full(self) -> bool:
+        newer = self._entries[self._older :]
+        most = self._config.max_disk_mb * 1_000_000 / 2
+        return len(newer) >= self._config.max_frames or sum(entry.bytes for entry in newer) >= most
+
+    def _begin_half(self, scratch: ScratchFile) -> None:
+        if len(self._snapshots) == 2:
+            if not self._left:
+                _log.info("history_is_full", frames=len(self._entries))
+            scratch.drop(range(self._left, self._left + self._older))
+            self._left += self._older
+            self._entries = self._entries[self._older :]
+            self._snapshots.pop(0).close()
+        self._older = len(self._entries)
+        self._snapshots.append(self._map.snapshot())
+
     def record(self, fused: FusedFrame) -> None:
         """Keep a frame that the map was just given. Where the disk fails, mapping goes on and correcting ends."""
         if self._scratch is None:
@@ -268,54 +304,38 @@ class MapCorrector:
         pose = frame.T_world_camera.copy()
         kept = replace(frame, rgb=nothing, depth_m=None, label=None, depth_sigma_m=None, T_world_camera=pose)
         self._entries = [*self._entries, _Entry(kept, len(blob))]
-        self._bytes += len(blob)
-
-    def make_room(self) -> None:
-        """Let the oldest frames of a full ring leave, before a step.
-
-        During a rebuild, which may still need them, none leaves, but the step continues it, so that it ends.
-        """
-        if self._scratch is None:
-            return
-        try:
-            if self._base is None:
-                self._base = self._map.copy()  # now, as the map may have become a saved one
-            if self._rebuild is not None and self._is_full:
-                with suppress(MapError):  # is logged, and it is not this step that has failed
-                    self.advance(FRAMES_A_STEP)
-            while self._is_full and self._rebuild is None:
-                self._freeze_oldest(self._scratch, self._base)
-        except SemanticMapperError as error:
-            self._end_history(str(error))
-
-    @property
-    def _is_full(self) -> bool:
-        config, count = self._config, len(self._entries)
-        return count >= config.max_frames or (count > 1 and self._bytes >= config.max_disk_mb * 1_000_000)
-
-    def _freeze_oldest(self, scratch: ScratchFile, base: VoxelMap) -> None:
-        oldest = self._entries[0]
-        fused = self._read(0, oldest.frame.T_world_camera)
-        if fused is not None:
-            self._fuse(base, fused)
-        if not self._left:
-            _log.info("history_is_full", frames=len(self._entries), mb=round(self._bytes / 1e6))
-        scratch.drop([self._left])
-        self._entries = self._entries[1:]
-        self._left += 1
-        self._bytes -= oldest.bytes
 
     def start(self, poses: CorrectedPoses, until_ns: int | None = None) -> CorrectionStatus:
-        """Begin to build the map again with corrected poses; see ``MappingPipeline.correct_poses``."""
+        """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
+
+        The map in use stays as it is until ``advance`` has brought the rebuild to its end. A call during a rebuild
+        begins it again, with this correction upon the one under way: the outcome is that of two in a row.
+
+        Args:
+            poses: stamp_ns, or (camera_id, stamp_ns), -> T_world_camera (4, 4) float64, at least one, in the map's
+                world as it is right from now on. Frames between them in time move as the head of this file says. Frames
+                that have left the history stay where they are.
+            until_ns: By default frames later than the last given one are trusted as they come: who corrects poses
+                mostly gives the corrected world from then on. Frames up to this stamp have come in the old world and
+                move with the last given one; ``ALWAYS``: odometry goes on in the old world, and frames to come are
+                moved, too.
+
+        Raises:
+            MapError: no history is kept, a stamp is of no frame, or all given frames have left the history. Nothing has
+                changed then.
+            PoseError: a pose is not a rigid transform.
+        """
         with self.lock:
             if self._scratch is None:
                 raise MapError(f"poses cannot be corrected: {self._why_none}")
             before = () if self._rebuild is None else self._rebuild.corrections
             pairs = self._pair_poses(poses)
             correction = PoseCorrection(pairs, max(p.stamp_ns for p in pairs) if until_ns is None else until_ns)
-            assert self._base is not None
-            self._rebuild = _Rebuild(self._base.copy(), (*before, correction))
+            begun = VoxelMap.restored(self._snapshots[0])
+            self._give_up_rebuild()
+            self._rebuild = _Rebuild(begun, [begun.snapshot()], (*before, correction))
             self._failure = ""
+            self._on_move()
             _log.info("correction_begins", given=len(pairs), frames=len(self._entries), again=bool(before))
             return self.status
 
@@ -334,18 +354,24 @@ class MapCorrector:
                 if rebuild is None:
                     return False
                 try:
-                    if rebuild.done < len(self._entries):
-                        fused = self._read(rebuild.done, rebuild.place(self._entries[rebuild.done].frame))
-                        if fused is not None:
-                            self._fuse(rebuild.voxel_map, fused)
-                        rebuild.done += 1
+                    self._fuse_next(rebuild)
                     if rebuild.done == len(self._entries):
                         self._exchange(rebuild)
                 except SemanticMapperError as error:  # a frame's too: at its new pose it may be out of reach, say
-                    self._rebuild, self._failure = None, str(error)
+                    self._give_up_rebuild()
+                    self._failure = str(error)
                     _log.error("correction_fails", reason=self._failure)
                     raise MapError(f"the correction is given up, the map stays as it is: {error}") from error
         return self._rebuild is not None
+
+    def _fuse_next(self, rebuild: _Rebuild) -> None:
+        if rebuild.done < len(self._entries):
+            fused = self._read(rebuild.done, rebuild.place(self._entries[rebuild.done].frame))
+            if fused is not None:
+                self._fuse(rebuild.voxel_map, fused)
+            rebuild.done += 1
+        if rebuild.done == self._older and len(rebuild.snapshots) < len(self._snapshots):
+            rebuild.snapshots.append(rebuild.voxel_map.snapshot())
 
     def _read(self, row: int, T_world_camera: Float64) -> FusedFrame | None:
         """A frame of the history; None, counted, where the disk has lost it."""
@@ -370,6 +396,8 @@ class MapCorrector:
         self._map.places.move(poses)
         keyframes = self._keyframes.move(poses)
         self._entries = moved
+        _close(self._snapshots)
+        self._snapshots = rebuild.snapshots
         for correction in rebuild.corrections:
             if correction.until_ns == ALWAYS:
                 for world, motion in correction.last_motions.items():
@@ -377,18 +405,24 @@ class MapCorrector:
         self._completed += len(rebuild.corrections)
         self._poses += sum(len(correction) for correction in rebuild.corrections)
         self._rebuild = None
-        self._on_exchange()
+        self._on_move()
         _log.info("correction_done", frames=len(moved), keyframes_moved=keyframes, blocks=self._map.block_count)
+
+    def _give_up_rebuild(self) -> None:
+        if self._rebuild is not None:
+            _close(self._rebuild.snapshots)
+        self._rebuild = None
 
     def _end_history(self, reason: str) -> None:
         """Without every frame a rebuild would lose a part of the map; better none."""
         self._why_none = f"the history has ended: {reason}"
         if self._rebuild is not None:
             self._failure = self._why_none
+        self._give_up_rebuild()
+        _close(self._snapshots)
         if self._scratch is not None:
             self._scratch.close()
-        self._scratch = self._base = self._rebuild = None
-        self._entries, self._bytes = [], 0
+        self._scratch, self._snapshots, self._entries = None, [], []
         _log.error("history_ends", reason=reason)
 
     def _pair_poses(self, poses: CorrectedPoses) -> list[PosePair]:
@@ -423,6 +457,11 @@ class MapCorrector:
         if missing:
             _log.warning("correction_is_partial", given=len(poses), frozen=missing, reason="frames left the history")
         return pairs
+
+
+def _close(snapshots: Sequence[MapSnapshot]) -> None:
+    for snapshot in snapshots:
+        snapshot.close()
 
 
 def _nearest(stamp_ns: int, stamps: list[int]) -> str:

@@ -1,4 +1,4 @@
-"""What a voxel map gives out: plain data, and which thing each voxel of a refined map belongs to."""
+"""What a voxel map gives out: plain data."""
 
 from __future__ import annotations
 
@@ -10,10 +10,6 @@ from numpy.typing import NDArray
 
 from semantic_mapper.types import Bool, Float32, Float64, UInt8
 
-_COORDINATE_BITS, _HALF_RANGE = (
-    21,
-    1 << 20,
-)  # of a packed coordinate: blocks lie within +-2^17
 # By stamp_ns, or by (camera_id, stamp_ns) where cameras share stamps: T_world_camera (4, 4).
 CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
 ALWAYS = 2**63 - 1  # later than any stamp
@@ -114,43 +110,3 @@ def computed_fraction(surface: MapPoints | MapMesh) -> float:
     """Fraction of the points, or vertices, whose depth no sensor measured; 0 of none, and where it is unknown."""
     measured = surface.measured
     return 0.0 if measured is None or not len(measured) else float(1 - measured.mean())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class InstanceLayer:
-    """Voxels that belong to things; others belong to none.
-
-    Args:
-        packed: (N,) int64 ascending, of ``pack_voxels``.
-        number: (N,) int32 from 0, the same for all voxels of a thing; those of a thing have one class.
-    """
-
-    packed: NDArray[np.int64]
-    number: NDArray[np.int32]
-
-    def at(self, voxels: NDArray[np.integer]) -> NDArray[np.int64]:
-        """The things (M,) that voxels (M, 3) belong to; -1 = none."""
-        wanted = pack_voxels(voxels)
-        if not len(self.packed):
-            return np.full(len(wanted), -1, np.int64)
-        row = np.minimum(np.searchsorted(self.packed, wanted), len(self.packed) - 1)
-        return np.where(self.packed[row] == wanted, self.number[row], -1).astype(np.int64)
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether voxels ascend, and things count from 0."""
-        return bool((np.diff(self.packed) > 0).all()) and int(self.number.min(initial=0)) >= 0
-
-
-def instance_layer(voxels: NDArray[np.integer], number: NDArray[np.integer]) -> InstanceLayer:
-    """Of unique voxels (N, 3) and the things (N,) they belong to; -1 = none."""
-    kept = number >= 0
-    packed = pack_voxels(voxels[kept])
-    order = np.argsort(packed)
-    return InstanceLayer(packed[order], number[kept][order].astype(np.int32))
-
-
-def pack_voxels(voxels: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Keys (N,) of voxel coordinates (N, 3) within +-2^20."""
-    shifted = voxels.astype(np.int64) + _HALF_RANGE
-    return (shifted[:, 0] << (2 * _COORDINATE_BITS)) | (shifted[:, 1] << _COORDINATE_BITS) | shifted[:, 2]

@@ -40,7 +40,6 @@ from semantic_mapper.labels import MOVING_NAMES, LabelSet
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame, UInt8
 
-BEYOND_M = np.float32(1e4)  # depth of what is left out, where no depth would mean free space
 CELLS = 80  # across the longer side of the image
 EVERY_S, SETTLED_S = 0.2, 3.0  # between two views that are kept; how long they are
 SURE_S = 0.8  # a surface that a view of so long ago saw at the same place does not move
@@ -194,9 +193,8 @@ class MovingFilter:
             return views
         depth_m = views.frame.depth_m
         assert depth_m is not None
-        nothing = BEYOND_M if self._config.voxel_map.no_return_range_m > 0 else np.float32(0)
         wider = cv2.dilate(moving.astype(np.uint8), np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)) > 0
-        return views.with_depth(np.where(wider, nothing, depth_m))
+        return views.with_depth(np.where(wider, np.float32(0), depth_m))
 
     def clear(self) -> None:
         """Forget the last seconds: poses of frames to come are in another world."""

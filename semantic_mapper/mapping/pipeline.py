@@ -33,11 +33,10 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import MAX_FEATURES, make_place
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction import CorrectionStatus, FusedFrame, MapCorrector
+from semantic_mapper.mapping.correction import FusedFrame, MapCorrector
 from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust, rendered_trust
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
-from semantic_mapper.mapping.map_types import CorrectedPoses
-from semantic_mapper.mapping.moving import BEYOND_M, MovingFilter
+from semantic_mapper.mapping.moving import MovingFilter
 from semantic_mapper.mapping.odometry_sessions import PoseInMap
 from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.mapping.pose_check import PoseCheck
@@ -187,42 +186,14 @@ class MappingPipeline:
         last frames whose depth was computed; None where there were none."""
         return self._frame_depth.disagreement.medians
 
-    def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None) -> CorrectionStatus:
-        """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
-
-        The map in use stays as it is until ``advance_correction`` has brought the rebuild to its end. A call during a
-        rebuild begins it again, with this correction upon the one under way: the outcome is that of two in a row.
-
-        Args:
-            poses: stamp_ns, or (camera_id, stamp_ns), -> T_world_camera (4, 4) float64, at least one, in the map's
-                world as it is right from now on. Frames between them in time move as ``pose_correction`` says, those
-                before the first one with the first. Frames that have left the history stay where they are.
-            until_ns: By default frames later than the last given one are trusted as they come: who corrects poses
-                mostly gives the corrected world from then on. Frames up to this stamp have come in the old world and
-                move with the last given one; ``ALWAYS``: odometry goes on in the old world, and frames to come are
-                moved, too.
-
-        Raises:
-            MapError: no history is kept, a stamp is of no frame, or all given frames have left the history. Nothing has
-                changed then.
-            PoseError: a pose is not a rigid transform.
-        """
-        status = self.corrector.start(poses, until_ns)
-        self.moving.clear()
-        return status
-
-    def advance_correction(self, max_frames: int = 1) -> bool:
-        """Carry a correction on by this many frames of the history; see ``MapCorrector.advance``."""
-        return self.corrector.advance(max_frames)
-
     def render_virtual_views(self, views: int = 1) -> tuple[RenderedVirtualView, ...]:
         """Render the map from where no camera stood, the views of most gain, and fuse what they say of classes.
 
         For when there is time to spare; every view takes about that of a frame. Nothing is measured: TSDF, colours and
         ``frames`` stay as they are. Deterministic, as part of the sequence of steps and virtual views.
 
-        The history keeps frames alone, so a correction of poses rebuilds the map without the votes of these views;
-        afterwards all may be looked at again.
+        The history keeps frames alone: a correction of poses rebuilds the map without the votes of these views, and
+        all may be looked at again.
 
         Args:
             views: At most this many.
@@ -394,8 +365,6 @@ class MappingPipeline:
         depth_m = full.depth_m
         if full.moving is not None and frame.depth_m is not None:
             depth_m = np.where(full.moving, frame.depth_m, depth_m)
-        if self.config.voxel_map.no_return_range_m > 0:
-            depth_m = np.where(depth_m == BEYOND_M, np.float32(0), depth_m)
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -576,8 +545,6 @@ class MappingPipeline:
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
             depth, trust = views.depth(frame.intrinsics), None
-            if self.config.voxel_map.no_return_range_m > 0:  # what is left out is no free space
-                depth = np.where(frame.depth_m == BEYOND_M, BEYOND_M, depth)
             if frame.depth_sigma_m is not None:
                 trust = computed_trust(depth, frame.depth_sigma_m)
         rows = upsample(view.probabilities, view.known, views.rgb(low), views.depth(low), frame.rgb, depth)

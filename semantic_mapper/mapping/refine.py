@@ -3,18 +3,13 @@
 The map is read in tiles, so that memory does not grow with it. The network sees 1.9 m far, and tiles overlap by that.
 What it answers is written back as evidence that reads as exactly that. TSDF, colour and weights stay as they are, bit
 for bit.
-
-Weights that know where centres of objects are also tell which voxels are one thing (``group_things``): those that
-touch, have one class, and of which the network says the same centre. Inside of a thing the centres that its voxels
-point to are near each other, or drift slowly; where two things touch, they jump. Some 30 bytes for each voxel of a
-thing are held until the end for that.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +20,6 @@ from semantic_mapper.errors import MapError, WeightsError
 from semantic_mapper.fields.nesf import (
     CELL_M,
     SMOOTHED,
-    Cells,
     Near,
     Nesf,
     NesfWeights,
@@ -34,15 +28,13 @@ from semantic_mapper.fields.nesf import (
     pool,
 )
 from semantic_mapper.geometry import turn_onto
-from semantic_mapper.labels import STUFF_NAMES, LabelSet
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.fusion.fuse import PROBABILITY_FLOOR, SURFACE_WEIGHT
-from semantic_mapper.mapping.map_types import InstanceLayer, instance_layer, pack_voxels
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.memory import check_room_for_scipy
-from semantic_mapper.types import Float32, Float64, Int64
+from semantic_mapper.types import Bool, Float32, Float64, Int64
 
 TILE_M = 8.0
 OVERLAP_M = 1.9
@@ -52,10 +44,6 @@ FILL_VOTES = 0.3  # of what is filled: later votes of frames outweigh it
 FILL = 0.5
 LEAST_LOG = np.float32(-30)  # of a probability that is written
 ANSWERED_AT_ONCE = 65_536
-AGREE_M = 0.09  # centres of neighbours that are farther apart belong to two things
-LEAST_VOXELS = 60  # of a piece that stands for itself where it touches others of its class
-_JOINS = 50  # rounds in which small pieces become part of larger ones
-_HALF_SPHERE = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)]) - 1  # 13 of 26 neighbours
 LOW_PERCENT = 1.0  # of the surface's points that lie below the floor, by noise
 
 
@@ -79,7 +67,7 @@ class SurfaceVoxels(NamedTuple):
     key: NDArray[np.int32]
     at: Int64
     points: SurfacePoints
-    core: NDArray[np.bool_]
+    core: Bool
 
     @property
     def voxel(self) -> Int64:
@@ -97,7 +85,6 @@ class RefineReport:
         relabelled: Of them, those with another class than before.
         filled: Those that had no votes and have a class now.
         voted: Whether anything had votes.
-        things: Instances that were distinguished; None where the weights do not know about them.
     """
 
     before: dict[str, int]
@@ -106,29 +93,16 @@ class RefineReport:
     relabelled: int
     filled: int
     voted: bool
-    things: int | None = None
 
 
 class _Written(NamedTuple):
-    """New evidence of voxels, not yet in the map: place of their tile, and of each block, voxel, evidence and votes.
-
-    And of the voxels that are things now: coordinates, channels, and the way to their centres, metres in the world.
-    """
+    """New evidence of voxels (N,), not yet in the map, and the place of their tile along x."""
 
     column: int
     key: NDArray[np.int32]
     at: Int64
     evidence: Float32
     votes: Float32
-    things: _Things
-
-
-class _Things(NamedTuple):
-    """Voxels (N, 3) of things, their channels (N,), and the way (N, 3) to their centres, metres along world axes."""
-
-    voxel: Int64
-    channel: Int64
-    way_m: Float32
 
 
 def refine(
@@ -138,7 +112,6 @@ def refine(
     fill: float = FILL,
     up: Float64 | None = None,
     by_name: bool = False,
-    tile_m: float = TILE_M,
     on_tile: Callable[[int, int], object] = lambda done, total: None,
 ) -> RefineReport:
     """Refine a map in place.
@@ -149,7 +122,6 @@ def refine(
         fill: Surface without votes gets a class where it is at least so likely; 1 = never.
         up: (3,) in the world; None = away from the floor.
         by_name: Take classes that have the same name in both; the probability of the others stays as it is.
-        tile_m: Side of a tile.
         on_tile: Called after each with tiles done and all tiles.
 
     Raises:
@@ -157,36 +129,25 @@ def refine(
         WeightsError: weights of other classes.
     """
     check_refinable(voxel_map)
-    shared = shared_classes(voxel_map.label_set, weights.model.label_set, by_name=by_name)
+    shared = _shared_classes(voxel_map.label_set, weights.model.label_set, by_name=by_name)
     frame = up_frame(voxel_map, up)
-    counts = _Counts(len(voxel_map.label_set))
+    overlap = int(np.ceil(OVERLAP_M / (BLOCK_SIDE * voxel_map.config.voxel_size_m)))
+    counts = np.zeros((len(voxel_map.label_set) + 1,) * 2, np.int64)  # [before, after] by channel, unknown last
     waiting: deque[_Written] = deque()
-    things: list[_Things] = []
-    tiles = list(_tiles(voxel_map, tile_m))
+    tiles = list(_tiles(voxel_map))
     for n, (column, low, high) in enumerate(tiles):
         while waiting and waiting[0].column < column - 1:  # no later tile reads them
             _write(voxel_map, waiting.popleft())
-        voxels = surface_voxels(voxel_map, frame, low - _overlap(voxel_map), high + _overlap(voxel_map))
+        voxels = surface_voxels(voxel_map, frame, low - overlap, high + overlap)
         own = np.asarray(((voxels.key >= low) & (voxels.key < high)).all(axis=1), np.bool_)
         if voxels.core.any() and own.any():
-            refined = _refined(voxel_map, weights.model, voxels, own, shared, fill, counts)
-            things.append(refined.things._replace(way_m=refined.things.way_m @ frame.R.astype(np.float32)))
-            waiting.append(refined._replace(column=column))
+            written = _refine_tile(voxel_map, weights.model, voxels, own, shared, fill, counts)
+            waiting.append(written._replace(column=column))
         on_tile(n + 1, len(tiles))
     for written in waiting:
         _write(voxel_map, written)
     voxel_map.refined = weights.digest
-    report = counts.report(voxel_map.label_set)
-    if not weights.model.config.centres or not things:
-        return report
-    layer = _layer(things, voxel_map.config.voxel_size_m)
-    voxel_map.instances = layer
-    return replace(report, things=int(layer.number.max(initial=-1)) + 1)
-
-
-def _layer(things: Sequence[_Things], voxel_m: float) -> InstanceLayer:
-    voxel, channel, way = (np.concatenate(parts) for parts in zip(*things, strict=True))
-    return instance_layer(voxel, group_things(voxel, channel, way, voxel_m))
+    return _report(counts, voxel_map.label_set)
 
 
 def check_refinable(voxel_map: VoxelMap) -> None:
@@ -195,30 +156,24 @@ def check_refinable(voxel_map: VoxelMap) -> None:
     Raises:
         MapError: says why.
     """
+    size = voxel_map.config.voxel_size_m
     if not voxel_map.block_count:
         raise MapError("an empty map has nothing to refine; map a frame first")
     if voxel_map.refined:
-        how = (
-            "its votes were smoothed"
-            if voxel_map.refined == SMOOTHED
-            else f"weights of digest {voxel_map.refined[:12]}"
-        )
+        smoothed = voxel_map.refined == SMOOTHED
+        how = "its votes were smoothed" if smoothed else f"weights of digest {voxel_map.refined[:12]}"
         raise MapError(f"the map is refined already ({how}); refine the map that it was made from")
-    if voxel_map.config.voxel_size_m > LARGEST_VOXEL_M:
+    if size > LARGEST_VOXEL_M:
         raise MapError(
-            f"voxels of {voxel_map.config.voxel_size_m * 100:g} cm are too coarse to refine (at most "
-            f"{LARGEST_VOXEL_M * 100:g} cm); replay the log with a smaller --voxel-size"
+            f"voxels of {size * 100:g} cm are too coarse to refine (at most {LARGEST_VOXEL_M * 100:g} cm); replay the "
+            "log with a smaller --voxel-size"
         )
     if not voxel_map.scale_known:
         raise MapError("the map's lengths are not metres, which the network learned in; import the film with --scale")
 
 
-def shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple[Int64, Int64]:
-    """Channels (S,) of the map and of the network that mean the same class.
-
-    Raises:
-        WeightsError: other classes, and not ``by_name``; or none has the same name.
-    """
+def _shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple[Int64, Int64]:
+    """Channels (S,) of the map and of the network that mean the same class."""
     if mine == theirs:
         return np.arange(len(mine)), np.arange(len(mine))
     pairs = [(mine.names.index(name), n) for n, name in enumerate(theirs.names) if name in mine.names]
@@ -273,45 +228,19 @@ def surface_voxels(voxel_map: VoxelMap, frame: UpFrame, low: Int64, high: Int64)
     return SurfaceVoxels(keys[row], at, points, core)
 
 
-def evidence_of(log_p: Float32, votes: Float32, vote_discount: float) -> Float32:
-    """Evidence (N, L) that reads as log-probabilities (N, L) of voxels with ``votes`` (N,)."""
-    return (log_p * (votes / _effective(votes, vote_discount))[:, None]).astype(np.float32)
-
-
-class _Counts:
-    """Voxels of the surface by channel, before and after; -1 = unknown."""
-
-    def __init__(self, classes: int) -> None:
-        self.before, self.after = np.zeros(classes + 1, np.int64), np.zeros(classes + 1, np.int64)
-        self.relabelled = self.filled = self.voted = 0
-
-    def add(self, before: Int64, after: Int64) -> None:
-        size = len(self.before)
-        self.before += np.bincount(before % size, minlength=size)
-        self.after += np.bincount(after % size, minlength=size)
-        self.relabelled += int(((before >= 0) & (after != before)).sum())
-        self.filled += int(((before < 0) & (after >= 0)).sum())
-        self.voted += int((before >= 0).sum())
-
-    def report(self, label_set: LabelSet) -> RefineReport:
-        names = (*label_set.names, "unknown")
-        before, after = (dict(zip(names, map(int, counts), strict=True)) for counts in (self.before, self.after))
-        return RefineReport(before, after, sum(before.values()), self.relabelled, self.filled, self.voted > 0)
-
-
-def _refined(
+def _refine_tile(
     voxel_map: VoxelMap,
     model: Nesf,
     voxels: SurfaceVoxels,
-    own: NDArray[np.bool_],
+    own: Bool,
     shared: tuple[Int64, Int64],
     fill: float,
-    counts: _Counts,
+    counts: Int64,
 ) -> _Written:
-    """New evidence of the ``own`` voxels of a tile."""
+    """New evidence of the ``own`` voxels of a tile; ``counts`` take what became of them."""
     mine, theirs = shared
     points = voxels.points
-    known = np.full((len(own), len(model.label_set)), 0, np.float32)
+    known = np.zeros((len(own), len(model.label_set)), np.float32)
     voted = points.votes > 0
     if len(theirs) < len(model.label_set):
         known[voted] = np.log(PROBABILITY_FLOOR)
@@ -320,8 +249,8 @@ def _refined(
     near = near_cells(points.xyz[own], cells.cells)
     before = points.log_p[own]
     with torch.inference_mode():
-        answers = _answers(model, cells, near, torch.from_numpy(known[own]), torch.from_numpy(theirs))
-    said, way = (part.numpy() for part in answers)
+        answer = model(cells)
+        said = _read_answer(model, answer, near, torch.from_numpy(known[own]), torch.from_numpy(theirs)).numpy()
     voted, reached = voted[own], (near.weights.sum(1) > 0.5).numpy()
     # What the classes have together that the network does not know stays; the rest it shares out.
     together = np.zeros((len(said), 1), np.float32)
@@ -333,31 +262,39 @@ def _refined(
     after = np.maximum(after, LEAST_LOG)
     filled = ~voted & reached & (np.exp(said.max(axis=1)) >= fill) & (fill < 1)
     changed = (voted & reached) | filled
-    votes = np.where(voted, points.votes[own], np.float32(FILL_VOTES))[changed]
     core = voxels.core[own]
     old = np.where(voted, before.argmax(axis=1), -1)
     new = np.where(changed, after.argmax(axis=1), old)
-    counts.add(old[core], new[core])
-    evidence = evidence_of(after[changed], votes, voxel_map.config.vote_discount)
-    is_thing = np.append(np.isin(voxel_map.label_set.ids, voxel_map.label_set.thing_ids(STUFF_NAMES)), [False])
-    things = np.flatnonzero(core & is_thing[new])
-    found = _Things(voxels.voxel[own][things], new[things], way[things])
-    return _Written(0, voxels.key[own][changed], voxels.at[own][changed], evidence, votes, found)
+    np.add.at(counts, (old[core], new[core]), 1)
+    votes = np.where(voted, points.votes[own], np.float32(FILL_VOTES))[changed]
+    evidence = after[changed] * (votes / _effective(votes, voxel_map.config.vote_discount))[:, None]
+    return _Written(0, voxels.key[own][changed], voxels.at[own][changed], evidence.astype(np.float32), votes)
 
 
-def _answers(
-    model: Nesf, cells: Cells, near: Near, log_p: torch.Tensor, channels: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-probabilities (N, S) of some channels at points, and the way (N, 3) to the centre of what they belong to."""
-    answer = model(cells)
+def _read_answer(
+    model: Nesf, answer: torch.Tensor, near: Near, log_p: torch.Tensor, channels: torch.Tensor
+) -> torch.Tensor:
+    """Log-probabilities (N, S) of some channels at points."""
     parts: list[torch.Tensor] = []
-    ways: list[torch.Tensor] = []
     for start in range(0, len(log_p), ANSWERED_AT_ONCE):
         rows = slice(start, start + ANSWERED_AT_ONCE)
-        logits, way = model.read(answer, Near(near.rows[rows], near.weights[rows]), log_p[rows])
+        logits, _ = model.read(answer, Near(near.rows[rows], near.weights[rows]), log_p[rows])
         parts.append(torch.log_softmax(logits[:, channels] / model.temperature, dim=1))
-        ways.append(way)
-    return torch.cat(parts), torch.cat(ways)
+    return torch.cat(parts)
+
+
+def _report(counts: Int64, label_set: LabelSet) -> RefineReport:
+    names = (*label_set.names, "unknown")
+    before, after = (dict(zip(names, counts.sum(axis=axis).tolist(), strict=True)) for axis in (1, 0))
+    voted = counts[:-1]
+    return RefineReport(
+        before,
+        after,
+        surface=int(counts.sum()),
+        relabelled=int(voted.sum() - voted.trace()),
+        filled=int(counts[-1, :-1].sum()),
+        voted=bool(voted.any()),
+    )
 
 
 def _write(voxel_map: VoxelMap, written: _Written) -> None:
@@ -373,12 +310,12 @@ def _write(voxel_map: VoxelMap, written: _Written) -> None:
             buffers.votes[where] = written.votes[here]
 
 
-def _tiles(voxel_map: VoxelMap, tile_m: float) -> Iterator[tuple[int, Int64, Int64]]:
+def _tiles(voxel_map: VoxelMap) -> Iterator[tuple[int, Int64, Int64]]:
     """Number along x, first block and end of boxes that together hold all blocks, in the order of x."""
     with voxel_map.locked() as grid:
         keys = grid.all_keys().astype(np.int64)
     low, high = keys.min(axis=0), keys.max(axis=0) + 1
-    most = max(1, round(tile_m / (BLOCK_SIDE * voxel_map.config.voxel_size_m)))
+    most = max(1, round(TILE_M / (BLOCK_SIDE * voxel_map.config.voxel_size_m)))
     count = -(-(high - low) // most)
     side = -(-(high - low) // count)
     for place in np.ndindex(*count):
@@ -386,10 +323,6 @@ def _tiles(voxel_map: VoxelMap, tile_m: float) -> Iterator[tuple[int, Int64, Int
         end = np.minimum(start + side, high)
         if ((keys >= start) & (keys < end)).all(axis=1).any():
             yield place[0], start, end
-
-
-def _overlap(voxel_map: VoxelMap) -> int:
-    return int(np.ceil(OVERLAP_M / (BLOCK_SIDE * voxel_map.config.voxel_size_m)))
 
 
 def _voxels(key: NDArray[np.int32], at: Int64) -> Int64:
@@ -429,71 +362,3 @@ def _log_probabilities(evidence: Float32, votes: Float32, vote_discount: float) 
     said -= said.max(axis=1, keepdims=True)
     said -= np.log(np.exp(said).sum(axis=1, keepdims=True))
     return np.where(votes[:, None] > 0, said, 0).astype(np.float32)
-
-
-def group_things(voxels: Int64, channel: Int64, way_m: Float32, voxel_m: float) -> Int64:
-    """The thing (N,) that each voxel belongs to, numbered from 0.
-
-    Args:
-        voxels: (N, 3) unique coordinates.
-        channel: (N,) class of each.
-        way_m: (N, 3) from each to the centre of its thing, along the axes of ``voxels``.
-        voxel_m: Edge of a voxel.
-    """
-    if not len(voxels):
-        return np.zeros(0, np.int64)
-    first, second = _neighbours(voxels)
-    same = channel[first] == channel[second]
-    first, second = first[same], second[same]
-    centre = voxels.astype(np.float64) * voxel_m + way_m.astype(np.float64)
-    agree = np.linalg.norm(centre[first] - centre[second], axis=1) < AGREE_M
-    piece = _components(len(voxels), first[agree], second[agree])
-    return _join_small_pieces(piece, first, second, centre)
-
-
-def _join_small_pieces(piece: Int64, first: Int64, second: Int64, centre: Float64) -> Int64:
-    """Pieces (N,); small ones that touch large ones, by the pairs ``first``, ``second``, are part of them now."""
-    size = np.bincount(piece)
-    middle = np.stack([np.bincount(piece, centre[:, axis]) for axis in range(3)], axis=1) / size[:, None]
-    large = size >= LEAST_VOXELS
-    for _ in range(_JOINS):
-        a, b = piece[first], piece[second]
-        touching = np.concatenate(
-            (np.stack((a, b), axis=1)[~large[a] & large[b]], np.stack((b, a), axis=1)[~large[b] & large[a]])
-        )
-        if not len(touching):
-            break
-        touching = np.unique(touching, axis=0)
-        apart = np.linalg.norm(middle[touching[:, 0]] - middle[touching[:, 1]], axis=1)
-        touching = touching[np.lexsort((apart, touching[:, 0]))]
-        small, row = np.unique(touching[:, 0], return_index=True)
-        becomes = np.arange(len(size))
-        becomes[small] = touching[row, 1]
-        piece = becomes[piece]
-    return np.unique(piece, return_inverse=True)[1].reshape(-1)
-
-
-def _neighbours(voxels: Int64) -> tuple[Int64, Int64]:
-    """Pairs of voxels that touch by face, edge or corner."""
-    keys = pack_voxels(voxels)
-    order = np.argsort(keys)
-    keys = keys[order]
-    first: list[Int64] = []
-    second: list[Int64] = []
-    for step in _HALF_SPHERE:
-        wanted = pack_voxels(voxels + step)
-        row = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        there = np.flatnonzero(keys[row] == wanted)
-        first.append(there)
-        second.append(order[row[there]])
-    return np.concatenate(first), np.concatenate(second)
-
-
-def _components(count: int, first: Int64, second: Int64) -> Int64:
-    """Number of the connected part that each belongs to. SciPy's libraries need 270 MB, and few sessions refine."""
-    check_room_for_scipy()
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(first), np.bool_), (first, second)), shape=(count, count))
-    return connected_components(links, directed=False)[1].astype(np.int64)

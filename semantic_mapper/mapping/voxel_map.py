@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.localization.places import PlaceStore, moved_place, shared_places
+from semantic_mapper.localization.places import Place, PlaceStore, moved_place, shared_places
 from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
-from semantic_mapper.mapping.files.map_file import MapManifest, open_map
-from semantic_mapper.mapping.files.map_saving import MapSaving
+from semantic_mapper.mapping.files.map_file import BlockPart, MapManifest, open_map
+from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
-from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, clear_in_view, clear_without_return, depth_bounds
+from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, clear_in_view, depth_bounds
 from semantic_mapper.mapping.fusion.fuse import (
     SURFACE_WEIGHT,
     check_depth,
@@ -33,7 +33,7 @@ from semantic_mapper.mapping.fusion.fuse import (
     trusted_depth,
 )
 from semantic_mapper.mapping.map_scale import require_same_scale, scale_name
-from semantic_mapper.mapping.map_types import InstanceLayer, MapMesh, MapPoints, MapView
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.changes import (
@@ -66,9 +66,8 @@ class VoxelMap:
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
     are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
-    where none did. ``instances`` says which voxels belong to which thing, where that refinement found out; None
-    otherwise, and as soon as anything changes. ``places`` are views to find the map again by. ``cleared`` counts the
-    voxels of surfaces that frames saw through, and that were forgotten (``clear_free_space``), in this process.
+    where none did. ``places`` are views to find the map again by. ``cleared`` counts the voxels of surfaces that frames
+    saw through, and that were forgotten (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.
@@ -89,7 +88,6 @@ class VoxelMap:
         self.last_stamp_ns = 0
         self.scale_known = True
         self.refined = ""
-        self.instances: InstanceLayer | None = None
         self.places = PlaceStore()
         self.cleared = 0
         self._cleared_rows = NONE_CLEARED
@@ -179,8 +177,7 @@ class VoxelMap:
 
         Args:
             frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
-            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement. All but
-                the last are free space up to ``no_return_range_m``.
+            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement.
             probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
@@ -201,8 +198,7 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if frame.intrinsics.distorted:
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        given = check_depth(depth_m, frame.intrinsics, where)
-        depth, weights = trusted_depth(given, trust, where)
+        depth, weights = trusted_depth(check_depth(depth_m, frame.intrinsics, where), trust, where)
         table = None
         if probabilities is not None:
             table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
@@ -238,10 +234,7 @@ class VoxelMap:
                 )
                 cleared.append((pack_keys(self._grid.buffers().keys[blocks]), voxels))
             if clears:
-                grid, limits, reach = self._grid, self._limits, self.config.no_return_range_m
-                cleared += clear_in_view(grid, packed, camera, limits, depth, rgb, bounds, self.version)
-                if reach > 0:
-                    cleared += clear_without_return(grid, camera, limits, given, rgb, reach, self.version)
+                cleared += clear_in_view(self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version)
                 for keys, voxels in cleared:
                     self.cleared += int(voxels.sum())
                     some = np.flatnonzero(voxels)
@@ -268,7 +261,6 @@ class VoxelMap:
             MapError: see ``BlockGrid.batches``.
         """
         version = self.version + 1
-        self.instances = None
         for blocks in self._grid.batches(packed):
             yield blocks
             self._grid.mark_changed(blocks, version)
@@ -289,24 +281,9 @@ class VoxelMap:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
             self.note_scale(other.scale_known)
-            self.refined, self.instances, self.places = other.refined, other.instances, other.places
+            self.refined, self.places = other.refined, other.places
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
-
-    def copy(self) -> VoxelMap:
-        """Another map with the same blocks, counters and places.
-
-        Raises:
-            MapError: there is no memory, or the disk fails.
-        """
-        other = VoxelMap(self.config, self.label_set)
-        with _KERNEL_LOCK:
-            copy_blocks(other._grid, self._grid, self.frames, measured=False)
-            other.frames = other.version = self.frames
-            other.last_stamp_ns = self.last_stamp_ns
-        other.note_scale(self.scale_known)
-        other.places = PlaceStore(self.places.places)
-        return other
 
     def points(self, min_weight: float = SURFACE_WEIGHT) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order.
@@ -387,20 +364,16 @@ class VoxelMap:
     def save(self, path: Path, between: Callable[[], object] = lambda: None) -> None:
         """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.
 
-        Other threads may go on integrating: they wait for a copy of ``CHUNK_BLOCKS`` at most, and what they change
-        before it is written is first put aside, in memory or in the folder for temporary files.
-
-        Args:
-            path: Of the file.
-            between: Called after every ``CHUNK_BLOCKS``.
+        Other threads may go on integrating: they wait for a copy of ``CHUNK_BLOCKS`` at most. ``between`` is called
+        after each of them.
 
         Raises:
             MapError: the file cannot be written; one that was there before is as it was.
         """
-        self.begin_save().write(path, between)
+        self.snapshot().write(path, between)
 
-    def begin_save(self) -> MapSaving:
-        """The map as it is now, for another thread to write; see ``save``."""
+    def snapshot(self) -> MapSnapshot:
+        """The map as it is now: for another thread to write, or to begin with again (``restored``)."""
         with _KERNEL_LOCK:
             manifest = MapManifest(
                 config=self.config,
@@ -410,7 +383,18 @@ class VoxelMap:
                 scale=scale_name(self.scale_known),
                 refined=self.refined,
             )
-            return MapSaving(self.locked, manifest, self.instances, self.places.places)
+            return MapSnapshot(self._grid, _KERNEL_LOCK, manifest, self.places.places)
+
+    @classmethod
+    def restored(cls, snapshot: MapSnapshot) -> VoxelMap:
+        """Another map, as one was when the snapshot was made, bit for bit.
+
+        Raises:
+            MapError: there is no memory, or the disk fails.
+        """
+        made = cls(snapshot.manifest.config, snapshot.manifest.label_set)
+        made._begin_with(snapshot.manifest, snapshot.parts(), snapshot.places)
+        return made
 
     @classmethod
     def load(cls, path: Path, memory_mb: int | None = None, config: VoxelMapConfig | None = None) -> VoxelMap:
@@ -442,17 +426,18 @@ class VoxelMap:
                     f"{path}: the saved configuration cannot be used: {error}. Where memory is short, load with a "
                     "memory_mb of your own"
                 ) from error
-            for keys, values in reader.parts():
-                with _KERNEL_LOCK:
-                    blocks = loaded._grid.fill(pack_keys(keys), values)
-                    loaded._grid.mark_changed(blocks, saved.frames)
-            loaded.instances = reader.instances()
-            loaded.places = PlaceStore(reader.places())
-        loaded.frames = loaded.version = saved.frames
-        loaded.last_stamp_ns = saved.last_stamp_ns
-        loaded.note_scale(saved.scale_known)
-        loaded.refined = saved.refined
+            loaded._begin_with(saved, reader.parts(), reader.places())
         return loaded
+
+    def _begin_with(self, manifest: MapManifest, parts: Iterable[BlockPart], places: tuple[Place, ...]) -> None:
+        for keys, values in parts:
+            with _KERNEL_LOCK:
+                self._grid.mark_changed(self._grid.fill(pack_keys(keys), values), manifest.frames)
+        self.frames = self.version = manifest.frames
+        self.last_stamp_ns = manifest.last_stamp_ns
+        self.note_scale(manifest.scale_known)
+        self.refined = manifest.refined
+        self.places = PlaceStore(places)
 
     def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
         """A new map of what both have measured, in this map's frame and with its settings; see ``add``."""
@@ -488,7 +473,7 @@ class VoxelMap:
         with _KERNEL_LOCK:
             version = self.version + other.frames
             if not self.block_count and (T_self_other == np.eye(4)).all():
-                copy_blocks(self._grid, other._grid, version, measured=True)
+                copy_blocks(self._grid, other._grid, version)
             else:
                 transform = voxel_transform(T_self_other, self.config.voxel_size_m)
                 add_blocks(self._grid, other._grid, transform, self.config.max_weight, version)
@@ -497,7 +482,6 @@ class VoxelMap:
             self.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)
             self.note_scale(other.scale_known)
             self.refined = self.refined or other.refined
-            self.instances = None
             for place in other.places.places:
                 self.places.add(moved_place(place, T_self_other))
 

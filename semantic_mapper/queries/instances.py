@@ -149,7 +149,7 @@ class InstanceTracker:
         with self._lock:
             last = self._last
             surface = class_surface(snapshot, wanted, last.surface if last else None)
-            found = _find_things(snapshot, surface, self._min_voxels)
+            found = find_components(surface, self._min_voxels)
             sizes = np.diff(found.ends, prepend=0)
             ids, same = np.zeros(len(sizes), np.int64), np.full(len(sizes), -1, np.int64)
             if last:
@@ -276,17 +276,6 @@ def describe_thing(
     )
 
 
-def _find_things(snapshot: MapSnapshot, surface: ClassSurface, min_voxels: int) -> Components:
-    """Connected pieces of one class; or, of a map that says itself which voxels belong to which thing, those things."""
-    if snapshot.instances is None:
-        return find_components(surface, min_voxels)
-    keys = np.repeat(surface.packed, np.diff(surface.start))
-    within = np.stack((surface.voxel & 7, (surface.voxel >> 3) & 7, surface.voxel >> 6), axis=1)
-    number = snapshot.instances.at(unpack_keys(keys).astype(np.int64) * 8 + within)
-    # A thing has one class; a voxel that reads as another since it is too unsure of its own belongs to none.
-    return components_of(np.where(number >= 0, number * 256 + surface.label, -1), min_voxels)
-
-
 @kernel
 def find_overlaps(old: _LabelledVoxels, new: _LabelledVoxels, count: int, pairs: Int64) -> int:
     """Write ``old component * count + new component`` of every voxel that has both; returns how many there are.
@@ -351,18 +340,10 @@ def find_components(surface: ClassSurface, min_voxels: int) -> Components:
     return _kept(first, min_voxels)
 
 
-def components_of(number: NDArray[np.int64], min_voxels: int) -> Components:
-    """Surface voxels (N,) of the same number, whether they touch or not; -1 belongs to none."""
-    _, index, inverse = np.unique(number, return_index=True, return_inverse=True)
-    return _kept(index[inverse.reshape(-1)], min_voxels, number >= 0)
-
-
-def _kept(first: NDArray[np.int64], min_voxels: int, wanted: NDArray[np.bool_] | None = None) -> Components:
-    """The components that are large enough, given the first voxel (N,) of each voxel's; of ``wanted`` (N,) ones."""
+def _kept(first: NDArray[np.int64], min_voxels: int) -> Components:
+    """The components that are large enough, given the first voxel (N,) of each voxel's."""
     count = len(first)
     sizes = np.bincount(first, minlength=count)  # at the first voxel of each component
-    if wanted is not None:
-        sizes = sizes * wanted
     large = np.flatnonzero(sizes >= min_voxels)
     number = np.full(count, -1, np.int64)
     number[large] = np.arange(len(large))

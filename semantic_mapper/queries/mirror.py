@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, make_block_index, pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import BlockChanges
@@ -58,7 +57,7 @@ class MapMirror:
     def of(cls, voxel_map: VoxelMap) -> MapMirror:
         """Mirror of a live or loaded map as it is now; further ``changes`` since its version may be applied."""
         mirror = cls(voxel_map.config.voxel_size_m, voxel_map.config.truncation_voxels, voxel_map.label_set)
-        mirror.apply(voxel_map.changes(0), voxel_map.instances)
+        mirror.apply(voxel_map.changes(0))
         return mirror
 
     @classmethod
@@ -71,7 +70,7 @@ class MapMirror:
         with open_map(path) as reader:
             config = reader.manifest.config
             mirror = cls(config.voxel_size_m, config.truncation_voxels, reader.manifest.label_set)
-            mirror.apply(reader.changes(), reader.instances())
+            mirror.apply(reader.changes())
         return mirror
 
     @property
@@ -88,8 +87,8 @@ class MapMirror:
         """The present state; stays as it is whatever is applied later."""
         return self._snapshot
 
-    def apply(self, changes: BlockChanges, instances: InstanceLayer | None = None) -> MapSnapshot:
-        """Take over changes and return the present state, with the ``instances`` of the map as it is then.
+    def apply(self, changes: BlockChanges) -> MapSnapshot:
+        """Take over changes and return the present state.
 
         After a new epoch, that is the last one of the old epoch until changes have come up to the map's newest version.
 
@@ -130,7 +129,6 @@ class MapMirror:
                 index=index,
                 voxels=pool,
                 scale_known=changes.scale_known,
-                instances=instances,
                 cleared=old.cleared.followed_by(changes.cleared.between(old.version, changes.version)),
             )
             if changes.epoch == self._snapshot.epoch or changes.version >= changes.newest:

@@ -264,7 +264,7 @@ class CorrectPosesRequest(Request[Correction], frozen=True, kw_only=True):
     about_map: ClassVar[bool] = False
     id: Word
     cameras: Annotated[tuple[Word, ...], Meta(min_length=1, max_length=256)]  # ("",) = whichever took the frame
-    until_ns: Stamp | None = None  # see ``MappingPipeline.correct_poses``
+    until_ns: Stamp | None = None  # see ``MapCorrector.start``
     within_ns: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 0  # how far from a stamp its frame may be
     stamps_ns: Int64  # (N,)
     camera: UInt8  # (N,) index of ``cameras``

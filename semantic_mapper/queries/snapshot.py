@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
 from semantic_mapper.mapping.storage.changes import (
     CONFIDENCE_STEPS,
@@ -61,7 +60,6 @@ class MapSnapshot:
         index: The same as a table for compiled code.
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
         scale_known: Whether lengths are metres.
-        instances: Which voxels belong to which thing; None = not known.
         cleared: Which blocks lost surface that frames saw through, and when; the latest.
         moving: (M, 3) int64 voxels where something moves that is left out of the map; see ``with_moving``.
     """
@@ -78,7 +76,6 @@ class MapSnapshot:
     index: BlockIndex
     voxels: BlockVoxels
     scale_known: bool = True
-    instances: InstanceLayer | None = None
     cleared: ClearedBlocks = NONE_CLEARED
     moving: Int64 = field(default_factory=lambda: np.empty((0, 3), np.int64))
 

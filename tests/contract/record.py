@@ -4,9 +4,8 @@
     OMP_NUM_THREADS=1 python -m tests.contract.record map cli     # some groups
 
 Golden data says what users have. Record again only what was meant to change, look at `git diff` of the JSON files, and
-say in the commit why users can live with it. Old bytes of the wire are never replaced: where a message is packed
-otherwise now, the new bytes are added beside the old ones, and files of the first recording stay (delete one by hand to
-make it again). The group ``kitchen`` needs the recording redkitchen (SEMANTIC_MAPPER_SHARED_DATA); only numbers of it
+say in the commit why users can live with it. Maps and other binary files stay: delete one by hand to make it again.
+The group ``kitchen`` needs the recording redkitchen (SEMANTIC_MAPPER_SHARED_DATA); only numbers of it
 are kept.
 """
 
@@ -22,6 +21,16 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from semantic_mapper import errors
+from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.fields.checkpoint import default_checkpoint_path
+from semantic_mapper.queries.questions import QUESTIONS, decode_question
+from semantic_mapper.testing import LogReplays
+from semantic_mapper.transport.codec import decode, encode
+from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.messages import TOPICS
+from semantic_mapper.transport.pose_message import decode_pose
+from semantic_mapper.transport.query_messages import decode_answer, encode_answer, encode_error, encode_request
 from tests.contract import entry_points as api
 from tests.contract import golden, runs, samples
 from tests.contract.golden import FOLDER, LOG, MAP, MAP_COARSE, POINTS, STORED, WEIGHTS
@@ -31,51 +40,47 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 def record_wire(folder: Path) -> None:
     """Bytes of every message, and what they say."""
-    known: dict[str, Any] = golden.read("wire") if (FOLDER / "wire.json").exists() else {}
-    wire: dict[str, Any] = {group: known.get(group, {}) for group in ("messages", "questions", "answers", "errors")}
+    wire: dict[str, Any] = {group: {} for group in ("messages", "questions", "answers", "errors", "poses")}
     for name, (topic, message, options) in samples.messages().items():
-        packing = (api.CodecOptions(**options),) if topic in api.TAKES_OPTIONS else ()
-        parts = api.encode_message[topic](message, *packing)
-        decoded: Any = api.decode_message(parts)
+        parts = encode(message, CodecOptions(**options))
+        decoded: Any = decode(parts)
         said, more = golden.plain(decoded), {}
         if "jpeg" in name:
             del said["rgb"]["digest"]
             more = {"pixels": b64encode(decoded.rgb.tobytes()).decode()}
         _keep(wire["messages"], name, parts, said, "jpeg" not in name, topic=topic, options=options, **more)
     for kind, fields in samples.questions().items():
-        parts = api.encode_question(kind, api.QUESTIONS[kind].request(**fields))
-        _keep(wire["questions"], kind, parts, golden.plain(api.decode_question(parts)), True, kind=kind)
+        parts = encode_request(kind, QUESTIONS[kind].request(**fields))
+        _keep(wire["questions"], kind, parts, golden.plain(decode_question(parts)), True, kind=kind)
     for kind, answer in samples.answers().items():
-        parts = api.encode_answer(kind, samples.STATE, answer)
-        _keep(wire["answers"], kind, parts, golden.plain(api.decode_answer(kind, parts)), True, kind=kind)
+        parts = encode_answer(kind, samples.STATE, answer)
+        _keep(
+            wire["answers"],
+            kind,
+            parts,
+            golden.plain(decode_answer(kind, QUESTIONS[kind].answer, parts)),
+            True,
+            kind=kind,
+        )
     for name in ("MapError", "LabelError", "CodecError", "ShapeError", "PoseError", "WeightsError"):
-        parts = api.encode_error(api.importable("semantic_mapper.errors", name)("the box is empty"))
+        parts = encode_error(getattr(errors, name)("the box is empty"))
         try:
-            api.decode_answer("at", parts)
-        except api.SemanticMapperError as error:
-            wire["errors"].setdefault(name, {"parts": _texts(parts), "raises": type(error).__name__})
-    wire["poses"] = known.get("poses", {})
+            decode_answer("at", QUESTIONS["at"].answer, parts)
+        except SemanticMapperError as error:
+            wire["errors"][name] = {"parts": _texts(parts), "raises": type(error).__name__}
     for name, parts in samples.pose_messages().items():
-        message = api.decode_pose(parts)
+        message = decode_pose(parts)
         said = {**golden.meaning(message), "matrix": golden.plain(message.matrix)}
         _keep(wire["poses"], name, parts, said, name == "msgpack")
     wire["topics"] = {
         name: {"queue": t.queue, "latched": t.latched, "logged": t.logged, "closes": t.closes}
-        for name, t in api.TOPICS.items()
+        for name, t in TOPICS.items()
     }
     golden.write("wire", wire)
 
 
 def _keep(entries: dict[str, Any], name: str, parts: list[bytes], said: Any, exact: bool, **more: Any) -> None:
-    """Add bytes, unless they are there; those of before are for reading alone from then on."""
-    texts = _texts(parts)
-    versions = [n for n in entries if n == name or n.startswith(f"{name}@")]
-    if any(entries[n]["parts"] == texts for n in versions):
-        return
-    for n in versions:
-        entries[n]["exact"] = False
-    new = f"{name}@{len(versions) + 1}" if versions else name
-    entries[new] = {"parts": texts, "says": said, "exact": exact, **more}
+    entries[name] = {"parts": _texts(parts), "says": said, "exact": exact, **more}
 
 
 def _texts(parts: list[bytes]) -> list[str]:
@@ -96,7 +101,7 @@ def record_kitchen(folder: Path) -> None:
     """Numbers of a real recording."""
     shared = Path(os.environ.get("SEMANTIC_MAPPER_SHARED_DATA", SHARED))
     run = runs.replay_kitchen(shared / "redkitchen", folder)
-    weights = golden.digest(api.default_checkpoint_path().read_bytes())
+    weights = golden.digest(default_checkpoint_path().read_bytes())
     golden.write("kitchen", {"numbers": runs.numbers_of(run), "weights": weights})
 
 
@@ -105,7 +110,7 @@ def record_files(folder: Path) -> None:
     from tests.contract import test_files
 
     if not MAP.exists():
-        replays = api.LogReplays(FOLDER, lambda name: folder / name)
+        replays = LogReplays(FOLDER, lambda name: folder / name)
         made = replays(LOG, weights=WEIGHTS, config=golden.STORED_SETTINGS, max_frames=golden.STORED_FRAMES)
         made.store(STORED)
     if not MAP_COARSE.exists():
@@ -115,7 +120,6 @@ def record_files(folder: Path) -> None:
         ran = api.run_here("replay", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, "--max-frames", "2")
         assert ran.code == 0, ran.stderr
         shutil.copyfile(out / "map.npz", MAP_COARSE)
-    test_files.make_small_files()
     golden.write("files", test_files.observe(folder))
 
 
@@ -154,13 +158,6 @@ def record_cli(folder: Path) -> None:
     golden.write("command_line", test_command_line.observe(folder))
 
 
-def record_settings(folder: Path) -> None:
-    """Names and defaults of all settings."""
-    from tests.contract import test_settings
-
-    golden.write("settings", test_settings.observe())
-
-
 def record_python(folder: Path) -> None:
     """Names that programs import, and their arguments."""
     from tests.contract import test_python
@@ -178,7 +175,6 @@ GROUPS: dict[str, Callable[[Path], None]] = {
     "answers": record_answers,
     "exporters": record_exporters,
     "cli": record_cli,
-    "settings": record_settings,
     "python": record_python,
 }
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, ROOM_SETTINGS, WEIGHTS
 
@@ -72,7 +73,7 @@ def numbers_of(run: Path) -> dict[str, Any]:
     """What is held of a run as numbers."""
     summary = summary_of(run)
     points, _, _ = read_ply(run / "map.ply")
-    state = api.VoxelMap.load(run / "map.npz").block_state()
+    state = VoxelMap.load(run / "map.npz").block_state()
     ids, counts = np.unique(points.label, return_counts=True)
     depth = summary["pose_check"]["worst_depth_disagreement"]
     return {

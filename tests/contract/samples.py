@@ -7,10 +7,30 @@ from typing import Any
 
 import numpy as np
 
-from tests.contract import entry_points as api
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.odometry_sessions import CameraPose
+from semantic_mapper.mapping.storage.changes import BlockChanges
+from semantic_mapper.queries.instances import Instance, OrientedBox
+from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+from semantic_mapper.queries.occupancy import DistanceField
+from semantic_mapper.queries.questions import Correction, InstanceArrays, MapInfo, Weights, WeightsEntry
+from semantic_mapper.queries.rays import RayHits
+from semantic_mapper.transport.messages import (
+    EndOfStream,
+    FrameRefused,
+    LabelledKeyframe,
+    Status,
+    StreamInfo,
+    WeightsInUse,
+    WeightsUpdate,
+)
+from semantic_mapper.transport.pose_message import decode_pose, encode_pose
+from semantic_mapper.transport.query_messages import MapState
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
-LENS = api.CameraIntrinsics(20.5, 21.0, 7.5, 5.5, 16, 12, (0.1, -0.05, 0.001, 0.002, 0.01))
-LABELS = api.LabelSet("Küche 7", (1, 2, 9), ("wall", "Tür", "counter top"), ((9, 80, 200), (1, 2, 3), (255, 0, 127)), 0)
+LENS = CameraIntrinsics(20.5, 21.0, 7.5, 5.5, 16, 12, (0.1, -0.05, 0.001, 0.002, 0.01))
+LABELS = LabelSet("Küche 7", (1, 2, 9), ("wall", "Tür", "counter top"), ((9, 80, 200), (1, 2, 3), (255, 0, 127)), 0)
 
 
 def frame(*, depth: bool = True, label: bool = True, exact_mm: bool = True) -> Any:
@@ -19,7 +39,7 @@ def frame(*, depth: bool = True, label: bool = True, exact_mm: bool = True) -> A
     c, s = np.cos(0.3), np.sin(0.3)
     T = np.array(((c, -s, 0, 1.25), (s, c, 0, -0.1), (0, 0, 1, 1 / 3), (0, 0, 0, 1)))
     depth_m = rng.integers(0, 5000, (12, 16)).astype(np.uint16).astype(np.float32) / np.float32(1000)
-    return api.PosedFrame(
+    return PosedFrame(
         stamp_ns=10**18 + 7,
         seq=42,
         camera_id="front:left-1",
@@ -36,7 +56,7 @@ def frame(*, depth: bool = True, label: bool = True, exact_mm: bool = True) -> A
 def map_update() -> Any:
     """A rendered view of the same size."""
     rng = np.random.default_rng(4)
-    return api.MapUpdate(
+    return MapUpdate(
         stamp_ns=10**18 + 7,
         seq=42,
         camera_id="front:left-1",
@@ -57,11 +77,11 @@ def map_update() -> Any:
 def messages() -> dict[str, tuple[str, Any, dict[str, Any]]]:
     """Topic, value and options of packing, by name."""
     data = b"safetensors" * 9
-    weights = api.WeightsUpdate("learner", 2, data, hashlib.sha256(data).hexdigest(), "cd" * 32, 0.8, 0.5, 9, 3)
+    weights = WeightsUpdate("learner", 2, data, hashlib.sha256(data).hexdigest(), "cd" * 32, 0.8, 0.5, 9, 3)
     cameras = {"front:left-1": LENS}
     return {
-        "info": ("info", api.StreamInfo("folder Küche", cameras, LABELS, 200, 6.5, {"place": "lab"}), {}),
-        "info_live": ("info", api.StreamInfo("a camera"), {}),
+        "info": ("info", StreamInfo("folder Küche", cameras, LABELS, 200, 6.5, {"place": "lab"}), {}),
+        "info_live": ("info", StreamInfo("a camera"), {}),
         "frame": ("frame", frame(), {}),
         "frame_without_depth": ("frame", frame(depth=False), {}),
         "frame_without_label": ("frame", frame(label=False), {}),
@@ -69,13 +89,13 @@ def messages() -> dict[str, tuple[str, Any, dict[str, Any]]]:
         "frame_float_depth": ("frame", frame(exact_mm=False), {}),
         "frame_raw": ("frame", frame(), {"rgb": "raw"}),
         "frame_jpeg": ("frame", frame(), {"rgb": "jpeg"}),
-        "end": ("end", api.EndOfStream("player", "error", 200, "disk gone", ("bytes 5 to 9",)), {}),
+        "end": ("end", EndOfStream("player", "error", 200, "disk gone", ("bytes 5 to 9",)), {}),
         "map": ("map", map_update(), {}),
-        "refused": ("refused", api.FrameRefused(4, 5, "front", "pose holds NaN"), {}),
-        "status": ("status", api.Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU",)), {}),
-        "keyframe": ("keyframe", api.LabelledKeyframe(frame(), LABELS, "a person"), {}),
+        "refused": ("refused", FrameRefused(4, 5, "front", "pose holds NaN"), {}),
+        "status": ("status", Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU",)), {}),
+        "keyframe": ("keyframe", LabelledKeyframe(frame(), LABELS, "a person"), {}),
         "weights": ("weights", weights, {}),
-        "in_use": ("in_use", api.WeightsInUse("mapper", 1, "ab" * 32, 2, 2, False, "contradicts", 1, True), {}),
+        "in_use": ("in_use", WeightsInUse("mapper", 1, "ab" * 32, 2, 2, False, "contradicts", 1, True), {}),
     }
 
 
@@ -113,7 +133,7 @@ def questions() -> dict[str, dict[str, Any]]:
     }
 
 
-STATE = api.MapState("m1", 7, 1)
+STATE = MapState("m1", 7, 1)
 
 
 def answers() -> dict[str, Any]:
@@ -122,7 +142,7 @@ def answers() -> dict[str, Any]:
     u8, f4 = rng.integers(0, 255, 3).astype(np.uint8), rng.random(3).astype(np.float32)
     rgb, xyz = rng.integers(0, 255, (3, 3)).astype(np.uint8), rng.random((3, 3)).astype(np.float32)
     measured = np.array((True, False, True))
-    correction = api.Correction(
+    correction = Correction(
         running=True,
         done=3,
         total=9,
@@ -136,11 +156,12 @@ def answers() -> dict[str, Any]:
         left_out=1,
         epoch=2,
     )
-    entry = api.WeightsEntry(1, "ab" * 32, "in use", 0.7, 0.5, 9)
-    box = api.OrientedBox(*rng.random((2, 3)), rng.random((3, 3)))
+    entry = WeightsEntry(1, "ab" * 32, "in use", 0.7, 0.5, 9)
+    center, size = rng.random((2, 3))
+    box = OrientedBox(center, size, rng.random((3, 3)))
     voxels = np.array([[1, 2, 3], [4, 5, -6]], np.int32)
-    thing = api.Instance(4, 9, "counter top", 0.75, rng.random(3), box, voxels)
-    changes = api.BlockChanges(
+    thing = Instance(4, 9, "counter top", 0.75, rng.random(3), box, voxels)
+    changes = BlockChanges(
         since=3,
         version=7,
         newest=9,
@@ -153,21 +174,19 @@ def answers() -> dict[str, Any]:
     )
     far = np.array((1.5, np.inf, 0.25), np.float32)
     return {
-        "info": api.MapInfo("m1", 7, 1, 9, 0.05, 4.0, LABELS),
-        "at": api.PointAnswers(u8, f4, f4[::-1], u8 % 3, measured),
-        "nearest": api.NearestSurface(np.array((0.1, 0.2, 1 / 3)), 0.5, 0.75),
-        "cast_rays": api.RayHits(far, u8, f4, rgb, measured),
-        "points_in_box": api.MapPoints(xyz, rgb, u8, f4, measured),
-        "instances": api.InstanceArrays.of([thing], LABELS),
+        "info": MapInfo("m1", 7, 1, 9, 0.05, 4.0, LABELS),
+        "at": PointAnswers(u8, f4, f4[::-1], u8 % 3, measured),
+        "nearest": NearestSurface(np.array((0.1, 0.2, 1 / 3)), 0.5, 0.75),
+        "cast_rays": RayHits(far, u8, f4, rgb, measured),
+        "points_in_box": MapPoints(xyz, rgb, u8, f4, measured),
+        "instances": InstanceArrays.of([thing], LABELS),
         "occupancy": u8 % 3,
-        "pose": api.CameraPose("rooms", 7, np.eye(4)),
-        "distance_field": api.DistanceField(
-            np.array((0.0, 0.1, 0.2)), 0.05, f4.reshape(1, 1, 3), u8.reshape(1, 1, 3) % 3
-        ),
+        "pose": CameraPose("rooms", 7, np.eye(4)),
+        "distance_field": DistanceField(np.array((0.0, 0.1, 0.2)), 0.05, f4.reshape(1, 1, 3), u8.reshape(1, 1, 3) % 3),
         "changes": changes,
         "correct_poses": correction,
         "correction": correction,
-        "weights": api.Weights(1, 0, None, 1, 2, 3, (entry,)),
+        "weights": Weights(1, 0, None, 1, 2, 3, (entry,)),
     }
 
 
@@ -176,5 +195,5 @@ def pose_messages() -> dict[str, list[bytes]]:
     json = b'{"v": 1, "stamp_ns": 12, "position": [1, 2, 0.5], "quaternion": [0, 0, 0.6, 0.8]}'
     text = b'{"v": 1, "stamp_ns": 12, "position": [1, 2, 0.5], "quaternion": [0, 0, 0.6, 0.8], "sigma": 0.02, '
     text += b'"parent": "odom", "child": "base"}'
-    packed = api.encode_pose(api.decode_pose([text]))
+    packed = encode_pose(decode_pose([text]))
     return {"msgpack": packed, "json": [json], "json_with_topic": [b"pose", text]}

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import rerun.chunk
 
+from semantic_mapper.replay.log.format import LogReader
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, MAP, plain, read
 from tests.contract.runs import Points, flat, read_ply
@@ -160,7 +161,7 @@ def look_at_folder(folder: Path) -> dict[str, Any]:
     files = sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file())
     text = {name: json.loads((out / name).read_text()) for name in ("intrinsics.json", "labels.json")}
     assert api.run_here("import", out, folder / "back.mcap").code == 0
-    with api.LogReader(LOG) as log, api.LogReader(folder / "back.mcap") as back:
+    with LogReader(LOG) as log, LogReader(folder / "back.mcap") as back:
         pairs = list(zip(log, back, strict=False))
         for one, other in pairs:
             for name in ("rgb", "label", "T_world_camera"):

@@ -10,6 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from semantic_mapper.drivers.calibration import load_calibration, load_mount
+from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore
+from semantic_mapper.nodes.launcher.launch_file import load_launch
+from semantic_mapper.replay.corrected_poses import read_corrections
+from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.testing import LogReplays
+from semantic_mapper.training.keyframe_pool import KeyframePool
+from semantic_mapper.transport.keys import load_keys
 from tests.contract import entry_points as api
 from tests.contract.golden import (
     FOLDER,
@@ -31,155 +42,6 @@ KEYS, LEARNING = FOLDER / "keys", FOLDER / "learning"
 CORRECTIONS, LAUNCH_FILE = FOLDER / "corrections.tum", FOLDER / "all-kinds.toml"
 POINT_M = 1e-5  # of points read out of a saved map: it is the same map, so float32 rounding at some metres
 
-_RIG = """fx = 80.25
-fy = 80.5
-cx = 47.5
-cy = 35.25
-width = 96
-height = 72
-distortion = [0.1, -0.02, 0.001, 0.002, 0.01]
-T_rig_camera = [
-    [1.0, 0.0, 0.0, 0.1],
-    [0.0, 0.0, 1.0, -0.2],
-    [0.0, -1.0, 0.0, 0.3],
-    [0.0, 0.0, 0.0, 1.0],
-]
-
-[about]
-made_by = "semantic-mapper 0.1.0 calibrate"
-rms_px = 0.21
-"""
-_JSON = '{"fx": 80, "fy": 80, "cx": 47.5, "cy": 35.5, "width": 96, "height": 72, "distortion": [0, 0, 0, 0]}'
-_ALL_KINDS = """# One node of each kind, each kind of camera and of poses, with what launch files of then say.
-heartbeat_s = 1.5
-publish = "tcp://127.0.0.1:5571"
-out = "runs/live"
-
-[[node]]
-name = "log"
-kind = "camera"
-[node.options]
-log = "room.mcap"
-mode = "realtime"
-rate = 0.5
-max_frames = 9
-subscriber_timeout_s = 60.0
-ack_timeout_s = 60.0
-
-[[node]]
-name = "oak"
-kind = "camera"
-restart = "on-failure"
-[node.options.camera]
-kind = "oak"
-id = "oak"
-open_s = 3.0
-T_rig_camera = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-[node.options.camera.config]
-device = ""
-fps = 20.0
-odometry = true
-[node.options.camera.poses]
-kind = "device"
-
-[[node]]
-name = "web"
-kind = "camera"
-[node.options]
-camera = { kind = "v4l2", id = "web", config = { uncalibrated = true }, poses = { kind = "board" } }
-
-[[node]]
-name = "film"
-kind = "camera"
-[node.options.camera]
-kind = "opencv"
-id = "film"
-config = { source = "a.mp4", pace = "fast", uncalibrated = true }
-poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }
-
-[[node]]
-name = "still"
-kind = "camera"
-[node.options.camera]
-kind = "v4l2"
-id = "still"
-config = { uncalibrated = true }
-poses = { kind = "fixed" }
-
-[[node]]
-name = "moving"
-kind = "camera"
-[node.options.camera]
-kind = "oak"
-id = "moving"
-poses = { kind = "rgbd" }
-
-[[node]]
-name = "mapper"
-kind = "mapper"
-[node.options]
-input = ["log", "oak", "web", "film", "still", "moving"]
-delivery = "newest"
-out = "{out}"
-weights = ""
-config = ""
-voxel_size_m = 0.03
-save_every_s = 60.0
-query = "query"
-learner = "finetuner"
-min_map_agreement = 0.5
-publish = "tcp://127.0.0.1:5572"
-
-[[node]]
-name = "recorder"
-kind = "recorder"
-[node.options]
-sources = ["log", "oak", "mapper"]
-streams = 2
-topics = ["info", "frame", "refused", "status", "map"]
-out = "{out}/recorded.mcap"
-split_mb = 100.0
-disk_full = "delete-oldest"
-reserve_mb = 100.0
-rgb = "jpeg"
-jpeg_quality = 80
-
-[[node]]
-name = "finetuner"
-kind = "finetuner"
-[node.options]
-mapper = "mapper"
-labels = "labels"
-cpu_fraction = 0.25
-threads = 1
-niceness = 18
-out = "{out}"
-"""
-
-
-def make_small_files() -> None:
-    """Write those that are not there yet."""
-    CALIBRATIONS.mkdir(exist_ok=True)
-    for path, text in (
-        (CALIBRATIONS / "rig.toml", _RIG),
-        (CALIBRATIONS / "plain.json", _JSON),
-        (LAUNCH_FILE, _ALL_KINDS),
-    ):
-        if not path.exists():
-            path.write_text(text, encoding="utf-8")
-    if not CORRECTIONS.exists():
-        assert (
-            api.run_here("export", LOG, "--out", CORRECTIONS, "--format", "trajectory", "--max-frames", "4").code == 0
-        )
-    if not KEYS.exists():  # a secret key that guards nothing: it is public from the day it was made
-        assert api.run_here("keys", "make", "--keys", KEYS).code == 0
-        key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
-        assert api.run_here("keys", "allow", "robot", key, "--keys", KEYS).code == 0
-    if not LEARNING.exists():
-        with api.LogReader(LOG) as log:
-            kept = api.Kept(log.frame(0), True, 3, 1), api.Kept(log.frame(2), False)
-        api.keep_learning(api.LearningStore(LEARNING, api.ROOMS), kept)
-
 
 def observe(folder: Path) -> dict[str, Any]:
     """What the files of today hold."""
@@ -188,7 +50,7 @@ def observe(folder: Path) -> dict[str, Any]:
 
 def look_at_map(path: Path) -> dict[str, Any]:
     """Frames, settings, classes, all voxels and the surface of a saved map."""
-    voxel_map = api.VoxelMap.load(path)
+    voxel_map = VoxelMap.load(path)
     points = voxel_map.points()
     return {
         "frames": voxel_map.frames,
@@ -210,7 +72,7 @@ def look_at_map(path: Path) -> dict[str, Any]:
 
 def look_at_weights(_: Path) -> dict[str, Any]:
     """Classes, training and network of the golden weights."""
-    checkpoint = api.load_checkpoint(WEIGHTS)
+    checkpoint = load_checkpoint(WEIGHTS)
     tensors = {name: plain(tensor.numpy()) for name, tensor in checkpoint.model.state_dict().items()}
     return {
         "kind": checkpoint.model.kind,
@@ -226,7 +88,7 @@ def look_at_weights(_: Path) -> dict[str, Any]:
 def look_at_calibrations(_: Path) -> dict[str, Any]:
     """Intrinsics and mounts."""
     return {
-        path.name: {"intrinsics": plain(api.load_calibration(path)), "mount": plain(api.load_mount(path))}
+        path.name: {"intrinsics": plain(load_calibration(path)), "mount": plain(load_mount(path))}
         for path in sorted(CALIBRATIONS.iterdir())
     }
 
@@ -236,20 +98,20 @@ def look_at_keys(folder: Path) -> dict[str, Any]:
     copy = folder / "keys"
     shutil.copytree(KEYS, copy)
     (copy / "own.key_secret").chmod(0o600)
-    keys = api.load_keys(copy)
+    keys = load_keys(copy)
     peers = {name: key.decode() for name, key in keys.peers().items()}
     return {"public": keys.public.decode(), "secret": plain(keys.secret), "peers": peers}
 
 
 def look_at_corrections(_: Path) -> dict[str, Any]:
     """Stamps and poses."""
-    found = api.read_corrections(CORRECTIONS)
+    found = read_corrections(CORRECTIONS)
     return {"stamps_ns": found.stamps_ns.tolist(), "poses": found.poses.round(12).ravel().tolist()}
 
 
 def look_at_launch(_: Path) -> dict[str, Any]:
     """Nodes with their options."""
-    launch = api.load_launch(LAUNCH_FILE)
+    launch = load_launch(LAUNCH_FILE)
     return {
         "nodes": {node.name: {"kind": node.kind, "entry": leaves(node)} for node in launch.nodes},
         "options": {name: leaves(options) for name, options in launch.options.items()},
@@ -262,8 +124,8 @@ def look_at_learning(folder: Path) -> dict[str, Any]:
     """Keyframes and progress that a finetuner keeps."""
     copy = folder / "learning"
     shutil.copytree(LEARNING, copy)
-    pool = api.KeyframePool(api.ROOMS, held_out_every=2, capacity=8)
-    progress = api.LearningStore(copy, api.ROOMS).restore(pool)
+    pool = KeyframePool(ROOMS, held_out_every=2, capacity=8)
+    progress = LearningStore(copy, ROOMS).restore(pool)
     return {"kept": {str(k.frame.stamp_ns): leaves(k) for k in pool.kept}, "progress": leaves(progress)}
 
 
@@ -296,13 +158,13 @@ def test_a_map_of_then_is_the_same_map(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", [MAP, MAP_COARSE], ids=lambda p: p.stem)
 def test_a_map_of_then_can_go_on(path: Path, tmp_path: Path) -> None:
-    voxel_map = api.VoxelMap.load(path)
-    with api.LogReader(LOG) as log:
+    voxel_map = VoxelMap.load(path)
+    with LogReader(LOG) as log:
         frame = log.frame(8)
     before = voxel_map.frames
-    assert voxel_map.integrate(frame, frame.depth_m, None) > 0
+    assert frame.depth_m is not None and voxel_map.integrate(frame, frame.depth_m, None) > 0
     voxel_map.save(tmp_path / "map.npz")
-    assert api.VoxelMap.load(tmp_path / "map.npz").frames == before + 1
+    assert VoxelMap.load(tmp_path / "map.npz").frames == before + 1
 
 
 def test_what_a_killed_mapper_leaves_can_be_asked(tmp_path: Path) -> None:
@@ -325,12 +187,12 @@ def test_corrections_of_then_move_the_map(tmp_path: Path) -> None:
         out = tmp_path / str(n)
         ran = api.run_here("replay", LOG, "--out", out, *settings, "--corrections", corrections)
         assert ran.code == 0, ran.stderr
-        means.append(api.VoxelMap.load(out / "map.npz").points().xyz.mean(0))
+        means.append(VoxelMap.load(out / "map.npz").points().xyz.mean(0))
     np.testing.assert_allclose(means[1] - means[0], (0.5, 0, 0), atol=1e-3)  # five whole voxels
 
 
 def test_a_stored_run_of_then_is_what_the_plugin_gets(tmp_path: Path) -> None:
-    replays = api.LogReplays(FOLDER, lambda name: tmp_path / name)
+    replays = LogReplays(FOLDER, lambda name: tmp_path / name)
     made = replays("room.mcap", weights="small.safetensors", config=STORED_SETTINGS, max_frames=STORED_FRAMES)
     # Rays at depth borders are sampled elsewhere since priors follow the image's edges (docs/decisions/0020).
     made.assert_like("stored", labels=0.02, score=0.03)

@@ -9,6 +9,7 @@ from typing import Any
 import mcap.reader
 import pytest
 
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from tests.contract import entry_points as api
 from tests.contract.golden import FRAMES, LOG, REFUSED_SEQ, WEIGHTS, differences, form, lacking, plain, read
 
@@ -17,7 +18,7 @@ CUT_BYTES = 20_000  # from the end: less than one frame
 
 def observe() -> dict[str, Any]:
     """What the log says, by our reader, and by MCAP's own."""
-    with api.LogReader(LOG) as log:
+    with LogReader(LOG) as log:
         frames = [plain(frame) for frame in log]
         info = plain(log.info)
         state = {"finished": log.finished, "errors": len(log.errors), "attachments": len(log.attachments())}
@@ -42,7 +43,7 @@ def test_a_golden_log_says_what_it_said() -> None:
 
 
 def test_a_log_is_written_with_the_same_channels(tmp_path: Path) -> None:
-    with api.LogReader(LOG) as log, api.LogWriter(tmp_path / "again.mcap", log.info) as again:
+    with LogReader(LOG) as log, LogWriter(tmp_path / "again.mcap", log.info) as again:
         for frame in log:
             again.write_frame(frame)
     with (tmp_path / "again.mcap").open("rb") as file:
@@ -50,7 +51,7 @@ def test_a_log_is_written_with_the_same_channels(tmp_path: Path) -> None:
     assert summary is not None
     channels = [[c.topic, c.message_encoding, summary.schemas[c.schema_id].name] for c in summary.channels.values()]
     assert channels == read("log")["channels"]
-    with api.LogReader(LOG) as log, api.LogReader(tmp_path / "again.mcap") as copy:
+    with LogReader(LOG) as log, LogReader(tmp_path / "again.mcap") as copy:
         for one, other in zip(log, copy, strict=True):
             assert plain(one) == plain(other)
 
@@ -68,7 +69,7 @@ def test_a_spoiled_log_is_told_of_and_mended(cut: int, tmp_path: Path) -> None:
     told = json.loads(described.stdout)
     assert told["finished"] == (not cut) and bool(told["damage"]) and described.code == 1
     assert api.run_here("import", log, mended).code == 0
-    with api.LogReader(mended) as clean, api.LogReader(LOG) as whole:
+    with LogReader(mended) as clean, LogReader(LOG) as whole:
         kept, there = {f.seq: plain(f) for f in clean}, {f.seq: plain(f) for f in whole}
         assert clean.finished and not clean.errors and clean.info == whole.info
     assert len(kept) == FRAMES - 1 and all(frame == there[seq] for seq, frame in kept.items())

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, POINTS, REFUSED_SEQ, WEIGHTS, digest, form, lacking, read
 from tests.contract.runs import (
@@ -122,7 +123,7 @@ def test_two_replays_are_equal_bit_for_bit(room_run: Path, tmp_path: Path) -> No
 def test_lockstep_processes_make_the_map_of_one_process_bit_for_bit(room_run: Path, tmp_path: Path) -> None:
     values = {"camera.log": LOG, "mapper.weights": WEIGHTS, "mapper.config": room_run.parent / "room.toml"}
     settings = [word for name, value in values.items() for word in ("--set", f"{name}={value}")]
-    ran = api.run_command("up", api.LAUNCH / "replay.toml", *settings, "--out", tmp_path / "up")
+    ran = api.run_command("up", api.REPOSITORY / "launch" / "replay.toml", *settings, "--out", tmp_path / "up")
     assert ran.code == 0, ran.stderr
     assert digest((tmp_path / "up" / "map.ply").read_bytes()) == digest((room_run / "map.ply").read_bytes())
     compared = api.run_here("compare", room_run, tmp_path / "up", "--exact")
@@ -133,7 +134,7 @@ def test_lockstep_processes_make_the_map_of_one_process_bit_for_bit(room_run: Pa
 @pytest.mark.slow
 def test_numbers_of_a_real_kitchen_are_those_of_then(redkitchen: Path, tmp_path: Path) -> None:
     then = read("kitchen")
-    weights = digest(api.default_checkpoint_path().read_bytes())
+    weights = digest(default_checkpoint_path().read_bytes())
     assert weights == then["weights"], "the package has other weights; record `kitchen` again"
     run = replay_kitchen(redkitchen, tmp_path)
     assert unlike(then["numbers"], numbers_of(run), KITCHEN, KITCHEN_FRACTION) == []

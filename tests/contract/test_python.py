@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
 import re
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +45,14 @@ def imported() -> set[tuple[str, str]]:
     return found
 
 
+def importable(module: str, name: str) -> Any:
+    """What ``from module import name`` gives; the name may have dots."""
+    return attrgetter(name)(importlib.import_module(module))
+
+
 def observe() -> dict[str, Any]:
     """Each name with what can be called: itself, and of a class the public methods and attributes."""
-    return {f"{module}:{name}": calls(api.importable(module, name)) for module, name in sorted(imported() | set(NAMED))}
+    return {f"{module}:{name}": calls(importable(module, name)) for module, name in sorted(imported() | set(NAMED))}
 
 
 def calls(value: Any) -> dict[str, list[list[str]]]:
@@ -71,7 +78,7 @@ _GOLDEN: dict[str, dict[str, list[list[str]]]] = read("python")
 
 @pytest.mark.parametrize("name", _GOLDEN)
 def test_a_name_can_be_imported_and_called_as_then(name: str) -> None:
-    now = calls(api.importable(*name.split(":")))
+    now = calls(importable(*name.split(":")))
     for call, arguments in _GOLDEN[name].items():
         assert call in now, f"{name} has no {call} any more"
         has = dict(map(tuple, now[call]))  # type: ignore[arg-type]
@@ -86,7 +93,7 @@ def test_a_name_can_be_imported_and_called_as_then(name: str) -> None:
 def test_what_documents_import_now_is_there() -> None:
     assert len(imported()) > 15
     for module, name in sorted(imported()):
-        api.importable(module, name)
+        importable(module, name)
 
 
 def test_the_readme_maps_a_log(tmp_path: Path) -> None:

@@ -14,6 +14,11 @@ import msgpack
 import pytest
 import zmq
 
+from semantic_mapper.queries.questions import QUESTIONS
+from semantic_mapper.transport.codec import decode
+from semantic_mapper.transport.messages import Status
+from semantic_mapper.transport.query_messages import decode_answer
+from semantic_mapper.types import MapUpdate
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, ROOM_SETTINGS, WEIGHTS, form, lacking, parts_of, read
 
@@ -94,7 +99,7 @@ def test_a_running_mapper_speaks_as_then(running: tuple[Path, subprocess.Popen[s
         then = parts_of(_WIRE["answers"].get(name, _WIRE["answers"][kind])["parts"])
         assert lacking(form(msgpack.unpackb(then[1])), form(msgpack.unpackb(answer[1]))) == []
         assert len(answer) == len(then)
-        api.decode_answer(kind, answer)
+        decode_answer(kind, QUESTIONS[kind].answer, answer)
     strange = ask(place, [b"fly", b"\x80"])
     assert strange is not None and strange[0] == b"error"
     with zmq.Context.instance().socket(zmq.SUB) as socket:
@@ -107,8 +112,8 @@ def test_a_running_mapper_speaks_as_then(running: tuple[Path, subprocess.Popen[s
         while len(found) < 2 and time.monotonic() < deadline:
             if socket.poll(1000):
                 parts = socket.recv_multipart()
-                found[parts[0].decode()] = api.decode_message(parts)
-    assert isinstance(found["map/rooms/"], api.MapUpdate) and isinstance(found["status/mapper/"], api.Status)
+                found[parts[0].decode()] = decode(parts)
+    assert isinstance(found["map/rooms/"], MapUpdate) and isinstance(found["status/mapper/"], Status)
     assert found["map/rooms/"].label.shape == (72, 96) and found["status/mapper/"].state == "running"
     process.send_signal(signal.SIGINT)
     _, told = process.communicate(timeout=api.TIMEOUT_S)

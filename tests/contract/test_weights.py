@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, WEIGHTS, read
 from tests.contract.test_map import unlike
@@ -46,9 +47,9 @@ ROUNDING_OF_FITS = {
 def without_depth(folder: Path) -> Path:
     """The golden log as a camera without a depth sensor would have recorded it."""
     path = folder / "blind.mcap"
-    with api.LogReader(LOG) as reader:
+    with LogReader(LOG) as reader:
         info = msgspec.structs.replace(reader.info, label_set=None)
-        with api.LogWriter(path, info, overwrite=True) as log:
+        with LogWriter(path, info, overwrite=True) as log:
             for frame in reader:
                 log.write_frame(dataclasses.replace(frame, depth_m=None, label=None))
     return path
@@ -63,7 +64,7 @@ def rendered(weights: str, folder: Path, *, classes: bool = True) -> dict[str, A
             continue
         ran = api.run_here("autolabel", log, "--weights", weights, "--out", out, *options, "--max-frames", str(FRAMES))
         assert ran.code == 0, ran.stderr
-        with api.LogReader(out) as reader:
+        with LogReader(out) as reader:
             frames = list(reader)
         out.unlink()
         if log == LOG:

@@ -9,16 +9,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.drivers import live
 from semantic_mapper.drivers.base import Camera, CameraImage
-from semantic_mapper.drivers.calibration import Rectifier, load_calibration
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.v4l2 import ioctls, list_devices
-from semantic_mapper.drivers.v4l2.ioctls import Capability
 from semantic_mapper.errors import CameraError, ConfigError
 from tests.drivers.fake_v4l2 import METADATA, Capture, Machine, Sensor, make_machine, write_calibration
 
@@ -82,15 +78,6 @@ def test_stamps_of_another_clock_are_replaced_by_the_time_of_arrival_and_told(
         image = next(iter(camera))
         assert before_ns - 1_000_000_000 < image.stamp_ns <= time.monotonic_ns()
         assert len(camera.warnings) == 1 and "stamped when they arrive" in camera.warnings[0]
-
-
-def test_stamps_that_foretell_the_end_of_an_exposure_are_no_later_than_the_arrival(
-    machine: Machine, tmp_path: Path
-) -> None:
-    device = machine.plug(Sensor(clock=lambda: time.monotonic() + 0.07), 0)
-    with v4l2(device, tmp_path) as camera:
-        image = next(iter(camera))
-        assert image.stamp_ns <= time.monotonic_ns() and camera.warnings == ()
 
 
 def test_another_pixel_format_and_rate_than_asked_for_are_told(machine: Machine, tmp_path: Path) -> None:
@@ -267,20 +254,6 @@ def test_values_of_more_than_32_bits_are_refused(machine: Machine, tmp_path: Pat
         v4l2(device, tmp_path, **settings)
 
 
-def test_controls_are_set_again_when_the_camera_comes_back(machine: Machine, tmp_path: Path) -> None:
-    sensor = Sensor()
-    with v4l2(machine.plug(sensor, 0), tmp_path, gain=40) as camera:
-        images = iter(camera)
-        next(images)
-        machine.unplug(sensor)
-        sensor.values.clear()
-        until(lambda: camera.warnings != ())
-        plugged_ns = time.monotonic_ns()
-        machine.plug(sensor, 1)
-        image_where(images, lambda image: image.stamp_ns > plugged_ns)
-        assert sensor.values[ioctls.GAIN] == 40
-
-
 def test_listing_names_cameras_by_id_and_leaves_metadata_out(machine: Machine) -> None:
     link = machine.plug(Sensor(), 10)
     machine.plug(Sensor(capabilities=METADATA), 11, link="usb-HD_Webcam-video-index1")
@@ -290,19 +263,6 @@ def test_listing_names_cameras_by_id_and_leaves_metadata_out(machine: Machine) -
     assert rows == [("v4l2", "Grabber", str(plain)), ("v4l2", "?", str(dead)), ("v4l2", "HD Webcam", str(link))]
     notes = [c.note for c in list_devices()]
     assert notes[2] == "video10; MJPG YUYV; uvcvideo at usb-1.2" and "does not answer" in notes[1]
-
-
-def test_a_camera_that_may_not_be_opened_is_listed_with_the_mend(
-    machine: Machine,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    machine.plug(Sensor(), 0)
-
-    def refuse(*arguments: object) -> Capability:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("semantic_mapper.drivers.v4l2.ioctls.query_capability", refuse)
-    assert "group `video`" in list_devices()[0].note
 
 
 def test_stop_ends_the_iteration_from_another_thread_even_while_the_camera_is_gone(
@@ -331,44 +291,3 @@ def test_a_failure_of_the_reading_thread_is_no_silence(
         monkeypatch.setattr("tests.drivers.fake_v4l2.Capture.read", lambda capture: 1 / 0)
         with pytest.raises(CameraError, match="its reading thread has failed"):
             list(images)
-
-
-def test_pauses_between_attempts_grow_to_a_limit(
-    machine: Machine,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pauses: list[float] = []
-
-    class Recording(threading.Event):
-        def wait(self, timeout: float | None = None) -> bool:
-            pauses.append(timeout or 0.0)
-            return super().wait(0.001)
-
-    sensor = Sensor()
-    monkeypatch.setattr(live, "MAX_PAUSE_S", 0.4)
-    camera = v4l2(machine.plug(sensor, 0), tmp_path)
-    monkeypatch.setattr(camera, "_stopping", Recording())
-    with camera:
-        next(iter(camera))
-        machine.unplug(sensor)
-        until(lambda: len(pauses) >= 5)
-    assert pauses[:5] == [0.1, 0.2, 0.4, 0.4, 0.4]
-
-
-def test_lens_distortion_is_taken_out(machine: Machine, tmp_path: Path) -> None:
-    path = tmp_path / "lens.json"
-    path.write_text(
-        '{"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48, "distortion": [-0.3, 0.1, 0, 0]}'
-    )
-    with v4l2(machine.plug(Sensor(), 0), tmp_path, calibration=str(path)) as camera:
-        image = next(iter(camera))
-    assert image.intrinsics == Rectifier(load_calibration(path)).intrinsics
-    assert image.intrinsics.distortion == () and image.intrinsics.fx != 60
-    assert (image.rgb == (100, 50, 0)).all()
-
-
-def test_fourcc_is_text_whatever_the_device_says() -> None:
-    assert ioctls.fourcc_text(cv2.VideoWriter.fourcc(*"MJPG")) == "MJPG"
-    assert ioctls.fourcc_text(0) == "...."
-    assert ioctls.fourcc_text(cv2.VideoWriter.fourcc(*"Y16 ") | 1 << 31) == "Y16 -BE"

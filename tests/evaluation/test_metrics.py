@@ -10,12 +10,8 @@ from semantic_mapper.errors import LabelError, ShapeError
 from semantic_mapper.evaluation.metrics import (
     ConfidenceScores,
     ConfusionMatrix,
-    calibration,
+    ImageMeans,
     confusion_of,
-    map_confusion,
-    map_miou,
-    metrics_per_image,
-    nearest_labels,
 )
 from semantic_mapper.labels import SCANNET20, make_label_set
 
@@ -87,11 +83,14 @@ def test_per_image_means_differ_from_data_set_figures() -> None:
     small = confusion_of(u8(2), u8(2), THREE)  # one pixel, right
     large = confusion_of(u8(2, 2, 2, 5), u8(5, 5, 5, 5), THREE)  # wall 0, chair 1/4
     empty = confusion_of(u8(255), u8(2), THREE)
-    m = metrics_per_image([small, large, empty])
+    means = ImageMeans()
+    assert means.metrics().miou is None
+    for image in (small, large, empty):
+        means.add(image)
+    m = means.metrics()
     assert m.miou == pytest.approx((1 + 1 / 8) / 2)
     assert m.total_accuracy == pytest.approx((1 + 1 / 4) / 2)
     assert m.per_class == pytest.approx({"wall": 0.5, "chair": 0.25})
-    assert metrics_per_image([]).miou is None
 
 
 def test_other_shapes_and_foreign_ids_are_refused_by_name() -> None:
@@ -103,73 +102,17 @@ def test_other_shapes_and_foreign_ids_are_refused_by_name() -> None:
         ConfusionMatrix(THREE) + ConfusionMatrix(SCANNET20)
 
 
-def test_nearest_labels_stop_at_the_distance() -> None:
-    source = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
-    asking = np.array([[0.02, 0, 0], [0.97, 0, 0], [0.5, 0, 0]], np.float32)
-    found = nearest_labels(asking, source, u8(2, 5), THREE, max_distance_m=0.05)
-    np.testing.assert_array_equal(found, u8(2, 5, 255))
-
-
-def test_an_empty_map_knows_nothing() -> None:
-    none = np.zeros((0, 3), np.float32)
-    truth = np.zeros((2, 3), np.float32)
-    np.testing.assert_array_equal(nearest_labels(truth, none, u8(), THREE), u8(255, 255))
-    assert map_miou(truth, u8(2, 5), none, u8(), THREE) == 0
-    assert map_miou(truth, u8(255, 255), none, u8(), THREE) is None
-
-
-def test_holes_in_the_map_cost_as_much_as_wrong_labels() -> None:
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], np.float32)
-    truth = u8(2, 2, 5, 5)
-    with_hole = map_confusion(vertices, truth, vertices[:3], truth[:3], THREE).metrics()
-    with_error = map_confusion(vertices, truth, vertices, u8(2, 2, 5, 9), THREE).metrics()
-    assert with_hole.miou == with_error.miou == pytest.approx(0.75)
-    assert with_hole.coverage == pytest.approx(0.75)
-    assert map_miou(vertices, truth, vertices, truth, THREE) == 1
-
-
-def test_points_of_another_shape_are_refused() -> None:
-    with pytest.raises(ShapeError, match="at_xyz"):
-        nearest_labels(np.zeros((3, 2), np.float32), np.zeros((1, 3), np.float32), u8(2), THREE)
-    with pytest.raises(ShapeError, match="from_label"):
-        nearest_labels(np.zeros((3, 3), np.float32), np.zeros((1, 3), np.float32), u8(2, 2), THREE)
-
-
-def test_calibration_error_by_hand() -> None:
-    confidence = np.array([0.9, 0.9, 0.9, 0.9, 0.6, 0.6])
-    correct = np.array([True, True, True, False, True, False])
-    result = calibration(confidence, correct, bins=10)
-    assert result.ece == pytest.approx((4 * 0.15 + 2 * 0.1) / 6)
-    assert result.count.sum() == 6
-    assert np.isnan(result.accuracy[0])
-
-
-def test_believable_confidences_have_little_calibration_error(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("boast", [False, True])
+def test_calibration_error_is_the_distance_of_confidence_from_accuracy(rng: np.random.Generator, boast: bool) -> None:
     p = rng.random(200_000).astype(np.float32)
     correct = rng.random(p.shape) < p
-    honest, boasting = calibration(p, correct).ece, calibration(np.sqrt(p), correct).ece
-    assert honest is not None and honest < 0.01
-    assert boasting == pytest.approx(1 / 6, abs=0.01)  # mean of sqrt(p) - p
-
-
-def test_confidences_that_are_not_probabilities_are_refused() -> None:
-    for bad in (1.5, -0.1, np.nan):
-        with pytest.raises(ShapeError, match="probabilities"):
-            calibration(np.array([bad]), np.array([True]))
-    assert calibration(np.zeros(0), np.zeros(0, bool)).ece is None
-
-
-def test_confidences_of_several_images_add_up_to_the_calibration_of_all_and_strange_pixels_stay_out():
-    draw = np.random.default_rng(3)
-    confidence = draw.random((4, 500), np.float32)
-    correct = draw.random((4, 500)) < confidence
-    strange = draw.random((4, 500)) < 0.2
     scores = ConfidenceScores()
-    for row in zip(confidence, correct, strange, strict=True):
-        scores.update(*row)
-    whole = calibration(confidence[~strange], correct[~strange])
-    assert scores.calibration.ece == pytest.approx(whole.ece, abs=1e-9)
-    assert np.array_equal(scores.calibration.count, whole.count)
+    for part in np.array_split(np.arange(len(p)), 3):  # images add up
+        confidence = np.sqrt(p[part]) if boast else p[part]
+        strange = np.arange(len(part)) % 7 == 0
+        scores.update(confidence, correct[part] & ~strange, strange)
+    expected = 1 / 6 if boast else 0  # mean of sqrt(p) - p
+    assert scores.calibration_error == pytest.approx(expected, abs=0.01)
 
 
 def test_of_pixels_above_a_confidence_it_is_known_how_many_there_are_and_how_many_are_right():
@@ -192,4 +135,4 @@ def test_open_set_auroc_is_how_often_a_known_pixel_is_surer_than_a_strange_one()
     assert alike.open_set_auroc == 0.5
     nothing = ConfidenceScores()
     nothing.update(np.full(2, 0.5, np.float32), np.ones(2, bool), np.zeros(2, bool))
-    assert nothing.open_set_auroc is None and nothing.calibration.ece is not None
+    assert nothing.open_set_auroc is None and nothing.calibration_error is not None

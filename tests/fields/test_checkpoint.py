@@ -13,6 +13,7 @@ from semantic_mapper.fields.checkpoint import (
     Checkpoint,
     adapt_model,
     anchor_from_frame,
+    default_checkpoint_path,
     find_checkpoint,
     load_checkpoint,
     save_checkpoint,
@@ -89,6 +90,22 @@ def test_metadata_that_cannot_be_used_are_refused_with_the_reason(tmp_path, chan
     save_checkpoint(Checkpoint(tiny_field()), path)
     change_metadata(path, **changes)
     with pytest.raises(WeightsError, match=r"w\.safetensors: its metadata is damaged: \w+: "):
+        load_checkpoint(path)
+
+
+def test_weights_that_name_a_base_hold_the_rest_of_its_tensors(tmp_path):
+    base = load_checkpoint(default_checkpoint_path())
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(base, path)
+    with safe_open(path, framework="pt") as stored:
+        own = {"model.classifier.bias": stored.get_tensor("model.classifier.bias") + 1}
+        metadata = stored.metadata()
+    save_file(own, path, metadata | {"base": "rooms"})
+    loaded, expected = load_checkpoint(path).model.state_dict(), base.model.state_dict()
+    expected["classifier.bias"] = expected["classifier.bias"] + 1
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in expected.items())
+    save_file(own, path, metadata | {"base": "rooms-of-before"})
+    with pytest.raises(WeightsError, match="'rooms-of-before', which do not ship"):
         load_checkpoint(path)
 
 

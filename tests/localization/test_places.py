@@ -12,7 +12,7 @@ from semantic_mapper.localization.features import (
     pose_from_features,
     pose_from_points,
 )
-from semantic_mapper.localization.places import PlaceIndex
+from semantic_mapper.localization.places import rank_places
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.drawn_room import walk_frames
 
@@ -32,23 +32,9 @@ def features_of(frame: PosedFrame, light: float = 1.0) -> Features:
 
 
 def test_a_place_is_found_among_others_in_weaker_light() -> None:
-    index = PlaceIndex()
+    places = {number: features_of(frame).descriptors for number, frame in enumerate(walk())}
     for number, frame in enumerate(walk()):
-        index.add(number, features_of(frame))
-    for number, frame in enumerate(walk()):
-        dim = features_of(frame, 0.5)
-        found = index.candidates(dim, 3)
-        assert found[0][0] == number and found == index.candidates(dim, 3)
-        assert number not in [key for key, _ in index.candidates(dim, 3, exclude=frozenset({number}))]
-
-
-def test_an_index_is_bounded_and_forgets_the_oldest() -> None:
-    index = PlaceIndex(capacity=3)
-    for number, frame in enumerate(walk()[:5]):
-        index.add(number, features_of(frame))
-    assert index.keys == (2, 3, 4)
-    index.remove(3)
-    assert index.keys == (2, 4)
+        assert rank_places(features_of(frame, 0.5), places, 3)[0][0] == number
 
 
 def test_the_pose_between_two_views_comes_of_their_features() -> None:
@@ -63,6 +49,6 @@ def test_images_without_features_match_nothing() -> None:
     flat = find_place_features(np.full((48, 64, 3), 90, np.uint8), np.ones((48, 64), np.float32), 100)
     assert len(flat.pixels) == 0 and flat.descriptors.shape == (0, 128)
     assert match_features(flat.descriptors, features_of(walk()[0]).descriptors).shape == (0, 2)
-    assert PlaceIndex().candidates(flat, 3) == []
+    assert rank_places(flat, {0: features_of(walk()[0]).descriptors}, 3) == []
     same = np.tile([[0.1, 0.2, 1.0]], (12, 1))
     assert pose_from_points(same, np.tile([[92.7, 85.9]], (12, 1)), INTRINSICS, 12, 4.0) is None

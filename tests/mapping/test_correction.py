@@ -41,7 +41,7 @@ def mapped(frames: list[PosedFrame] | tuple[PosedFrame, ...], **changes: object)
 
 
 def finish(pipeline: MappingPipeline) -> None:
-    while pipeline.advance_correction(3):
+    while pipeline.corrector.advance(3):
         pass
 
 
@@ -83,7 +83,7 @@ def test_what_was_cleared_is_cleared_again_by_a_rebuild() -> None:
     pipeline, other = mapped(frames), mapped(frames, voxel_map={"voxel_size_m": 0.05, "clear_free_space": False})
     assert pipeline.voxel_map.cleared > 20 and not same(pipeline.voxel_map, other.voxel_map)
     before = bits(pipeline.voxel_map)
-    pipeline.correct_poses({f.stamp_ns: f.T_world_camera for f in frames})
+    pipeline.corrector.start({f.stamp_ns: f.T_world_camera for f in frames})
     finish(pipeline)
     assert pipeline.corrector.status.completed == 1 and bits(pipeline.voxel_map) == before
 
@@ -91,7 +91,7 @@ def test_what_was_cleared_is_cleared_again_by_a_rebuild() -> None:
 def test_true_poses_of_all_frames_give_the_geometry_of_true_poses_to_the_bit():
     frames = tiny_frames()
     pipeline = mapped(drifted(frames))
-    pipeline.correct_poses(true_poses(frames, 1))
+    pipeline.corrector.start(true_poses(frames, 1))
     finish(pipeline)
     ours, ideal = pipeline.voxel_map.block_state(), mapped(frames).voxel_map.block_state()
     for name in ("keys", "tsdf", "weight", "color"):  # what the field rendered along the way differs a little
@@ -105,7 +105,7 @@ def test_unchanged_poses_give_the_same_map_to_the_bit_also_where_frames_have_lef
     pipeline = mapped(frames, max_frames=max_frames)
     without = mapped(frames, max_frames=0)
     assert same(pipeline.voxel_map, without.voxel_map)
-    pipeline.correct_poses(
+    pipeline.corrector.start(
         {frames[-1].stamp_ns: frames[-1].T_world_camera, frames[3].stamp_ns: frames[3].T_world_camera}
     )
     finish(pipeline)
@@ -122,7 +122,7 @@ def test_a_saved_map_that_was_gone_on_in_stays_where_it_is_through_a_correction(
     for frame in frames[3:]:
         pipeline.step(frame)
         other.step(frame)
-    pipeline.correct_poses({frames[4].stamp_ns: frames[4].T_world_camera})
+    pipeline.corrector.start({frames[4].stamp_ns: frames[4].T_world_camera})
     finish(pipeline)
     assert pipeline.corrector.status.completed == 1 and pipeline.voxel_map.frames == 6
     assert same(pipeline.voxel_map, other.voxel_map)
@@ -131,7 +131,7 @@ def test_a_saved_map_that_was_gone_on_in_stays_where_it_is_through_a_correction(
 def test_frames_move_with_given_poses_of_their_own_world_alone():
     frames = [replace(f, world=int(i > 2)) for i, f in enumerate(tiny_frames(6))]
     pipeline = mapped(frames)
-    pipeline.correct_poses({frames[4].stamp_ns: drift(0.5) @ frames[4].T_world_camera}, until_ns=ALWAYS)
+    pipeline.corrector.start({frames[4].stamp_ns: drift(0.5) @ frames[4].T_world_camera}, until_ns=ALWAYS)
     finish(pipeline)
     poses = pipeline.corrector.poses()
     for frame in frames:
@@ -146,16 +146,16 @@ def test_frames_that_come_during_the_rebuild_are_in_the_new_map():
     frames = tiny_frames(8)
     at_once, between = mapped(drifted(frames)[:5]), mapped(drifted(frames)[:5])
     poses = true_poses(frames[:5], 2)
-    between.correct_poses(poses)
+    between.corrector.start(poses)
     old = between.voxel_map.block_state()
-    assert between.advance_correction(2) and old["tsdf"].tobytes() == between.voxel_map.block_state()["tsdf"].tobytes()
+    assert between.corrector.advance(2) and old["tsdf"].tobytes() == between.voxel_map.block_state()["tsdf"].tobytes()
     for frame in drifted(frames)[5:]:
         between.step(frame)
-        assert between.advance_correction(1)
+        assert between.corrector.advance(1)
     finish(between)
     for frame in drifted(frames)[5:]:
         at_once.step(frame)
-    at_once.correct_poses(poses)
+    at_once.corrector.start(poses)
     finish(at_once)
     assert between.voxel_map.frames == 8 and same(between.voxel_map, at_once.voxel_map)
 
@@ -169,12 +169,12 @@ def test_a_correction_during_another_one_is_as_if_it_came_after_it():
     }
     second = {late[1].stamp_ns: frames[1].T_world_camera, late[5].stamp_ns: frames[5].T_world_camera}
     joined, in_a_row = mapped(late), mapped(late)
-    joined.correct_poses(first, until_ns=ALWAYS)
-    joined.advance_correction(4)
-    assert joined.correct_poses(second).done == 0
+    joined.corrector.start(first, until_ns=ALWAYS)
+    joined.corrector.advance(4)
+    assert joined.corrector.start(second).done == 0
     finish(joined)
     for poses, until_ns in ((first, ALWAYS), (second, None)):
-        in_a_row.correct_poses(poses, until_ns=until_ns)
+        in_a_row.corrector.start(poses, until_ns=until_ns)
         finish(in_a_row)
     assert same(joined.voxel_map, in_a_row.voxel_map)
     assert joined.corrector.status == in_a_row.corrector.status
@@ -195,7 +195,7 @@ def test_keyframes_move_with_their_frames_and_anchors_of_another_recording_stay(
         pipeline.step(frame)
     before = pipeline.keyframes.keyframes
     assert [k.labelled for k in before[:3]] == [True, True, False]
-    pipeline.correct_poses(true_poses(frames, 1))
+    pipeline.corrector.start(true_poses(frames, 1))
     finish(pipeline)
     after = pipeline.keyframes.keyframes
     assert after[0] is before[0]
@@ -213,8 +213,8 @@ def test_later_frames_are_trusted_unless_their_odometry_goes_on_in_the_old_world
     motion = drift(1.0)
     trusting, moving = mapped(late[:4]), mapped(late[:4])
     poses = {f.stamp_ns: motion @ f.T_world_camera for f in late[1:3]}
-    trusting.correct_poses(poses)
-    moving.correct_poses(poses, until_ns=ALWAYS)
+    trusting.corrector.start(poses)
+    moving.corrector.start(poses, until_ns=ALWAYS)
     for pipeline in (trusting, moving):
         pipeline.step(late[4])  # comes during the rebuild
         finish(pipeline)
@@ -239,7 +239,7 @@ def test_queries_and_steps_go_on_during_a_rebuild_in_another_thread():
         return pipeline.voxel_map.points().xyz.tobytes(), cast.depth_m.tobytes()
 
     old = look()
-    pipeline.correct_poses(true_poses(frames, 1))
+    pipeline.corrector.start(true_poses(frames, 1))
     rebuild = threading.Thread(target=finish, args=(pipeline,))
     rebuild.start()
     while rebuild.is_alive():
@@ -248,7 +248,7 @@ def test_queries_and_steps_go_on_during_a_rebuild_in_another_thread():
     new = look()
     points, casts = {old[0], new[0]}, {old[1], new[1]}
     assert len(points) == 2 and {p for p, _ in seen} <= points and {c for _, c in seen} <= casts
-    pipeline.correct_poses({f.stamp_ns: f.T_world_camera for f in late})
+    pipeline.corrector.start({f.stamp_ns: f.T_world_camera for f in late})
     rebuild = threading.Thread(target=finish, args=(pipeline,))
     rebuild.start()
     more = tiny_frames(9)[6:]
@@ -265,7 +265,7 @@ def test_mirrors_see_every_block_as_changed_and_a_new_epoch_after_a_swap():
     voxel_map = pipeline.voxel_map
     version, epoch = voxel_map.version, voxel_map.epoch
     assert version == voxel_map.frames == 6 and len(voxel_map.changed_since(version)) == 0
-    pipeline.correct_poses(true_poses(frames, 1))
+    pipeline.corrector.start(true_poses(frames, 1))
     finish(pipeline)
     assert pipeline.voxel_map is voxel_map and (voxel_map.version, voxel_map.epoch) == (version + 1, epoch + 1)
     assert voxel_map.changed_since(version).tobytes() == voxel_map.block_state()["keys"].tobytes()
@@ -281,15 +281,15 @@ def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
     far = frames[3].T_world_camera.copy()
     far[0, 3] = 1e7
     with pytest.raises(PoseError, match="nearer origin"):
-        pipeline.correct_poses({frames[3].stamp_ns: far})
+        pipeline.corrector.start({frames[3].stamp_ns: far})
     far[0, 3] = 9e4  # keys of 1 cm voxels reach 84 km
-    assert pipeline.correct_poses({frames[3].stamp_ns: far}).running
+    assert pipeline.corrector.start({frames[3].stamp_ns: far}).running
     with pytest.raises(MapError, match="given up, the map stays as it is"):
         finish(pipeline)
     status = pipeline.corrector.status
     assert not status.running and "beyond" in status.failure and bits(pipeline.voxel_map) == before
     assert pipeline.step(frames[6]).fused
-    pipeline.correct_poses({frames[3].stamp_ns: drift(0.5) @ frames[3].T_world_camera})
+    pipeline.corrector.start({frames[3].stamp_ns: drift(0.5) @ frames[3].T_world_camera})
     finish(pipeline)
     assert pipeline.corrector.status.completed == 1 and pipeline.corrector.status.failure == ""
 
@@ -298,7 +298,7 @@ def test_blocks_on_disk_count_as_changed_too():
     frames = tiny_frames()
     settings = {"voxel_size_m": 0.01, "depth_max_m": 2.0, "memory_mb": 110}
     pipeline = mapped(drifted(frames), voxel_map=settings)
-    pipeline.correct_poses(true_poses(frames, 1))
+    pipeline.corrector.start(true_poses(frames, 1))
     finish(pipeline)
     voxel_map = pipeline.voxel_map
     assert voxel_map.stored_blocks > 0
@@ -312,7 +312,7 @@ def test_a_damaged_frame_is_left_out_counted_and_logged():
     frames = tiny_frames()
     pipeline = mapped(drifted(frames))
     pipeline.corrector._scratch._database.execute("UPDATE blobs SET blob = x'00' WHERE key = 2")
-    pipeline.correct_poses(true_poses(frames, 1))
+    pipeline.corrector.start(true_poses(frames, 1))
     with structlog.testing.capture_logs() as logs:
         finish(pipeline)
     assert [e["seq"] for e in logs if e["event"] == "history_frame_lost"] == [2]
@@ -326,7 +326,7 @@ def test_a_damaged_frame_is_left_out_counted_and_logged():
 def test_a_disk_that_fails_ends_correcting_but_not_mapping():
     frames = tiny_frames()
     pipeline = mapped(frames[:3])
-    pipeline.correct_poses({frames[1].stamp_ns: frames[1].T_world_camera})
+    pipeline.corrector.start({frames[1].stamp_ns: frames[1].T_world_camera})
     pipeline.corrector._scratch._database.execute("DROP TABLE blobs")
     with structlog.testing.capture_logs() as logs:
         for frame in frames[3:]:
@@ -334,7 +334,7 @@ def test_a_disk_that_fails_ends_correcting_but_not_mapping():
     assert [e["event"] for e in logs if e["log_level"] == "error"] == ["history_ends"]
     assert "history has ended: frame seq=3" in pipeline.corrector.status.failure
     with pytest.raises(MapError, match="history has ended"):
-        pipeline.correct_poses({frames[1].stamp_ns: frames[1].T_world_camera})
+        pipeline.corrector.start({frames[1].stamp_ns: frames[1].T_world_camera})
     assert not pipeline.corrector.status.running and same(pipeline.voxel_map, mapped(frames, max_frames=0).voxel_map)
 
 
@@ -354,51 +354,52 @@ def test_poses_that_cannot_be_used_are_refused_and_change_nothing():
     ]
     for poses, error, message in refused:
         with pytest.raises(error, match=message):
-            pipeline.correct_poses(poses)
+            pipeline.corrector.start(poses)
         assert not pipeline.corrector.status.running
-    pipeline.correct_poses({("rear", frames[5].stamp_ns): frames[5].T_world_camera})
+    pipeline.corrector.start({("rear", frames[5].stamp_ns): frames[5].T_world_camera})
     with pytest.raises(MapError, match=r"no frames are kept; set history\.max_frames"):
-        make_pipeline(max_frames=0).correct_poses({1: pose})
-    assert not make_pipeline().advance_correction()
+        make_pipeline(max_frames=0).corrector.start({1: pose})
+    assert not make_pipeline().corrector.advance()
 
 
-def test_the_ring_is_bounded_and_frames_that_have_left_it_stay_where_they_are() -> None:
-    frames = tiny_frames(13)
+def test_the_history_is_bounded_and_frames_that_have_left_it_stay_where_they_are() -> None:
+    frames = tiny_frames(17)
     late = drifted(frames)
-    pipeline = mapped(late[:7], max_frames=5, moving={"motion": False})
+    pipeline = mapped(late[:9], max_frames=4, moving={"motion": False})
     status = pipeline.corrector.status
-    assert (status.total, status.frozen) == (5, 2) and status.disk_bytes > 10_000
+    assert (status.total, status.frozen) == (5, 4) and status.disk_bytes > 10_000
     with structlog.testing.capture_logs() as logs:
-        pipeline.correct_poses(true_poses(frames[:7], 1))
+        pipeline.corrector.start(true_poses(frames[:9], 1))
     partial = [e for e in logs if e["event"] == "correction_is_partial"]
-    assert len(partial) == 1 and (partial[0]["given"], partial[0]["frozen"]) == (7, 2)
+    assert len(partial) == 1 and (partial[0]["given"], partial[0]["frozen"]) == (9, 4)
     finish(pipeline)
     with pytest.raises(MapError, match="all 1 frames given have left the history"):
-        pipeline.correct_poses({frames[0].stamp_ns: frames[0].T_world_camera})
+        pipeline.corrector.start({frames[0].stamp_ns: frames[0].T_world_camera})
     with pytest.raises(MapError, match="no frame with this stamp was mapped"):
-        pipeline.correct_poses({frames[6].stamp_ns + 1: frames[0].T_world_camera})
-    for frame in late[7:]:
+        pipeline.corrector.start({frames[8].stamp_ns + 1: frames[0].T_world_camera})
+    for frame in late[9:]:
         pipeline.step(frame)
-    pipeline.correct_poses(true_poses(frames[8:], 1))
+    assert pipeline.corrector.status.frozen == 12
+    pipeline.corrector.start(true_poses(frames[12:], 1))
     finish(pipeline)
     by_hand = VoxelMap(pipeline.config.voxel_map, ROOMS)
-    for frame in (*late[:2], *frames[2:7], late[7], *frames[8:]):
+    for frame in (*late[:4], *frames[4:9], *late[9:12], *frames[12:]):
         by_hand.integrate(frame, frame.depth_m, None, None)
     ours, expected = pipeline.voxel_map.block_state(), by_hand.block_state()
     for name in ("keys", "tsdf", "weight", "color"):
         assert ours[name].tobytes() == expected[name].tobytes(), name
 
 
-def test_steps_continue_a_rebuild_where_the_ring_is_full_and_nobody_else_does() -> None:
+def test_steps_continue_a_rebuild_where_the_history_is_full_and_nobody_else_does() -> None:
     frames = tiny_frames(14)
-    pipeline = mapped(frames[:8], max_frames=6)
-    pipeline.correct_poses({frames[7].stamp_ns: drift(0.5) @ frames[7].T_world_camera})
+    pipeline = mapped(frames[:8], max_frames=3)
+    pipeline.corrector.start({frames[7].stamp_ns: drift(0.5) @ frames[7].T_world_camera})
     for frame in frames[8:]:
         pipeline.step(frame)
-        assert pipeline.corrector.status.total <= 8
+        assert pipeline.corrector.status.total <= 7
     status = pipeline.corrector.status
     assert status.completed == 1 and not status.running
-    assert status.total == 6 and status.frozen == 8 and pipeline.voxel_map.frames == 14
+    assert status.total + status.frozen == pipeline.voxel_map.frames == 14 and status.frozen >= 8
 
 
 def test_the_bytes_on_disk_are_bounded() -> None:

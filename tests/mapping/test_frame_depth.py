@@ -156,8 +156,8 @@ def test_a_rebuild_of_a_computed_map_with_the_same_poses_is_the_same_map() -> No
     frames = without_depth(walk()[:10])
     pipeline = mapped(frames, history={"max_frames": 100})
     before = pipeline.voxel_map.block_state()
-    pipeline.correct_poses({frames[0].stamp_ns: pipeline.corrector.poses()["rooms", frames[0].stamp_ns]})
-    while pipeline.advance_correction(3):
+    pipeline.corrector.start({frames[0].stamp_ns: pipeline.corrector.poses()["rooms", frames[0].stamp_ns]})
+    while pipeline.corrector.advance(3):
         pass
     assert pipeline.corrector.status.poses == 1
     after = pipeline.voxel_map.block_state()

@@ -13,7 +13,6 @@ from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import KITTI360, ROOMS
 from semantic_mapper.mapping.moving import (
-    BEYOND_M,
     MUCH_LEFT_OUT,
     POSES_OFF,
     SETTLED_S,
@@ -154,29 +153,11 @@ def test_a_passer_by_is_no_wall_neither_when_the_map_is_built_again() -> None:
     assert abs(np.median(on.moving.space.points[:, 2]) - THING_M) < 0.1 and not len(off.moving.space.points)
     assert wall_of(on) < 0.05 * wall_of(off) and on.moving.pixels > 10_000 and off.moving.pixels == 0
     before = on.voxel_map.block_state()
-    on.correct_poses({11 * 10**9 // HZ: on.corrector.place(scene(11, None, shift_m=0.33)[0]).T_world_camera})
-    while not on.advance_correction(4):
+    on.corrector.start({11 * 10**9 // HZ: on.corrector.place(scene(11, None, shift_m=0.33)[0]).T_world_camera})
+    while not on.corrector.advance(4):
         pass
     after = on.voxel_map.block_state()
     assert all(np.array_equal(before[name], after[name]) for name in before)
-
-
-def test_what_is_left_out_is_no_free_space_for_a_sensor_whose_missing_depth_is() -> None:
-    cleared: list[int] = []
-    for left_out in (0.0, float(BEYOND_M)):
-        config = tiny_config(
-            moving={"motion": True}, voxel_map=VOXELS | {"no_return_range_m": 5.0, "clear_free_space": True}
-        )
-        p = MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
-        for number in range(12):
-            frame, thing = scene(number, None)
-            assert frame.depth_m is not None
-            thing[30:90, 60:100] = number > 5
-            p.step(replace(frame, depth_m=np.where(thing, np.float32(left_out), frame.depth_m)))
-        cleared.append(p.voxel_map.cleared)
-        told, _ = scene(12, 60)
-        assert p.step(told).depth_m.max() < 10, "depth that stands for no return is not reported"
-    assert cleared[0] > 100 and cleared[1] == 0
 
 
 def test_where_it_moved_is_kept_for_a_second() -> None:

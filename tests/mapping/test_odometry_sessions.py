@@ -134,8 +134,8 @@ def test_frames_are_found_where_a_correction_has_moved_the_map() -> None:
     shift = np.eye(4)
     shift[:3, 3] = 0.0, 0.5, 0.0
     poses = {f.stamp_ns: shift @ f.T_world_camera for f in walk()[:8:2]}
-    session.pipeline.correct_poses(poses, until_ns=ALWAYS)
-    while session.pipeline.advance_correction(8):
+    session.pipeline.corrector.start(poses, until_ns=ALWAYS)
+    while session.pipeline.corrector.advance(8):
         pass
     results: list[MapUpdate | Refusal] = []
     for frame in walk()[1:8:2]:

@@ -13,16 +13,12 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError, WeightsError
 from semantic_mapper.fields.nesf import Nesf, NesfConfig, NesfWeights, smoothed_votes
 from semantic_mapper.labels import NYU40, ROOMS, LabelSet, make_label_set
-from semantic_mapper.mapping.refine import FILL_VOTES, check_refinable, group_things, refine
+from semantic_mapper.mapping.refine import FILL_VOTES, check_refinable, refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from tests.mapping.grids import decided
 from tests.small import tiny_frames
 
 UP = np.array((0.0, 0.0, 1.0))
-
-VOXEL_M = 0.02
 
 
 def make_map(label_set: LabelSet = ROOMS, votes: bool = True, **changes: object) -> VoxelMap:
@@ -87,24 +83,22 @@ def test_only_likely_classes_fill_surface_without_votes(fill: float) -> None:
         assert decided(row, FILL_VOTES, 0.75)[1] >= fill - 1e-4
 
 
-def test_tiles_give_what_the_whole_gives() -> None:
+def test_tiles_give_what_the_whole_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     whole, tiled = make_map(), make_map()
-    refine(whole, random_weights(), up=UP, tile_m=100)
+    refine(whole, random_weights(), up=UP)
+    monkeypatch.setattr("semantic_mapper.mapping.refine.TILE_M", 1.5)
     seen: list[int] = []
-    refine(tiled, random_weights(), up=UP, tile_m=1.5, on_tile=lambda done, total: seen.append(total))
+    refine(tiled, random_weights(), up=UP, on_tile=lambda done, total: seen.append(total))
     assert seen[0] > 2
     a, b = whole.block_state(), tiled.block_state()
     np.testing.assert_array_equal(a["votes"], b["votes"])
     np.testing.assert_allclose(a["evidence"], b["evidence"], atol=1e-3)
-    assert whole.instances is not None and tiled.instances is not None
-    assert (np.isin(whole.instances.packed, tiled.instances.packed)).mean() > 0.99
 
 
 def test_the_file_says_by_what_it_was_refined_and_other_files_say_nothing(tmp_path: Path) -> None:
     voxel_map = make_map()
     voxel_map.save(tmp_path / "plain.npz")
     assert b"refined" not in (tmp_path / "plain.npz").read_bytes()
-    assert b"instances" not in (tmp_path / "plain.npz").read_bytes()
     refine(voxel_map, random_weights(), up=UP)
     voxel_map.save(tmp_path / "refined.npz")
     again = VoxelMap.load(tmp_path / "refined.npz")
@@ -115,39 +109,6 @@ def test_the_file_says_by_what_it_was_refined_and_other_files_say_nothing(tmp_pa
     refine(smoothed, smoothed_votes(ROOMS), up=UP, fill=0.0)
     with pytest.raises(MapError, match="its votes were smoothed"):
         refine(smoothed, random_weights(), up=UP)
-
-
-def test_things_of_a_refined_map_are_in_its_file_and_answer_queries(tmp_path: Path) -> None:
-    voxel_map = make_map()
-    report = refine(voxel_map, random_weights(), up=UP)
-    assert voxel_map.instances is not None and report.things == len(np.unique(voxel_map.instances.number)) > 3
-    voxel_map.save(tmp_path / "refined.npz")
-    again = VoxelMap.load(tmp_path / "refined.npz")
-    assert again.instances is not None
-    np.testing.assert_array_equal(again.instances.packed, voxel_map.instances.packed)
-    np.testing.assert_array_equal(again.instances.number, voxel_map.instances.number)
-
-    found = InstanceTracker(min_voxels=5).update(MapMirror.of(again).snapshot())
-    assert len(found) > 3
-    for thing in found:
-        numbers = again.instances.at(thing.voxels)
-        assert (numbers == numbers[0]).all() and numbers[0] >= 0
-        others = again.instances.at(np.concatenate([t.voxels for t in found if t is not thing]))
-        assert numbers[0] not in others
-
-
-def test_things_are_forgotten_when_the_map_changes_or_is_merged(tmp_path: Path) -> None:
-    voxel_map = make_map()
-    refine(voxel_map, random_weights(), up=UP)
-    mirror = MapMirror.of(voxel_map)
-    assert mirror.snapshot().instances is not None
-    assert voxel_map.merged(make_map(), np.eye(4)).instances is None
-    frame = tiny_frames()[0]
-    voxel_map.integrate(frame, frame.depth_m, None)
-    assert voxel_map.instances is None
-    assert mirror.apply(voxel_map.changes(mirror.version)).instances is None
-    voxel_map.save(tmp_path / "later.npz")
-    assert b"instances" not in (tmp_path / "later.npz").read_bytes()
 
 
 def test_what_cannot_be_refined_is_refused() -> None:
@@ -187,46 +148,3 @@ def test_by_name_leaves_the_probability_of_other_classes_alone() -> None:
     assert len(p) > 100
     np.testing.assert_allclose(p[:, 2:], q[:, 2:], atol=1e-5)
     assert np.abs(p[:, :2] - q[:, :2]).max() > 0.05
-
-
-def slab(x0: int, x1: int, *, y: int = 10, z: int = 2) -> np.ndarray:
-    """Voxels (N, 3) of a box."""
-    return np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y), np.arange(z), indexing="ij"), -1).reshape(-1, 3)
-
-
-def way(voxels: np.ndarray) -> np.ndarray:
-    """To their middle, metres."""
-    return ((voxels.mean(axis=0) - voxels) * VOXEL_M).astype(np.float32)
-
-
-def test_two_things_that_touch_are_two_where_their_centres_say_so() -> None:
-    left, right = slab(0, 10), slab(10, 20)
-    both = np.concatenate((left, right))
-    channel = np.full(len(both), 5)
-    apart = group_things(both, channel, np.concatenate((way(left), way(right))), VOXEL_M)
-    assert len(np.unique(apart)) == 2
-    assert len(np.unique(apart[: len(left)])) == len(np.unique(apart[len(left) :])) == 1
-    assert len(np.unique(group_things(both, channel, way(both), VOXEL_M))) == 1
-
-
-def test_classes_and_gaps_part_things_whatever_the_centres_say() -> None:
-    voxels = np.concatenate((slab(0, 10), slab(10, 20), slab(30, 40)))
-    found = group_things(voxels, np.repeat((3, 4, 4), 200), way(voxels), VOXEL_M)
-    assert [len(np.unique(part)) for part in np.split(found, 3)] == [1, 1, 1]
-    assert len(np.unique(found)) == 3
-
-
-def test_a_long_thing_whose_centres_drift_is_one() -> None:
-    voxels = slab(0, 200)
-    towards = np.clip(way(voxels), -0.3, 0.3)  # as far as the network says
-    assert len(np.unique(group_things(voxels, np.zeros(len(voxels), np.int64), towards, VOXEL_M))) == 1
-
-
-def test_crumbs_join_the_neighbour_that_is_nearest_to_what_they_say() -> None:
-    left, right = slab(0, 10), slab(11, 21)
-    between = slab(10, 11)  # 20 voxels that are of two minds
-    ways = np.concatenate((way(left), way(right), np.full((len(between), 3), (0.09, 0, 0), np.float32)))
-    voxels = np.concatenate((left, right, between))
-    found = group_things(voxels, np.zeros(len(voxels), np.int64), ways, VOXEL_M)
-    assert len(np.unique(found)) == 2
-    assert (found[-len(between) :] == found[len(left)]).all()

@@ -10,12 +10,12 @@ from rich.table import Table
 
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS, LabelSet
-from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.processes import NodeProcess
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.plain_text import visible
 from semantic_mapper.replay.log.format import LogAttachment, LogWriter
-from semantic_mapper.replay.page import Card, Section, table_of, write_page
+from semantic_mapper.replay.page import Section, table_of, write_page
 from semantic_mapper.transport.messages import StreamInfo
 from tests.nodes.support import error_line, run, run_here
 from tests.small import INTRINSICS, tiny_field, tiny_frames
@@ -110,8 +110,7 @@ def test_report_pages_hold_names_as_text(results: Path) -> None:
     hostile = "</script><b>\u202e"
     view = {"classes": [{"id": 1, "name": hostile, "color": "red", "share": "1 %"}], "data": {"name": hostile}}
     table = table_of(("<i>",), [("\x1b[2J",)])
-    cards = [Card(hostile, lines=[hostile])]
-    section = Section(hostile, [hostile], view, cards=cards, tables=[table], lines=[hostile], folded={hostile: hostile})
+    section = Section(hostile, [hostile], view, tables=[table], folded={hostile: hostile})
     write_page(results / "made.html", hostile, [section])
     text = (results / "made.html").read_text(encoding="utf-8")
     assert visible(text, keep="\n") == text and text.count("</script>") == 2
@@ -149,17 +148,3 @@ def test_every_place_of_a_table_and_a_line_is_plain(name: str, shown: str) -> No
     for place in ("head", "title", "caption", "cell", "line"):
         assert f"{place} {shown}" in stream.getvalue()
     assert len(stream.getvalue().splitlines()) == 5  # title, table of 5 lines, caption, line
-
-
-def test_progress_is_plain(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm")
-    with frame_progress("play [/b]\x1b]0;x\x07", 3) as bar:
-        bar.set(1, note="[/b]\x1b]0;y\x07")
-    said = capsys.readouterr().err
-    assert r"play [/b]\x1b]0;x\x07" in said and r"[/b]\x1b]0;y\x07" in said and "\x1b]0" not in said
-
-
-def test_messages_in_a_style_are_plain(capsys: pytest.CaptureFixture[str]) -> None:
-    stderr_console().print("stopped; the map is in /tmp/[/b]\x1b[2J", style="yellow")
-    assert r"/tmp/[/b]\x1b[2J" in capsys.readouterr().err

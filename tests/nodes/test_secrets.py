@@ -71,7 +71,7 @@ def test_tables_json_reports_files_and_logs_are_without_secrets(
     output.quiet = True
     output.json({"map": url, "logs": [url]})
     write_json(tmp_path / "summary.json", {"source": url})
-    write_page(tmp_path / "page.html", url, [Section(url, [url], tables=[table_of((url,), [(url,)])], lines=[url])])
+    write_page(tmp_path / "page.html", url, [Section(url, [url], tables=[table_of((url,), [(url,)])])])
     prepare_process()
     structlog.get_logger("test").error("failed", error=url, places=[url], path=Path(url))
     structlog.reset_defaults()

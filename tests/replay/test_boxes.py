@@ -18,7 +18,7 @@ from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.nodes.map_answers import answer_instances
 from semantic_mapper.queries.instances import Instance, OrientedBox
-from semantic_mapper.replay.boxes import QUERY_MARGIN_M, BoxFile, load_boxes, save_boxes, with_classes, with_times
+from semantic_mapper.replay.boxes import QUERY_MARGIN_M, BoxFile, load_boxes, with_classes, with_times
 from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.sequence import open_log
@@ -57,22 +57,13 @@ def kitti_xml(*objects: tuple[int, str, int, np.ndarray], instance: int = 0) -> 
     return f"<?xml version='1.0'?><opencv_storage>{listed}</opencv_storage>"
 
 
-def same(a: Primitive, b: Primitive) -> bool:
-    arrays = [(a.T_world_box, b.T_world_box), (a.size, b.size), (a.polygon, b.polygon)]
-    arrays += [(a.vertices, b.vertices), (a.faces, b.faces)]
-    equal = all(np.array_equal(np.array(x, float), np.array(y, float), equal_nan=True) for x, y in arrays)
-    named = (a.id, a.class_name, a.shape, a.thing) == (b.id, b.class_name, b.shape, b.thing)
-    known = [[[(s, T.tolist()) for s, T in poses or ()] for poses in (p.stamps, p.frames)] for p in (a, b)]
-    return equal and named and known[0] == known[1]
-
-
 def at(*centre: float) -> np.ndarray:
     pose = np.eye(4)
     pose[: len(centre), 3] = centre
     return pose
 
 
-def test_all_shapes_are_read_and_written(tmp_path: Path) -> None:
+def test_all_shapes_are_read(tmp_path: Path) -> None:
     triangles = np.concatenate((QUADS[:, :3], QUADS[:, (0, 2, 3)]))
     entries = [
         entry(),
@@ -85,13 +76,10 @@ def test_all_shapes_are_read_and_written(tmp_path: Path) -> None:
     assert [p.thing for p in boxes.primitives] == [True, True, False, True, True]
     assert [p.moves for p in boxes.primitives] == [False, False, False, False, True]
     assert boxes.primitives[2].size.tolist() == [2, 1, 2]
-    save_boxes(tmp_path / "b.json", boxes)
-    again = load_boxes(tmp_path / "b.json")
-    assert again.merge == {"chair": ("sofa",)}
-    assert all(same(a, b) for a, b in zip(boxes.primitives, again.primitives, strict=True))
+    assert boxes.merge == {"chair": ("sofa",)}
 
 
-def test_kitti360_xml_survives_a_round_trip(tmp_path: Path) -> None:
+def test_kitti360_xml_is_read_with_its_names_and_scales(tmp_path: Path) -> None:
     scaled = T.copy()
     scaled[:3, :3] *= (4.0, 2.0, 1.5)
     xml = kitti_xml((0, "building", -1, scaled), (1, "driveway", -1, T), (2, "car", 7, T), (3, "unknownObject", -1, T))
@@ -108,9 +96,6 @@ def test_kitti360_xml_survives_a_round_trip(tmp_path: Path) -> None:
     places = np.random.default_rng(0).uniform(-0.6, 0.6, (500, 3))
     expected = (np.abs(places) <= 0.5).all(1)
     np.testing.assert_array_equal(building.inside(places @ scaled[:3, :3].T + scaled[:3, 3])[:, 0], expected)
-    save_boxes(tmp_path / "boxes.json", boxes)
-    again = load_boxes(tmp_path / "boxes.json")
-    assert all(same(a, b) for a, b in zip(boxes.primitives, again.primitives, strict=True))
 
 
 def test_what_query_instances_writes_is_a_file_of_boxes(tmp_path: Path) -> None:
@@ -127,23 +112,16 @@ def test_what_query_instances_writes_is_a_file_of_boxes(tmp_path: Path) -> None:
     ("changed", "message"),
     [
         ({"size": [1, 0, 1]}, "size must be at least 0.001 m"),
-        ({"size": [1, float("nan"), 1]}, "size.* = nan"),
-        ({"size": [1, 1]}, "size"),
         ({"size": None}, "size, three metres, is missing"),
         ({"size": [1, 1, 1e6]}, "size must be metres within 100 km"),
-        ({"T_world_box": (2 * np.eye(4)).tolist()}, "last row"),
         ({"T_world_box": np.diag((2.0, 1, 1, 1)).tolist()}, "not a rotation"),
         ({"T_world_box": at(1e9).tolist()}, r"the box is at \[1.e\+09"),
-        ({"id": 65536}, "id"),
-        ({"class": 3}, "class"),
         ({"shape": "cone"}, "shape.*cone|cone.*shape"),
         ({"sise": [1, 1, 1]}, "did you mean .size"),
         ({"shape": "prism", "polygon": [[0, 0], [1, 1], [1, 0], [0, 1]]}, "outline"),
         ({"shape": "prism", "polygon": [[0, 0], [1, 1], [0, 0]]}, "3 different corners, got 2"),
         ({"shape": "mesh", "vertices": CORNERS.tolist(), "faces": [[0, 1, 2]]}, "the surface is open"),
         ({"shape": "mesh", "vertices": [], "faces": []}, "needs vertices and faces"),
-        ({"shape": "mesh", "vertices": CORNERS.tolist(), "faces": [[0.5, 1, 2]]}, "faces"),
-        ({"stamps": [[0.5, T.tolist()]]}, "stamps"),
         ({"stamps": [[5, T.tolist()], [5, T.tolist()]]}, "stamps must be .* each number once"),
         ({"stamps": [[5, (2 * T).tolist()]]}, "stamps, pose at 5: the last row"),
         ({"stamps": [[5, T.tolist()]], "frames": [[5, T.tolist()]]}, "has stamps and frames"),
@@ -168,7 +146,7 @@ def test_two_boxes_of_one_id_and_classes_that_are_not_there_are_refused(tmp_path
         with_classes(load_boxes(path), ROOMS, path)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"boxes": 3}', "<a", "<a></a>", '{"boxes": [], "merge": 3}'])
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"boxes": 3}', "<a", "<a></a>", '{"boxes": [], "merg": {}}'])
 def test_files_without_boxes_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "boxes.json"
     path.write_text(text)
@@ -200,8 +178,6 @@ def test_an_outline_or_mesh_is_where_it_is_drawn_wherever_its_origin_is(tmp_path
     for box, size in ((prism, (4.5, 2, 0.15)), (mesh, (0.5, 0.5, 0.5))):
         core = (resized(box, 0.5 * box.size).mesh()[0] - box.T_world_box[:3, 3]) @ box.T_world_box[:3, :3]
         np.testing.assert_allclose((core.min(0), core.max(0)), np.outer((-0.5, 0.5), size), atol=1e-12)
-    save_boxes(tmp_path / "b.json", BoxFile((prism, mesh)))
-    assert all(same(a, b) for a, b in zip((prism, mesh), load_boxes(tmp_path / "b.json").primitives, strict=True))
 
 
 def test_the_example_of_the_docs_is_a_file_of_boxes(tmp_path: Path) -> None:
@@ -215,19 +191,15 @@ def test_the_example_of_the_docs_is_a_file_of_boxes(tmp_path: Path) -> None:
 
 def test_kitti360_moving_objects_are_boxes_with_poses_by_frame(tmp_path: Path) -> None:
     moves = [(i, "car", 20 - i, T @ at(-i)) for i in range(3)]
-    xml = kitti_xml(*moves, (3, "car", 20, T), (4, "truck", 3, T), (5, "car", -1, T), instance=7)
+    xml = kitti_xml(*moves, (4, "truck", 3, T), (5, "car", -1, T), instance=7)
     (tmp_path / "a.xml").write_text(xml)
     boxes = load_boxes(tmp_path / "a.xml")
     car, truck, parked = boxes.primitives
-    (bad,) = boxes.bad
-    assert bad.startswith("box 4 ") and bad.endswith("frame 20")
     assert [n for n, _ in car.frames or ()] == [18, 19, 20] and car.stamps is None and not parked.moves
     for number, pose in car.frames or ():
         np.testing.assert_allclose(pose, T @ at(number - 20), atol=1e-12)
         assert car.pose_at(number) is None
     np.testing.assert_array_equal(car.T_world_box, (car.frames or ())[0][1])
-    save_boxes(tmp_path / "b.json", boxes)
-    assert all(same(a, b) for a, b in zip(boxes.primitives, load_boxes(tmp_path / "b.json").primitives, strict=True))
     assert truck.id == 5
 
 
@@ -254,12 +226,6 @@ def test_xml_of_kitti360_goes_with_labels_of_fewer_classes(tmp_path: Path) -> No
     assert [p.class_name for p in boxes.primitives] == ["car", "trailer", "parking", "garage"]
     assert boxes.merge == {"sidewalk": ("parking",), "car": ("trailer",)} and boxes.left_out == 2
     assert known.names == (*few.names, "trailer", "parking") and "no class lamp, truck" in logs[0]["reason"]
-    save_boxes(edited := tmp_path / "edited.json", boxes)  # as of the XML without truck and lamp
-    again, also = with_classes(load_boxes(edited), few, edited)
-    assert (dict(again.merge), also) == (dict(boxes.merge), known)
-    cats = make_label_set("cats", ["cat", "garage"])
-    with pytest.raises(ConfigError, match=r"a\.xml: label set 'cats' has no class car, .*, of which 5 of 6 boxes are"):
-        with_classes(load_boxes(path), cats, path)
 
 
 def test_objects_of_xml_that_cannot_be_used_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -278,29 +244,6 @@ def test_objects_of_xml_that_cannot_be_used_are_left_out_and_counted(tmp_path: P
     (tmp_path / "a.xml").write_text(kitti_xml((69999, "car", -1, T)))
     with pytest.raises(ConfigError, match=r"box 1 \(id 70000\): id must be"):
         load_boxes(tmp_path / "a.xml")
-
-
-def test_things_are_the_same_by_class_in_json_and_xml(tmp_path: Path) -> None:
-    names = LABELS.names
-    (tmp_path / "a.xml").write_text(kitti_xml(*((i, name, -1, T) for i, name in enumerate(names))))
-    entries = [entry(id=i, thing=None, **{"class": name}) for i, name in enumerate(names, 1)]
-    told = [load_boxes(f).primitives for f in (tmp_path / "a.xml", write(tmp_path / "a.json", *entries))]
-    assert [[p.thing for p in listed] for listed in told[:1]] == [[p.thing for p in told[1]]]
-    things = {p.class_name for p in told[0] if p.thing}
-    assert things >= {"building", "car", "pole", "traffic sign"} and not things & {"road", "gate", "wall", "rail track"}
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"boxes": [], "merg": {}}', ".*merg.*did you mean .merge"),
-        ('{"boxs": []}', ".*boxs.*did you mean .boxes|.*boxes must be"),
-    ],
-)
-def test_unknown_keys_of_the_file_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "boxes.json").write_text(text)
-    with pytest.raises(ConfigError, match=rf"boxes\.json: {message}"):
-        load_boxes(tmp_path / "boxes.json")
 
 
 def test_all_bad_boxes_are_named_and_a_byte_order_mark_is_none(tmp_path: Path) -> None:

@@ -11,12 +11,11 @@ from msgspec.structs import replace
 import research.bench.plots as plots_module
 import research.bench.walk as bench_walk_module
 from research.bench.plots import draw_walk
-from research.bench.walk import WalkPlan, bench_walk, first_and_last, slope_percent
-from semantic_mapper.errors import ConfigError
+from research.bench.walk import WalkPlan, bench_walk
+from research.plots import Panel
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.plots import Panel
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.nodes.support import write_weights
 from tests.small import tiny_config, tiny_field
@@ -116,19 +115,6 @@ def drawn_panels(monkeypatch: pytest.MonkeyPatch) -> list[Panel]:
     return panels
 
 
-def test_slopes_are_in_percent_of_the_mean() -> None:
-    minutes = np.linspace(0, 10, 101)
-    assert slope_percent(minutes, 100 + 2 * (minutes - 5)) == pytest.approx(2.0)
-    assert slope_percent(minutes[:90], minutes[:90]) is None, "less than ten minutes"
-
-
-def test_the_first_ten_minutes_that_count_stand_beside_the_last_ten() -> None:
-    minutes = np.linspace(0, 30, 3001)
-    times = np.where(minutes < 5, 999.0, np.where(minutes < 15, 20.0, np.where(minutes > 20, 30.0, 500.0)))
-    assert first_and_last(minutes, times) == (20.0, 30.0)
-    assert first_and_last(minutes[:2400], times[:2400]) == (None, None), "they would overlap"
-
-
 def test_memory_is_told_where_it_has_settled_and_where_it_was_most(monkeypatch: pytest.MonkeyPatch) -> None:
     rss = [300.0, 310, 320, 330, 340, 400, 410, 450, 430]
     found = bench_walk_module._memory(rss, 100)
@@ -145,8 +131,3 @@ def test_memory_is_told_where_it_has_settled_and_where_it_was_most(monkeypatch: 
     levels = {curve.name: list(curve.points) for curve in panels[1].curves}
     assert levels["minute 5"] == [(5, 400), (8, 400)] and levels["most after it"] == [(5, 450), (8, 450)]
     assert levels["each minute"] == list(enumerate(rss))
-
-
-def test_more_returns_than_rooms_are_refused(weights: Path) -> None:
-    with pytest.raises(ConfigError, match="returns"):
-        bench_walk(weights, CONFIG, WalkPlan(rooms=1, returns=2, minutes=0.1, width=96))

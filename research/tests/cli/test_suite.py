@@ -114,14 +114,6 @@ def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: 
     assert written["title"].endswith("1 room, scratch: 3 keyframes, 2 steps, 3 views, without depth, 48x36")
 
 
-def test_a_file_that_cannot_be_written_is_refused_before_a_room_is_made(suite: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    out = tmp_path / "file" / "a.json"
-    refused = run("suite", "rooms", "--config", suite, "--rooms", "1", "--out", out)
-    assert refused.returncode == 1 and str(tmp_path / "file") in error_line(refused.stderr)
-    assert "rooms" not in refused.stdout, "no room was begun"
-
-
 def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Path) -> None:
     out = tmp_path / "kind.json"
     options = ("--config", suite, "--kind", "semantic_nerf", "--out", out)
@@ -163,11 +155,6 @@ def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, .
     done = run(*arguments)
     assert done.returncode == 2, done.stderr
     assert "Usage: semantic-mapper" in done.stderr
-
-
-def test_more_rooms_than_there_are_is_refused() -> None:
-    done = run("suite", "rooms", "--rooms", "21")
-    assert done.returncode == 1 and "has 20 rooms" in error_line(done.stderr)
 
 
 def test_an_unknown_setting_names_the_nearest_one(tmp_path: Path) -> None:

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.text import Text
 
 from research.evaluation.sheet import SheetRow, draw_sheet
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.plots import UNKNOWN
-from tests.figures import figure_of, misplaced_texts
 
 WALL, BED = (ROOMS.ids[ROOMS.names.index(n)] for n in ("wall", "bed"))
 
@@ -35,16 +33,3 @@ def test_unknown_is_grey_and_in_the_legend() -> None:
     unknown = np.full((24, 32), ROOMS.ignore_id, np.uint8)
     sheet = draw_sheet([row(a=unknown)], ["a"], ROOMS, title="sheet")
     assert shows(sheet, UNKNOWN) * sheet[..., 0].size > 320 * 240
-
-
-def test_long_names_keep_to_their_columns() -> None:
-    name = "a name of weights that is much longer than its column is wide"
-    figure = figure_of(draw_sheet, [row(**{name: row().truth, "b": row().truth})], [name, "b"], ROOMS, title=name * 9)
-    assert not misplaced_texts(figure)
-
-
-def test_what_was_rendered_from_what_fits_beside_one_method() -> None:
-    how = "8 cover views, the query's own image among them, hard query images, without depth, 160x120"
-    figure = figure_of(draw_sheet, [row(a=row().truth)], ["a"], ROOMS, title="ROOMS test, 20 rooms", subtitle=how)
-    assert not misplaced_texts(figure)
-    assert how in [text.get_text() for text in figure.findobj(Text)], "not cut"

@@ -78,14 +78,7 @@ def test_every_encoder_can_have_another_shape() -> None:
     shallow = peers.Budget(encoder={"channels": [32], "blocks": [2]})
     for name, run in peers.RUNS.items():
         own = {"channels": [32], "blocks": [2], "depth": run.depth}
-        assert peers.tomllib.loads(peers.recipe(name, shallow))["field"] == run.settings | {"encoder": own}
-
-
-def test_a_run_can_have_settings_of_its_own() -> None:
-    recipe = peers.tomllib.loads(peers.recipe("sray-paper", ALONE))
-    assert recipe["field"] == {"occlusion": False, "encoder": {"depth": True}}
-    plain = recipe | {"kind": "sray", "field": {"encoder": {"depth": True}}}
-    assert recipe["kind"] == "sray-paper" and plain == peers.tomllib.loads(peers.recipe("sray", ALONE))
+        assert peers.tomllib.loads(peers.recipe(name, shallow))["field"] == {"encoder": own}
 
 
 def test_what_is_done_is_not_trained_again_and_another_recipe_is_refused(

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from research.suites.entries import load_entries
-from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, renew_card, ship
+from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, ship, ship_on_base
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from tests.small import tiny_field
 
 COMMIT = "a" * 40
@@ -78,6 +78,18 @@ def test_what_was_measured_is_shipped_bit_by_bit_with_its_figures(tmp_path: Path
     assert page.read_text(encoding="utf-8") == f"# Card\n\n{BEGIN}\n{metadata_block(out)}{END}\n\nProse.\n"
 
 
+def test_weights_shipped_on_a_base_read_back_alike_and_smaller(tmp_path: Path) -> None:
+    half, out = tmp_path / "half.safetensors", tmp_path / "out.safetensors"
+    base = load_checkpoint(default_checkpoint_path())
+    base.model.label_logit.data += 1
+    save_checkpoint(Checkpoint(base.model, (), run()), half, half=True)
+    ship_on_base(half, out)
+    assert out.stat().st_size < half.stat().st_size / 50
+    loaded = load_checkpoint(out)
+    assert all(torch.equal(loaded.model.state_dict()[name], t) for name, t in base.model.state_dict().items())
+    assert loaded.recipe == run()
+
+
 def test_weights_that_were_measured_before_they_were_converted_are_refused(tmp_path: Path) -> None:
     full, out = weights(tmp_path), tmp_path / "rooms.safetensors"
     with pytest.raises(WeightsError, match="--half-only"):
@@ -97,17 +109,6 @@ def test_figures_of_other_weights_or_of_half_a_run_are_refused(tmp_path: Path) -
         figures_of(path, table(tmp_path / "on.json", load_entries([path])[0].digest, complete=False))
     with pytest.raises(ConfigError, match="not a table"):
         figures_of(path, path)
-
-
-def test_figures_with_depth_and_without_are_asked_for(tmp_path: Path) -> None:
-    half, out = tmp_path / "half.safetensors", tmp_path / "rooms.safetensors"
-    convert(weights(tmp_path), half)
-    off, on = tables(tmp_path, half)
-    other_views = tables(tmp_path, half, views=4)
-    for given in ([], [off], [on, on], [off, on, on], other_views):
-        with pytest.raises(ConfigError, match="two tables"):
-            ship(half, given, out, card(tmp_path))
-    assert not out.exists()
 
 
 @pytest.mark.parametrize("revision", [None, "abc", f"{COMMIT}-dirty"])
@@ -139,13 +140,6 @@ def test_the_card_lists_the_runs_from_the_first_to_the_last(tmp_path: Path) -> N
     assert lines[start + 2].endswith("| `bbbbbbb` | cpu | 61 |")
     assert lines[start + 3].startswith("| `sray` | rays | colours and depth | 1,500 | last |")
     assert "Nothing was measured." in lines
-
-
-def test_a_card_without_its_marks_is_refused(tmp_path: Path) -> None:
-    page = tmp_path / "card.md"
-    page.write_text(f"{END}\n{BEGIN}\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match="must hold"):
-        renew_card(page, weights(tmp_path))
 
 
 def test_weights_that_others_published_need_no_revision_and_are_named_in_the_card(tmp_path: Path) -> None:

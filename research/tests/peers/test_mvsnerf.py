@@ -1,18 +1,14 @@
-import copy
 from dataclasses import replace
 
 import pytest
 import torch
 
-from research.peers.config import MVSNeRFConfig
-from research.peers.cost_volume import Sweep, cost_volume, nearest_views, query_camera
+from research.peers.cost_volume import Sweep, cost_volume, nearest_views
 from research.peers.mvsnerf import MVSNeRF
-from semantic_mapper.config import EncoderConfig
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.scene.grid import encoded_size
 from tests.fields.scene import INTRINSICS, WALL_M, pose_at, wall_rays, wall_sources
-from tests.fields.tiny_fields import AWAY, LABELS, POSES, assert_gradients_are_right, assert_unknown, tiny
+from tests.fields.tiny_fields import POSES, assert_gradients_are_right, tiny
 
 
 def mvsnerf() -> MVSNeRF:
@@ -32,36 +28,10 @@ def test_any_number_of_views_from_1_to_16_renders_with_and_without_depth(views: 
     assert render.known.all()
 
 
-def test_a_ray_that_no_view_sees_is_unknown():
-    field = mvsnerf()
-    assert_unknown(field.render(wall_rays(AWAY, step=53), field.encode(wall_sources(POSES))))
-
-
-def test_the_query_camera_is_found_from_any_few_of_its_rays():
-    pose = torch.from_numpy(pose_at(0.7, 0.4)).float()
-    rays = wall_rays(pose_at(0.7, 0.4))
-    for some in (slice(None), slice(0, 96), slice(1400, 1500)):
-        part = type(rays)(
-            *(getattr(rays, n)[some] for n in ("origin", "direction", "near_m", "far_m", "prior_depth_m"))
-        )
-        centre, axis = query_camera(part)
-        torch.testing.assert_close(centre, pose[:3, 3])
-        torch.testing.assert_close(axis, pose[:3, 2], atol=1e-3, rtol=0)
-
-
 def test_the_nearest_views_are_those_that_stand_near_and_look_the_same_way():
     encoded = mvsnerf().encode(wall_sources([pose_at(0.5), pose_at(0.05), pose_at(0.0, 1.5), pose_at(-0.1, 0.05)]))
     assert nearest_views(wall_rays(pose_at(0.0), step=9), encoded, 3).tolist() == [1, 3, 0]
     assert nearest_views(wall_rays(pose_at(0.0), step=9), encoded, 16).tolist() == [1, 3, 0, 2]
-
-
-def test_views_beyond_the_nearest_three_are_ignored():
-    field = mvsnerf()
-    near = [pose_at(0.0), pose_at(0.1), pose_at(-0.1)]
-    rays = wall_rays(pose_at(0.02), step=31)
-    few = field.render(rays, field.encode(wall_sources(near))).logits
-    many = field.render(rays, field.encode(wall_sources([pose_at(0.6), *near, pose_at(-0.7)]))).logits
-    torch.testing.assert_close(few, many, atol=1e-5, rtol=1e-4)
 
 
 def test_features_of_all_views_agree_on_the_plane_that_the_wall_stands_on():
@@ -113,13 +83,6 @@ def test_a_sample_looks_up_the_volume_at_its_own_place():
     assert (variance[seen_by_all].argmin(1) == 3).float().mean() > 0.9
 
 
-def test_planes_are_where_the_sweep_places_them():
-    sweep = Sweep(planes=4, near_m=0.5, far_m=4.0)
-    torch.testing.assert_close(sweep.place(torch.tensor([0.5, 4.0])), torch.tensor([-1.0, 1.0]))
-    torch.testing.assert_close(sweep.place(torch.tensor([1 / ((2 + 0.25) / 2)])), torch.tensor([0.0]))
-    assert sweep.place(torch.tensor([-3.0, 0.0])).isfinite().all()
-
-
 def test_a_view_rendered_in_chunks_is_swept_once_and_weights_that_change_sweep_it_anew():
     field = mvsnerf()
     swept: list[int] = []
@@ -152,32 +115,6 @@ def test_training_never_uses_a_volume_without_gradients():
     field.render(rays, encoded).logits.sum().backward()
     first = next(iter(field.volume_net.parameters()))
     assert first.grad is not None and first.grad.abs().max() > 0
-
-
-def test_a_kept_volume_hinders_neither_copies_nor_saving():
-    field = mvsnerf()
-    encoded = field.encode(wall_sources(POSES))
-    with torch.no_grad():
-        before = field.render(wall_rays(pose_at(0.0), step=101), encoded).logits
-        twin = copy.deepcopy(field)
-        torch.testing.assert_close(twin.render(wall_rays(pose_at(0.0), step=101), encoded).logits, before)
-    assert not any("kept" in name for name in field.state_dict())
-
-
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"views": 0}, "views"),
-        ({"planes": 1}, "planes"),
-        ({"plane_near_m": 9.0}, "plane_near_m"),
-        ({"volume_channels": 6}, "volume_channels"),
-        ({"depth": 0}, "depth"),
-        ({"encoder": EncoderConfig(channels=(8,))}, "encoder"),
-    ],
-)
-def test_a_config_that_cannot_be_built_is_refused_by_name(changes, named):
-    with pytest.raises(ConfigError, match=named):
-        MVSNeRF(MVSNeRFConfig(**changes), LABELS)
 
 
 def test_world_frame_does_not_matter():

@@ -4,10 +4,8 @@ import pytest
 import torch
 
 from research.peers.neuray import NeuRay, visibility_share
-from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.sray_layers import contextual_space
 from semantic_mapper.fields.volume import weighted_moments
-from semantic_mapper.types import SourceViews
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
 from tests.fields.tiny_fields import AWAY, POSES, assert_gradients_are_right, assert_unknown, tiny
 
@@ -72,15 +70,6 @@ def test_moments_are_those_of_the_views_that_count():
     assert nothing[0].abs().max() == 0 and nothing[1].abs().max() == 0
 
 
-def test_colour_comes_from_the_views():
-    field = neuray()
-    render = field.render(wall_rays(pose_at(0.0), step=31), field.encode(wall_sources(POSES)))
-    expected = wall_sources([pose_at(0.0)]).rgb[0].flatten(1).T[::31]
-    solid = render.opacity > 0.9
-    assert solid.any()
-    assert (render.rgb / render.opacity[:, None] - expected)[solid].abs().mean() < 0.05
-
-
 def test_source_logits_are_those_of_a_ray_of_the_view_itself_that_surely_ends():
     field = neuray()
     encoded = field.encode(wall_sources(POSES[:1]))
@@ -98,21 +87,6 @@ def test_source_logits_are_those_of_a_ray_of_the_view_itself_that_surely_ends():
     _, sample = field.aggregate(space.feature, cues, torch.ones_like(space.visibility), space.valid)
     logits = field.classifier(field.semantic(sample))[0, 1]
     torch.testing.assert_close(logits, own[0, :, 5, 7], atol=1e-4, rtol=1e-4)
-
-
-def test_labels_of_the_sources_are_not_looked_at():
-    field = neuray()
-    views = wall_sources(POSES)
-    rays = wall_rays(pose_at(0.0), step=31)
-    labelled = field.encode(replace(views, channel=torch.ones_like(views.depth_m, dtype=torch.int64)))
-    assert (labelled.channel == -1).all()
-    torch.testing.assert_close(field.render(rays, labelled).logits, field.render(rays, field.encode(views)).logits)
-
-
-def test_mismatched_sources_give_a_shape_error():
-    views = wall_sources(POSES)
-    with pytest.raises(ShapeError, match="source T_world_camera"):
-        neuray().encode(SourceViews(views.rgb, views.depth_m, views.K, views.T_world_camera[:, :3]))
 
 
 def test_the_whole_field_passes_gradcheck():

@@ -18,9 +18,9 @@ from research.scenes import (
 )
 from research.scenes.pose_noise import drifting_poses
 from research.scenes.primitives import rotation_x, rotation_z
-from research.scenes.sensor_color import blur_motion, develop, expose
+from research.scenes.sensor_color import blur_motion, expose
 from research.scenes.sensor_depth import STEREO_SENSORS, depth_edges, hidden_from_other_eye, measure_depth
-from research.scenes.shots import Shot, sequence_shots
+from research.scenes.shots import Shot
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.geometry import check_pose, invert_pose
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
@@ -62,19 +62,6 @@ def test_disparities_are_multiples_of_the_sensors_step(sensor: str) -> None:
     np.testing.assert_allclose(steps, np.round(steps), atol=2e-2)
 
 
-def test_noise_of_neighbouring_pixels_is_correlated() -> None:
-    error = measure_depth(flat(3.0), textured(), CAMERA, "oak_d", np.random.default_rng(2)) - 3.0
-    near = np.corrcoef(error[:, :-2].ravel(), error[:, 2:].ravel())[0, 1]
-    far = np.corrcoef(error[:, :-40].ravel(), error[:, 40:].ravel())[0, 1]
-    assert near > 0.25
-    assert abs(far) < 0.1
-
-
-def test_nothing_is_measured_nearer_than_the_ceiling_of_the_disparity() -> None:
-    assert (measure_depth(flat(0.6), textured(), CAMERA, "oak_d", np.random.default_rng(0)) == 0).all()
-    assert (measure_depth(flat(0.8), textured(), CAMERA, "oak_d", np.random.default_rng(0)) > 0).mean() > 0.9
-
-
 def test_the_passive_sensor_fails_on_blank_surfaces_and_the_active_one_does_not() -> None:
     blank = np.full((*SIZE, 3), 128, np.uint8)
     rng = np.random.default_rng
@@ -88,21 +75,6 @@ def test_a_band_beside_a_near_thing_is_hidden_from_the_other_eye() -> None:
     hidden = hidden_from_other_eye(disparity)
     # The background at columns 14 to 19 lands behind the near thing in the right image: 8 - 2 = 6 pixels.
     np.testing.assert_array_equal(np.flatnonzero(hidden[0]), np.arange(14, 20))
-
-
-def test_near_things_grow_at_their_edges() -> None:
-    exact = flat(4.0)
-    exact[:, 160:] = 2.0
-    measured = measure_depth(exact, textured(), CAMERA, "d435", np.random.default_rng(0))
-    beside = measured[:, 159]
-    assert (np.abs(beside[beside > 0] - 2.0) < 0.3).mean() > 0.4
-
-
-def test_exact_and_no_depth_sensor() -> None:
-    exact = flat(2.5)
-    rng = np.random.default_rng(0)
-    np.testing.assert_array_equal(measure_depth(exact, textured(), CAMERA, "exact", rng), exact)
-    assert not measure_depth(exact, textured(), CAMERA, "none", rng).any()
 
 
 @pytest.mark.parametrize(("sensor", "least", "most"), [("oak_d", 0.08, 0.5), ("d435", 0.01, 0.2)])
@@ -133,43 +105,6 @@ QUIET = NoiseConfig(auto_exposure=0.0, shot_noise=0.0, read_noise=0.0)
 
 def taken(linear: Float32, how: Shot, config: NoiseConfig = QUIET, z: float = 2.0) -> UInt8:
     return expose(linear, flat(z), CAMERA, how, config, np.random.default_rng(0))
-
-
-def test_a_quiet_neutral_camera_is_a_perfect_one() -> None:
-    linear = np.random.default_rng(0).uniform(0, 2, (*SIZE, 3)).astype(np.float32)
-    assert np.abs(taken(linear, shot()).astype(int) - develop(linear).astype(int)).max() <= 1
-
-
-def test_noise_in_the_dark_stands_out_and_grows_with_iso() -> None:
-    grey = np.full((*SIZE, 3), 0.05, np.float32)
-    config = NoiseConfig(auto_exposure=0.0)
-    low, high = (taken(grey, shot(iso=iso), config).astype(float).std() for iso in (0.5, 2.0))
-    assert 1.0 < low < high < 30.0
-
-
-def test_corners_are_darker_with_vignetting() -> None:
-    picture = taken(np.full((*SIZE, 3), 0.4, np.float32), shot(vignetting=0.35)).astype(int)
-    assert picture[0, 0, 0] < picture[120, 160, 0] - 10
-
-
-def test_auto_exposure_brings_dark_and_bright_rooms_closer() -> None:
-    config = NoiseConfig(shot_noise=0.0, read_noise=0.0)
-    dark, bright = (np.full((*SIZE, 3), light, np.float32) for light in (0.1, 1.2))
-    before = develop(bright).mean() - develop(dark).mean()
-    assert taken(bright, shot(), config).mean() - taken(dark, shot(), config).mean() < 0.6 * before
-
-
-def test_motion_blur_follows_the_motion_and_spares_what_is_far() -> None:
-    linear = np.zeros((*SIZE, 3), np.float32)
-    linear[:, 160] = 1.0
-    T = np.eye(4)
-    T[0, 3] = 0.05  # 5 cm to the right while the shutter is open: 5.5 pixels at 2 m, none at 50 m
-    near, far = (blur_motion(linear, flat(z), CAMERA, shot(T_open_close=T)) for z in (2.0, 50.0))
-    assert (near[120, :, 0] > 0).sum() >= 5
-    np.testing.assert_array_equal(far, linear)
-    T[:2, 3] = 0.0, 0.05
-    up = blur_motion(linear, flat(2.0), CAMERA, shot(T_open_close=T))
-    np.testing.assert_allclose(up[20:-20], linear[20:-20], atol=1e-6)  # along the line itself nothing changes
 
 
 def plain_blur(linear: Float32, depth_m: Float32, T_close_open: Float64) -> Float32:
@@ -241,18 +176,6 @@ def test_light_that_is_no_number_is_black() -> None:
     linear[0, 0, 1] = np.nan
     picture = taken(linear, shot())
     assert (picture[0, 0] == 0).all() and (picture[0, 1:] > 0).all()
-
-
-def test_exposure_and_white_balance_drift_along_a_sequence_without_jumps() -> None:
-    poses = camera_path(make_room(3, FAST), 60, 0)
-    shots = sequence_shots(poses, 5, NoiseConfig())
-    gains = np.log([s.gain for s in shots])
-    assert gains.std(0).min() > 0.01
-    assert np.abs(np.diff(gains, axis=0)).max() < 0.5
-    assert len({(s.contrast, s.saturation, s.iso) for s in shots}) == 1  # one camera
-    assert [s.gain.tolist() for s in sequence_shots(poses[:20], 5, NoiseConfig())] == [
-        s.gain.tolist() for s in shots[:20]
-    ]
 
 
 def test_odometry_drifts_a_little_and_a_loop_closure_takes_part_of_it_back() -> None:

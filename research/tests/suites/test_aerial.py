@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from research.scenes.aerial.views import aerial_camera, aerial_views
 from research.suites.aerial import (
     AGREEMENT,
     DARK,
@@ -29,7 +28,7 @@ from research.suites.aerial import (
     thinned,
     training_frames,
 )
-from research.suites.aerial_arms import BRIDGE, IMAGE_ARMS, PATCH, patch_arm
+from research.suites.aerial_arms import BRIDGE, PATCH, patch_arm
 from research.suites.aerial_claims import CLAIMS, CONSISTENCY, DARK_DROP, MIOU
 from research.suites.aerial_fields import field_arms
 from research.suites.aerial_grids import town_grid
@@ -37,10 +36,7 @@ from research.suites.aerial_irt import irt_arms
 from research.suites.claims import Claim, Counts, Unit, check_claim, check_claims, figure
 from research.suites.scene_runs import ViewScores
 from research.suites.store import RecordStore
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.geometry import unproject
 from semantic_mapper.labels import CARLA
-from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
 from semantic_mapper.types import PosedFrame, UInt8
 
 TINY = AerialConfig(
@@ -105,15 +101,6 @@ def test_the_truth_scores_100_and_one_class_little() -> None:
     assert agreeing == compared > 500
 
 
-def test_pixels_of_a_thinned_frame_are_those_of_the_frame() -> None:
-    (view, *_) = scored_views(TINY, EPISODE, DAY)
-    few, depth = thinned(view.frame, 3), view.rendered.exact_depth_m
-    assert few.rgb.shape == (16, 16, 3) and few.label is not None
-    assert np.array_equal(few.label, thin(view.rendered.label, 3))
-    there = thin(unproject(depth, view.frame.intrinsics), 3)
-    assert np.allclose(unproject(thin(depth, 3), few.intrinsics), there, atol=1e-4)
-
-
 def test_arms_are_not_shown_the_truth_they_are_scored_by() -> None:
     def predict(frame: PosedFrame, every: int) -> UInt8:
         assert frame.label is None and frame.depth_m is None
@@ -140,17 +127,6 @@ def test_a_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert len(table["a", DAY]) == 4 and sum(int(c.sum()) for c in table["a", DAY].values()) == 2 * 4 * 48 * 48
     assert aerial_digest(TINY) != aerial_digest(msgspec.structs.replace(TINY, grid_steps=7))
     assert aerial_digest(TINY) == aerial_digest(msgspec.structs.replace(TINY, towns=2))
-
-
-def test_settings_that_no_run_can_follow_are_refused(tmp_path: Path) -> None:
-    config = msgspec.structs.replace(TINY, labelled=24)
-    with pytest.raises(ConfigError, match="labelled"):
-        list(run_aerial(config, {}, RecordStore(tmp_path / "a.jsonl")))
-
-
-def test_colours_say_little_and_nothing_in_the_dark() -> None:
-    scores = IMAGE_ARMS["color"](TINY, EPISODE)
-    assert 3.0 < miou(scores) < 30.0 and miou(scores, DARK) < miou(scores)
 
 
 def test_patches_are_of_asphalt_and_as_many_as_it_has_pixels() -> None:
@@ -184,17 +160,6 @@ def test_a_grid_is_fitted_once_and_knows_depth(folder: Path) -> None:
 def test_arms_on_a_grid_beat_one_class(name: str, folder: Path) -> None:
     scores = (field_arms(folder) | irt_arms(folder))[name](TINY, EPISODE)
     assert miou(scores) > 5.0 > 3.0 * miou(score_episode(TINY, EPISODE, terrain))
-
-
-def test_a_dimmed_unet_sees_other_pictures_and_the_default_none() -> None:
-    frames = [v.frame for v in aerial_views(200_000, [0], aerial_camera(32))]
-    nets = {
-        darkest: UNetBaseline(CARLA, UNetConfig(steps=2, width=32, darkest=darkest)) for darkest in (1.0, 0.999999, 0.1)
-    }
-    for net in nets.values():
-        net.fit(frames)
-    weights = {darkest: net.net.classifier.weight for darkest, net in nets.items()}
-    assert not torch.equal(weights[1.0], weights[0.1])
 
 
 def table_of(values: dict[str, list[int]], kind: str = DAY) -> dict[tuple[str, str], dict[Unit, Counts]]:

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from research.plots import Panel
 from research.suites import figures as module
 from research.suites.figures import draw_fit_curves
-from semantic_mapper.plots import Panel
 
 
 def figures(curve: list[tuple[float, float | None]], carried: float | None) -> dict[str, Any]:

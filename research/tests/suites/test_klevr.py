@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from research.suites.claims import Claim, Counts, Training, Unit, check_claim
+from research.suites.claims import Claim, Counts, Unit, check_claim
 from research.suites.klevr import (
     POINTS,
     TEST_CAMERAS,
@@ -32,7 +32,6 @@ from research.suites.klevr_claims import CLAIMS, POINTS_MIOU, TRAIN_MIOU
 from research.suites.klevr_images import color_arm, vote_at_points
 from research.suites.plateau import PLATEAU, fit_to_plateau
 from research.suites.store import RecordStore
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.labels import KLEVR
 from semantic_mapper.types import PosedFrame, UInt8
@@ -131,26 +130,6 @@ def test_claims_compare_figures_of_one_arm_and_a_fraction() -> None:
     assert check_claim(less, one).result == "not run"
 
 
-def test_claims_on_an_arm_that_still_learns_are_not_judged() -> None:
-    table = {("a", POINTS): matrices([90, 80]), ("b", POINTS): matrices([60, 50])}
-    claim = Claim("gain", "", POINTS_MIOU, "a", "b", least=5.0, at_plateau=("b",))
-    judged = check_claim(claim, table, training=Training({"a"}))
-    left = check_claim(claim, table, training=Training({"b", "c"}))
-    assert judged.result == "accepted" and judged.reason == ""
-    assert left.result == "not judged" and left.reason == "b not at the plateau"
-    assert (left.difference, left.low, left.high) == (judged.difference, judged.low, judged.high)
-    assert check_claim(claim, {}, training=Training({"a"})).result == "not run"
-
-
-def test_claims_on_the_same_steps_are_not_judged_after_others() -> None:
-    table = {("a", POINTS): matrices([90, 80]), ("b", POINTS): matrices([60, 50])}
-    claim = Claim("gain", "", POINTS_MIOU, "a", "b", least=5.0, same_steps=True)
-    assert check_claim(claim, table, training=Training((), {"a": {40}, "b": {40}})).result == "accepted"
-    left = check_claim(claim, table, training=Training((), {"a": {40}, "b": {20, 40}}))
-    assert left.result == "not judged" and left.reason == "a 40 steps, b 20/40 steps"
-    assert check_claim(replace(claim, same_steps=False), table, training=Training((), {"a": {40}})).result == "accepted"
-
-
 @pytest.mark.parametrize(
     ("reached", "steps", "gain"),
     [
@@ -173,13 +152,6 @@ def test_steps_are_doubled_until_the_plateau(reached: tuple[float, ...], steps: 
     if reached[1] < reached[0] and gain > 0:
         asked.clear()
         assert fit_to_plateau(fit, 10, doublings=2, a_loss_ends_it=True)[0] == 10
-
-
-def test_settings_that_no_run_can_follow_are_refused(tmp_path: Path) -> None:
-    for changes in ({"train_views": 9}, {"label_maps": 8}):
-        config = msgspec.structs.replace(TINY, **changes)
-        with pytest.raises(ConfigError, match="label maps"):
-            list(run_klevr(config, {}, RecordStore(tmp_path / "a.jsonl")))
 
 
 def test_points_take_the_class_that_most_cameras_say() -> None:

@@ -12,7 +12,6 @@ from research.suites.figures import compare_with_carried, view_figures
 from research.suites.predict import predict_view
 from research.suites.protocols import (
     Entry,
-    Keyframes,
     RoomResult,
     answer_from_keyframes,
     choose_fitted,
@@ -104,14 +103,6 @@ def test_computed_depth_comes_with_its_spread_and_is_sampled_more_widely() -> No
     assert not np.array_equal(asked.depth_m, room.frames[room.queries[0]].depth_m)
 
 
-def test_without_depth_coarse_samples_may_guide_fine_ones() -> None:
-    tier = {"width": 48, "blind": {"mode": "reference", "coarse": 6, "fine": 4}}
-    record = score(tiny_contestant(), tiny_suite(depth="off", tier=tier)).record
-    uniform = score(tiny_contestant(), tiny_suite(depth="off")).record
-    assert record.images[0].depth.count > 0 and record.settings != uniform.settings
-    assert record.images[0].depth != uniform.images[0].depth
-
-
 def test_the_compiled_renderer_gives_the_figures_of_the_field_itself() -> None:
     fast, plain = (score(Entry("x", "x", f), tiny_suite()) for f in (tiny_field(), watched()))
     for query, answer in fast.answers.items():
@@ -142,30 +133,6 @@ def test_keyframes_are_no_queries_and_not_next_to_one() -> None:
     assert len(chosen.labelled) == 3 and not set(chosen.labelled) & {5, 6, 7, 8, 9} and not chosen.unlabelled
     with pytest.raises(ConfigError, match="9 keyframes are requested"):
         choose_fitted(tiny_room(), tiny_suite(scene={"keyframes": 9, "guard": 2}))
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"scene": {"guard": -1}},
-        {"scene": {"keyframes": 0}},
-        {"scene": {"seconds": -1.0}},
-        {"views": 0},
-        {"views": 40},
-        {"seed": -1},
-        {"map_frames": 0},
-        {"sequence": {"query_pairs": 0}},
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(bad: dict[str, object]) -> None:
-    with pytest.raises(ConfigError, match="test suite"):
-        tiny_suite(**bad)
-
-
-def test_a_guard_of_none_still_keeps_the_queries_out() -> None:
-    scene = {"keyframes": 6, "unlabelled": 6, "guard": 0}
-    chosen = choose_fitted(tiny_room(), tiny_suite(protocol="finetune", scene=scene))
-    assert not {*chosen.labelled, *chosen.unlabelled} & set(tiny_room().queries)
 
 
 @pytest.mark.slow
@@ -199,14 +166,6 @@ def test_fitting_gives_a_curve_and_renders_from_the_labelled_keyframes() -> None
     assert told == sorted(told) and told[-1] == pytest.approx(1)
     figures = view_figures([record])
     assert [p["steps"] for p in figures["curve"]] == [0, 1, 2]
-
-
-def test_labels_of_the_keyframes_can_be_kept_from_the_queries() -> None:
-    field = watched()
-    for given in (True, False):
-        suite = tiny_suite(protocol="finetune", scene={"labelled_sources": given})
-        answer_from_keyframes(tiny_room(), field, suite, Keyframes((0, 2, 12), ()))
-        assert (field.seen.channel is not None) == given
 
 
 def test_labels_kept_from_the_queries_play_no_part_in_fitting_either() -> None:
@@ -265,24 +224,11 @@ def test_a_kind_for_one_scene_is_fitted_in_a_box_round_what_the_keyframes_see() 
     assert 0.5 * depth_m < box.half_extent_m
 
 
-def test_a_scene_grid_has_its_own_fitter_and_claims_no_class() -> None:
-    (entry,) = load_entries([], ["grid"])
-    scene = {"keyframes": 3, "guard": 1, "seconds": 0, "steps": 5, "shares": (1.0,)}
-    record = score(entry, tiny_suite(protocol="scratch", scene=scene)).record
-    assert record.curve[-1].steps == 5
-    assert from_rows(record.confusion).metrics().coverage == 0
-
-
 def test_a_fitting_that_is_stopped_gives_no_figures() -> None:
     steps: list[float] = []
     suite = tiny_suite(protocol="finetune", scene={"keyframes": 3, "guard": 1, "seconds": 0, "steps": 50})
     assert run_room(tiny_room(), tiny_contestant(), suite, steps.append, lambda: len(steps) >= 2) is None
     assert len(steps) == 2
-
-
-def test_a_budget_of_nothing_is_refused() -> None:
-    with pytest.raises(ConfigError, match="needs a budget"):
-        score(tiny_contestant(), tiny_suite(protocol="scratch", scene={"seconds": 0, "steps": 0}))
 
 
 @pytest.mark.parametrize(

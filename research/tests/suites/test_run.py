@@ -4,16 +4,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from research.evaluation.sheet import draw_sheet
-from research.suites.config import settings_digest
 from research.suites.figures import compare, view_figures
 from research.suites.records import CalibrationRecord, MapRecord, RoomRecord
 from research.suites.run import Progress, room_records, run_suite, sheet_rows
 from research.suites.store import RecordStore
 from research.tests.suites.tiny import ROOM, tiny_contestant, tiny_suite
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -92,21 +88,6 @@ def test_a_line_that_was_cut_off_is_dropped_and_the_next_one_is_whole(tmp_path: 
     assert again.find(MapRecord, "s", "w", 1) and again.find(MapRecord, "s", "w", 2) is None
     again.add(map_record(3))
     assert RecordStore(path).find(MapRecord, "s", "w", 3) == map_record(3)
-
-
-def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "run.jsonl"
-    path.write_text('{"record": "views"}\n', encoding="utf-8")
-    with pytest.raises(ConfigError, match="line 1 is not a record"):
-        RecordStore(path)
-
-
-def test_settings_decide_which_records_count(tmp_path: Path) -> None:
-    path = tmp_path / "run.jsonl"
-    run_suite(tiny_suite(), [tiny_contestant()], RecordStore(path), tmp_path / "views", silent)
-    store = RecordStore(path)
-    assert store.find(RoomRecord, settings_digest(tiny_suite(), "views"), "digest0", ROOM) is not None
-    assert room_records(tiny_suite(sources="wide"), tiny_contestant(), store) == []
 
 
 def test_the_benchmark_needs_nothing_that_a_training_machine_lacks() -> None:

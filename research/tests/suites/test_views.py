@@ -7,7 +7,6 @@ import pytest
 
 from research.suites.config import SpacingConfig
 from research.suites.views import choose_as_mapper, choose_covering, choose_sources
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 CAMERA = CameraIntrinsics(40.0, 40.0, 23.5, 15.5, 48, 32)
@@ -51,22 +50,6 @@ def test_wide_views_keep_their_distance_from_the_query_and_from_each_other() -> 
     assert set(found.numbers) == {2, 5, 4}
 
 
-def test_distances_are_given_up_where_too_few_views_keep_them() -> None:
-    candidates = [frame(x) for x in (0.1, 0.5, 0.55)]
-    assert choose(candidates, 2, 0.5, 0.2).numbers == (1, 2)
-    assert choose(candidates, 3, 0.5, 0.2).numbers == (1, 2, 0)
-
-
-def test_sensor_holes_hide_nothing() -> None:
-    blind = dataclasses.replace(frame(0.1), depth_m=np.zeros_like(WALL))
-    assert choose([blind, frame(0.3)], 1, 0.0, 0.0).numbers == (0,)
-
-
-def test_more_views_than_frames_are_refused() -> None:
-    with pytest.raises(ConfigError, match="3 source views"):
-        choose([frame(0.1)], 3, 0.0, 0.0)
-
-
 def test_covering_views_add_to_each_other_and_labelled_ones_count_twice() -> None:
     left, near, right = frame(-0.6), frame(-0.55), frame(0.6)
     found = choose_covering(np.eye(4), WALL, [left, near, right, frame(0.0, turned=True)], [False] * 4, 2)
@@ -74,11 +57,6 @@ def test_covering_views_add_to_each_other_and_labelled_ones_count_twice() -> Non
     assert found.seen > 0.95
     assert found.distance_m == pytest.approx(0.575)
     assert choose_covering(np.eye(4), WALL, [left, near, right], [True, False, False], 1).numbers == (0,)
-
-
-def test_a_view_is_chosen_even_where_none_sees_anything() -> None:
-    blind = choose_covering(np.eye(4), WALL, [frame(0.0, turned=True)], [True], 3)
-    assert blind.numbers == (0,) and blind.seen == 0
 
 
 def test_the_choice_of_the_mapper_takes_keyframes_of_the_past_that_cover_the_query() -> None:

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -9,14 +8,13 @@ import torch
 from research.scenes import PoseNoiseConfig, room_frames
 from research.tests.train.small_run import POOL, small_run
 from research.train.cameras import draw_camera
-from research.train.computed_depth import BETWEEN_M, ComputedDepth, compute_depth, draw_computed_depth
+from research.train.computed_depth import ComputedDepth, compute_depth
 from research.train.rooms import PackedRoom, RoomPoolConfig, pack_room, unpack_room
 from research.train.start import take_over
 from research.train.step import StepConfig, draw_batch
 from research.train.train import train
-from research.train.view_draws import cropped_view, join_sources, select_sources
+from research.train.view_draws import cropped_view
 from semantic_mapper.config import SamplingConfig, convert_config
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.volume import COMPUTED_GUIDED
@@ -56,29 +54,12 @@ def test_computed_depth_is_near_the_measured_one_where_its_spread_is_small():
         assert np.median(error[spread <= np.median(spread)]) < 0.05
 
 
-def test_views_far_apart_get_pictures_in_between():
-    assert draw_computed_depth(0, 0.0, 0.3) is None
-    near, far = draw_computed_depth(0, 1.0, 0.5 * BETWEEN_M), draw_computed_depth(0, 1.0, 2.5 * BETWEEN_M)
-    assert near is not None and far is not None
-    assert (near.between, far.between) == (1, 3)
-    assert {d.delay_frames for d in (draw_computed_depth(s, 1.0, 0.1) for s in range(20)) if d} == {0, 6}
-
-
 def test_every_nth_picture_is_a_view_whose_pose_drifts_as_it_was_given():
     intrinsics = draw_camera(0, 64, 0.1, MEASURED.camera).intrinsics
     frames = list(room_frames(0, 6, intrinsics, pose_noise=PoseNoiseConfig()))
     chosen = compute_depth(frames, ComputedDepth(2, 0))
     assert [f.seq for f in chosen] == [0, 2, 4]
     assert all(np.array_equal(f.T_world_camera, frames[f.seq].T_world_camera) for f in chosen)
-
-
-def test_rooms_without_computed_depth_do_not_depend_on_the_setting():
-    seeds = [seed for seed in range(6) if draw_computed_depth(seed, 0.5, 0.1) is None]
-    some = msgspec.structs.replace(MEASURED, computed_depth=0.5)
-    for seed in seeds[:2]:
-        one, other = pack_room(seed, MEASURED), pack_room(seed, some)
-        assert isinstance(one, PackedRoom) and isinstance(other, PackedRoom) and other.computed_m is None
-        assert np.array_equal(one.rgb, other.rgb) and np.array_equal(one.depth_m, other.depth_m)
 
 
 def test_mirrored_and_cropped_views_carry_their_computed_depth_along(room: PackedRoom):
@@ -96,17 +77,6 @@ def test_mirrored_and_cropped_views_carry_their_computed_depth_along(room: Packe
     assert part.computed_sigma_m.shape == part.depth_m.shape
 
 
-def test_spreads_stay_with_their_views_when_sources_are_joined_and_selected(room: PackedRoom):
-    computed = stack_sources(unpack_room(room, CPU).views[:2])
-    measured = replace(computed, depth_sigma_m=None)
-    joined = join_sources([measured, computed])
-    assert joined.depth_sigma_m is not None and not joined.depth_sigma_m[:2].any()
-    chosen = select_sources(joined, torch.tensor([3, 0]))
-    assert chosen.depth_sigma_m is not None and computed.depth_sigma_m is not None
-    assert torch.equal(chosen.depth_sigma_m[0], computed.depth_sigma_m[1])
-    assert join_sources([measured, measured]).depth_sigma_m is None
-
-
 def test_rays_are_sampled_round_computed_depth_and_learn_the_measured_one(room: PackedRoom):
     views = unpack_room(room, CPU).views
     config = StepConfig(rays=64, depth_dropout=0, sampling=SamplingConfig(guided=4))
@@ -115,11 +85,6 @@ def test_rays_are_sampled_round_computed_depth_and_learn_the_measured_one(room: 
     assert batch.z.shape[1] == COMPUTED_GUIDED
     assert torch.isin(batch.rays.prior_depth_m, views[2].computed_m).all()
     assert torch.isin(batch.targets.depth_m, views[2].depth_m).all()
-
-
-def test_an_encoder_that_is_shown_no_computed_depth_cannot_be_trained_on_it():
-    with pytest.raises(ConfigError, match=r"\[field.encoder\]"):
-        train(small_run(pool=POOL | {"computed_depth": 0.5}))
 
 
 def test_a_run_learns_from_rooms_with_computed_depth():

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from research.train.step import StepConfig, pick_views_on_path
 from research.train.view_draws import degrade_view, natural_weights
-from semantic_mapper.config import EncoderConfig, SRayConfig, UNetFieldConfig
+from semantic_mapper.config import EncoderConfig, SRayConfig
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.losses import guess_loss, semantic_loss
+from semantic_mapper.training.losses import guess_loss
 from semantic_mapper.training.views import draw_pixels
 from semantic_mapper.types import SourceViews
 from tests.fields.scene import pose_at, wall_sources
-from tests.small import SMALL_ENCODER, tiny_field
+from tests.small import SMALL_ENCODER
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -45,13 +43,6 @@ def test_weighted_rays_have_the_class_frequencies_of_the_image() -> None:
     found = torch.zeros(8).scatter_add(0, drawn, weight) / weight.sum()
     torch.testing.assert_close(found, natural, atol=0.01, rtol=0)
     assert natural_weights(drawn, channel, 0.0).eq(1).all()
-
-
-def test_a_weight_counts_as_so_many_rays() -> None:
-    logits, channel = torch.randn(4, 5, generator=generator()), torch.tensor([0, 1, -1, 4])
-    twice = semantic_loss(torch.cat((logits, logits[:1])), torch.cat((channel, channel[:1])))
-    weighted = semantic_loss(logits, channel, torch.tensor([2.0, 1, 9, 1]))
-    torch.testing.assert_close(weighted, twice)
 
 
 def test_a_degraded_view_is_spoiled_and_the_others_are_not() -> None:
@@ -96,31 +87,6 @@ def test_a_frozen_colour_network_keeps_weights_and_statistics_while_the_other_le
     with encoder.batch_statistics():
         encoder(views).square().mean().backward()
     assert all(p.grad is not None for p in encoder.colour_net.parameters())
-
-
-def test_a_field_starts_as_the_classifier_of_a_unet() -> None:
-    field = tiny_field()
-    unet = UNetField(UNetFieldConfig(field.config.feature_dim, field.config.encoder), ROOMS).eval()
-    unet.encoder.load_state_dict(field.encoder.state_dict())
-    assert field.start_from_classifier(*unet.image_classifier())
-    views = source_views(2, (36, 48))
-    with torch.no_grad():
-        encoded = field.encode(views)
-        torch.testing.assert_close(
-            field.source_logits(encoded), unet.source_logits(unet.encode(views)), atol=1e-4, rtol=1e-4
-        )
-    other = torch.zeros(len(ROOMS), field.config.feature_dim + 4)
-    assert not field.start_from_classifier(other, torch.zeros(len(ROOMS)))
-
-
-@pytest.mark.parametrize("name", ["own_view_degraded", "wide_fraction"])
-def test_what_is_off_draws_nothing(name: str) -> None:
-    """Runs of before repeat bit for bit."""
-    plain = StepConfig(views_min=2, views_max=5)
-    assert getattr(plain, name) == 0
-    a, b = generator(3), generator(3)
-    assert pick_views_on_path([4], 9, plain, a) == pick_views_on_path([4], 9, plain, b)
-    assert torch.equal(torch.rand(1, generator=a), torch.rand(1, generator=b))
 
 
 def test_the_depth_of_views_without_any_is_learned_where_it_was_measured() -> None:

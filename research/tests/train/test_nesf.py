@@ -12,8 +12,8 @@ import torch
 from msgspec.structs import replace
 
 from research.train.map_grids import training_map
-from research.train.nesf import NesfTrainConfig, TrainingMap, VoxelLabels, _crop, train_nesf, withhold
-from semantic_mapper.errors import ConfigError, WeightsError
+from research.train.nesf import NesfTrainConfig, TrainingMap, VoxelLabels, _crop, train_nesf
+from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.nesf import (
     CELL_M,
     FARTHEST_M,
@@ -22,7 +22,6 @@ from semantic_mapper.fields.nesf import (
     load_nesf,
     pool,
     save_nesf,
-    smoothed_votes,
 )
 from semantic_mapper.labels import ROOMS, make_label_set
 from tests.mapping.test_refine import UP, make_map
@@ -85,14 +84,6 @@ def test_a_network_that_overrules_right_votes_is_trusted_less(noisy: TrainingMap
     assert recipe["trusted"] <= 0.5 and recipe["validation"]["miou"] > recipe["history"][-1]["miou"]
 
 
-def test_an_untrusted_network_leaves_the_smoothed_votes(noisy: TrainingMap) -> None:
-    trained = train_nesf(replace(TINY, steps=5), ROOMS, [noisy], [noisy]).model
-    cells = pool(noisy.points)
-    trained.trust(0.0)
-    expected, found = smoothed_votes(ROOMS).model(cells), trained(cells)
-    torch.testing.assert_close(found[:, :-3], expected[:, :-3])
-
-
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """Several threads add gradients in an order that changes."""
@@ -128,18 +119,6 @@ def test_training_maps_and_weights_survive_their_files(noisy: TrainingMap, tmp_p
     assert loaded.model.label_set == ROOMS and loaded.recipe["steps"] == 1 and len(loaded.digest) == 64
 
 
-def test_votes_and_colours_are_withheld_as_often_as_asked(noisy: TrainingMap) -> None:
-    rng = np.random.default_rng(0)
-    config = NesfTrainConfig(no_votes=0.2, cubes=0.3, no_colour=0.4)
-    kept = [withhold(noisy.points, config, rng) for _ in range(200)]
-    had = (noisy.points.votes > 0).sum()
-    votes = np.array([(p.votes > 0).sum() / had for p in kept])
-    assert 0.1 < (votes == 0).mean() < 0.4
-    assert 0.1 < ((votes > 0) & (votes < 1)).mean() < 0.4
-    assert 0.3 < np.mean([not p.rgb.any() for p in kept]) < 0.5
-    assert all((p.log_p[p.votes == 0] == 0).all() for p in kept)
-
-
 def test_the_way_to_objects_is_learned_where_maps_have_instances(noisy: TrainingMap) -> None:
     numbers = [np.where(frame.label == 5, 3, 9).astype(np.uint16) for frame in tiny_frames()]
     told = training_map(make_map(), tiny_frames(), ROOMS, UP, instances=numbers)
@@ -165,13 +144,6 @@ def test_targets_are_the_ways_to_whole_objects(noisy: TrainingMap) -> None:
     reached = crop.xyz[near] + crop.way[near].numpy() / CELL_M
     assert near.sum() > 10
     assert len(np.unique(np.rint(reached * 4), axis=0)) <= 4, "those that reach a centre reach one of two"
-
-
-def test_no_maps_and_no_budget_are_refused(noisy: TrainingMap) -> None:
-    with pytest.raises(ConfigError, match="at least one map"):
-        train_nesf(TINY, ROOMS, [], [noisy])
-    with pytest.raises(ConfigError, match="budget"):
-        train_nesf(NesfTrainConfig(steps=0), ROOMS, [noisy], [noisy])
 
 
 def test_maps_of_more_classes_are_refined_as_those_of_fewer(noisy: TrainingMap, tmp_path: Path) -> None:

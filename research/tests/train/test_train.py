@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors import safe_open
 
 from research.tests.train.small_run import contents, small_run
 from research.train.train import (
@@ -12,13 +11,10 @@ from research.train.train import (
     WEIGHTS_FILE,
     TrainProgress,
     learning_rate,
-    step_seed,
     train,
 )
-from research.train.train_config import TrainConfig
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
-from semantic_mapper.fields.sray import SRay
 
 
 def stop_after(steps: int):
@@ -47,21 +43,6 @@ def test_a_run_that_was_stopped_and_resumed_equals_one_that_was_not_bit_for_bit(
     assert whole.recipe["validation_miou"] == parts.recipe["validation_miou"]
 
 
-def test_another_seed_gives_other_weights_and_other_rooms():
-    a, b = (train(small_run(steps=2, seed=seed)).model.state_dict() for seed in (0, 1))
-    assert any(not torch.equal(a[n], b[n]) for n in a)
-    assert len({step_seed(s, r, k) for s in range(3) for r in range(3) for k in range(3)}) == 27
-
-
-def test_the_last_weights_are_kept_where_asked_for(tmp_path: Path):
-    validation = {"times": 3, "rooms": 1, "queries": 1, "rays": 64, "views": 3}
-    last = train(small_run(keep="last", steps=6, validation=validation), tmp_path)
-    assert last.recipe["best_step"] == 6 and last.recipe["validation"]["step"] == 6
-    with safe_open(tmp_path / STATE_FILE, framework="pt") as state:
-        for name, tensor in last.model.state_dict().items():
-            assert torch.equal(state.get_tensor(f"model.{name}"), tensor), name
-
-
 @pytest.mark.slow
 def test_training_lowers_the_loss_and_keeps_the_best_weights(tmp_path: Path):
     run = small_run(steps=36, log_steps=12, validation={"times": 3, "rooms": 1, "queries": 1, "rays": 64})
@@ -83,13 +64,6 @@ def test_the_recipe_tells_where_the_weights_come_from():
     assert recipe["device"].startswith("cpu") and recipe["width"] == 48
     assert set(recipe["validation"]) >= {"miou", "blind_miou", "accuracy", "blind_accuracy"}
     assert "git_revision" in recipe and json.dumps(recipe, allow_nan=False)
-
-
-def test_a_stop_before_the_first_validation_gives_the_latest_weights(tmp_path: Path):
-    checkpoint = train(small_run(steps=500), tmp_path, **stop_after(3))
-    assert checkpoint.recipe["steps"] == 3 and checkpoint.recipe["validation_miou"] is None
-    tensors, _ = contents(tmp_path / STATE_FILE)
-    assert all(torch.equal(tensors[f"model.{n}"], t) for n, t in checkpoint.model.state_dict().items())
 
 
 def test_a_run_goes_on_with_a_larger_budget_but_with_no_other_config(tmp_path: Path):
@@ -134,20 +108,6 @@ def test_a_state_that_is_damaged_says_so(tmp_path: Path):
         train(small_run(), tmp_path, resume=True)
 
 
-def test_a_loss_that_is_no_number_ends_training():
-    with pytest.raises(WeightsError, match="diverged by step"):
-        train(small_run(steps=40, learning_rate=1e12, final_learning_rate=1e12, gradient_clip=1e12))
-
-
-def test_the_kind_of_field_and_its_settings_come_from_the_config():
-    model = train(small_run(steps=1)).model
-    assert isinstance(model, SRay) and model.config.feature_dim == 16
-    with pytest.raises(ConfigError, match="no field of kind 'nerf'"):
-        train(small_run(kind="nerf"))
-    with pytest.raises(ConfigError, match="did you mean `heads`"):
-        train(small_run(field={"head": 2}))
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -162,11 +122,6 @@ def test_the_kind_of_field_and_its_settings_come_from_the_config():
 def test_settings_that_make_no_sense_are_refused(changes: dict, words: str):
     with pytest.raises(ConfigError, match=words):
         train(small_run(**changes))
-
-
-def test_labels_of_source_views_are_not_given_unless_asked_for():
-    assert not TrainConfig().step.known_labels
-    assert not small_run().step.known_labels, "a [step] table that leaves it out must not switch it on"
 
 
 def test_the_rate_warms_up_and_then_falls_to_its_end():

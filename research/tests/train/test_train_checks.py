@@ -40,17 +40,6 @@ def encoder(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_kinds_that_do_not_classify_images_are_told_which_setting_to_change(tmp_path: Path):
-    with pytest.raises(ConfigError, match=r"kind 'mvsnerf' .* fraction = 0 under \[images\] .* --encoder"):
-        train(small_run(kind="mvsnerf", field={}), tmp_path)
-
-
-@pytest.mark.parametrize("images", [{}, RAYS_ALONE])
-def test_a_field_of_one_scene_has_nothing_to_learn_for_other_rooms(images: dict[str, float]):
-    with pytest.raises(ConfigError, match=r"a single scene .* --protocol scratch --kind semantic_nerf"):
-        train(small_run(kind="semantic_nerf", field={}, images=images))
-
-
 def test_a_state_to_go_on_with_has_to_be_there(tmp_path: Path):
     with pytest.raises(WeightsError, match="no such training state; train without --resume first"):
         train(small_run(), tmp_path, resume=True)
@@ -84,17 +73,3 @@ def test_rooms_of_a_step_share_one_call_only_where_a_kind_encodes_each_view_by_i
     with pytest.raises(ConfigError, match="in the light of each other"):
         train(small_run(images=RAYS_ALONE, encode_together=True))
     check_field(tiny_field(), small_run(encode_together=True))
-
-
-def test_parts_that_compute_in_bfloat16_have_to_be_there():
-    with pytest.raises(ConfigError, match="no part 'decoder'"):
-        train(small_run(bfloat16=["decoder"]))
-
-
-@pytest.mark.parametrize(
-    ("pool", "what"),
-    [({"rooms": 2, "rooms_at_start": 3}, "rooms_at_start <= rooms"), ({"step_m_min": 0.5}, "step_m_min <= step_m_max")],
-)
-def test_a_pool_that_cannot_be_filled_is_refused_where_it_is_read(pool: dict[str, float], what: str):
-    with pytest.raises(ConfigError, match=what):
-        small_run(pool=pool)

@@ -15,16 +15,14 @@ from research.train.recipe import rooms_before
 from research.train.rooms import RoomPool, RoomPoolConfig, draw_images, render_room
 from research.train.start import take_over_encoder
 from research.train.train import IMAGES_FILE, STATE_FILE, WEIGHTS_FILE, train
-from semantic_mapper.config import SRayConfig, convert_config, to_plain
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.training.fit import cosine_rate
 from semantic_mapper.training.losses import image_loss
-from semantic_mapper.training.views import mirrored_view, query_rays, stack_sources
-from tests.small import SMALL_ENCODER
+from semantic_mapper.training.views import mirrored_view, query_rays
 
 
 def load_state_of(folder: Path) -> dict[str, str]:
@@ -183,58 +181,6 @@ def test_a_larger_budget_goes_on_with_rays_once_the_images_are_over(
     assert (tmp_path / IMAGES_FILE).read_bytes() == after_images
 
 
-def test_a_larger_budget_of_a_run_on_images_alone_is_for_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("research.train.train.draw_batch", refuse)
-    images = {"fraction": 1.0, "rooms": 1}
-    for steps in (2, 4):
-        train(small_run(images=images, steps=steps), tmp_path, resume=steps > 2)
-    assert load_checkpoint(tmp_path / IMAGES_FILE).recipe["steps"] == 4
-
-
-def test_the_network_for_depth_grows_from_the_one_for_colours_after_its_share_of_the_images(tmp_path: Path):
-    images = {"fraction": 1.0, "rooms": 1, "colours_first": 0.5, "learning_rate": 1e-12}
-    rates = {"final_learning_rate": 1e-12, "weight_decay": 0.0, "validation": {"times": 1, "rooms": 1, "queries": 1}}
-    encoder = train(small_run(images=images, steps=4, **rates), tmp_path).model.image_encoder
-    assert encoder is not None and encoder.depth_net is not None
-    # Next to nothing was learned, so that the two are still the same but for the first layer's view of depth.
-    torch.testing.assert_close(encoder.depth_net.head.weight, encoder.colour_net.head.weight, atol=1e-6, rtol=0)
-    assert encoder.depth_net.stem.weight[:, 3:].abs().max() < 1e-6
-    state = load_state_of(tmp_path)
-    assert state["depth_grown"] == "True"
-
-
-def test_images_come_without_depth_at_first():
-    config = ImageStepConfig(rooms=1, images=4, depth_dropout=0.0)
-    for only in (True, False):
-        batch = draw_images([ROOM], config, torch.Generator().manual_seed(1), CPU, colours_only=only)
-        assert bool((batch.views.depth_m > 0).any()) is not only
-
-
-def test_a_network_for_depth_grows_from_an_encoder_of_colours_that_is_taken_over(tmp_path: Path):
-    colours = {"feature_dim": 16, "heads": 2, "encoder": {"channels": [8, 16], "blocks": [1, 1], "depth": False}}
-    save_checkpoint(Checkpoint(build_field("sray", colours, ROOMS)), tmp_path / "c.safetensors")
-    field = build_field("sray", SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER), ROOMS)
-    take_over_encoder(field, tmp_path / "c.safetensors")
-    assert field.image_encoder is not None and field.image_encoder.depth_net is not None
-    assert torch.equal(field.image_encoder.depth_net.head.weight, field.image_encoder.colour_net.head.weight)
-
-
-def test_rays_from_the_first_step_on_start_with_a_calibrated_encoder(tmp_path: Path):
-    field = train(small_run(images={"fraction": 0.0}, steps=1)).model
-    assert field.image_encoder is not None and not field.image_encoder.uncalibrated
-
-
-def test_half_precision_files_keep_statistics_whole(tmp_path: Path):
-    field = build_field("sray", SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER), ROOMS)
-    assert field.image_encoder is not None
-    for module in field.image_encoder.modules():
-        if isinstance(module, torch.nn.BatchNorm2d) and module.running_var is not None:
-            module.running_var.fill_(3e5)  # beyond float16
-    save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors", half=True)
-    again = load_checkpoint(tmp_path / "w.safetensors").model
-    assert all(float(t.min()) == 3e5 for n, t in again.named_buffers() if n.endswith("running_var"))
-
-
 def test_images_may_go_on_among_the_rays():
     """Steps on images leave alone what only rays teach; with a share of 1 all later steps are on images."""
     start = train(small_run(images={"fraction": 0.0, "later": 1.0}, steps=1)).model.state_dict()
@@ -244,19 +190,3 @@ def test_images_may_go_on_among_the_rays():
     assert "encoder" in moved and "classifier" in moved and not moved & {"density", "weights", "cross", "label_logit"}
     mixed = train(small_run(images={"fraction": 0.0, "later": 0.5}, steps=12)).model.state_dict()
     assert any(not torch.equal(mixed[name], start[name]) for name in mixed if name.startswith("density"))
-
-
-@pytest.mark.parametrize("tokens", ["surface", "samples"])
-def test_a_field_takes_over_how_another_one_of_its_kind_classifies_images(tokens: str, tmp_path: Path):
-    config = convert_config(to_plain(small_run().field) | {"tokens": tokens}, SRayConfig, "field")
-    start = build_field("sray", config, ROOMS).eval()
-    for parameter in start.parameters():
-        parameter.data += 0.1 * torch.randn_like(parameter)
-    save_checkpoint(Checkpoint(start), tmp_path / "start.safetensors")
-    field = build_field("sray", small_run().field, ROOMS).eval()
-    take_over_encoder(field, tmp_path / "start.safetensors")
-    views = stack_sources(ROOM.views[:2])
-    with torch.no_grad():
-        expected, found = (f.source_logits(f.encode(views)) for f in (start, field))
-    assert expected is not None and found is not None
-    torch.testing.assert_close(found, expected)

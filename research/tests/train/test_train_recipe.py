@@ -3,10 +3,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-import torch
 
 from research.experiments import peers
-from research.train.recipe import git_revision, provenance
+from research.train.recipe import git_revision
 from research.train.train_config import TrainConfig
 from semantic_mapper.config import load_config
 from semantic_mapper.fields.registry import build_field
@@ -34,23 +33,11 @@ def test_the_revision_is_that_of_the_checkout_and_tells_of_changes(checkout: Pat
     assert git_revision(checkout / "package") == f"{clean}-dirty"
 
 
-def test_a_package_that_is_merely_installed_inside_a_checkout_has_no_revision(checkout: Path):
-    installed = checkout / "environment" / "site-packages" / "package"
-    installed.mkdir(parents=True)
-    assert git_revision(installed) is None
-
-
 def test_a_package_outside_any_checkout_has_no_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     assert git_revision(tmp_path) is None
     monkeypatch.setenv("PATH", str(tmp_path))
     assert git_revision(tmp_path) is None, "nor where there is no git"
-
-
-def test_provenance_names_versions_and_device():
-    about = provenance(torch.device("cpu"))
-    assert about["torch"] == torch.__version__ and "threads" in about["device"]
-    assert {"version", "git_revision", "platform"} <= about.keys()
 
 
 @pytest.mark.parametrize(

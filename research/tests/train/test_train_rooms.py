@@ -1,10 +1,7 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from research.scenes import TRAIN_SEEDS
 from research.tests.train.small_run import POOL
 from research.train import rooms
 from research.train.rooms import PackedRoom, RoomPool, RoomPoolConfig, RoomViews, pack_room, render_room
@@ -51,11 +48,6 @@ def test_ranks_that_share_the_seeds_see_different_rooms():
     assert seen[0] == {0, 2, 4} and seen[1] == {1, 3, 5}
 
 
-def test_the_seeds_of_training_are_a_circle():
-    with RoomPool(CONFIG, len(TRAIN_SEEDS) - 1) as pool:
-        assert seeds_drawn(pool, 1)[0][1] == (TRAIN_SEEDS[-1], TRAIN_SEEDS[0])
-
-
 def test_a_room_that_cannot_be_made_leaves_its_place_empty(monkeypatch: pytest.MonkeyPatch):
     plain = rooms.room_frames
 
@@ -83,17 +75,3 @@ def test_a_packed_room_holds_the_views_without_loss():
     view = room.views[2]
     assert torch.equal((view.rgb * 255).round().to(torch.uint8), torch.from_numpy(packed.rgb[2]))
     assert view.rgb.shape == (3, 36, 48) and view.rgb.max() <= 1 and view.channel.dtype == torch.int64
-
-
-@pytest.mark.slow
-def test_workers_are_gone_when_the_pool_is_closed():
-    with RoomPool(CONFIG, 0, workers=1) as pool:
-        seeds_drawn(pool, 1)
-        pids = list(pool._feed._pool._processes)
-        assert len(pids) == 1 and Path(f"/proc/{pids[0]}").exists()
-    assert not Path(f"/proc/{pids[0]}").exists()
-
-
-def test_a_negative_number_of_workers_is_refused():
-    with pytest.raises(ConfigError, match="must not be negative"):
-        RoomPool(CONFIG, 0, workers=-1)

@@ -1,13 +1,11 @@
 from dataclasses import replace
 
-import pytest
 import torch
 
-from research.train.step import LossConfig, StepBatch, StepConfig, batch_loss, draw_batch, pick_views_on_path
+from research.train.step import LossConfig, StepBatch, batch_loss, draw_batch, pick_views_on_path
 from research.train.train_config import TrainStepConfig
 from semantic_mapper.config import convert_config
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.device import choose_device, compute_in_bfloat16
+from semantic_mapper.fields.device import compute_in_bfloat16
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_field, tiny_frames
@@ -55,12 +53,6 @@ def test_a_blind_step_has_no_depth_anywhere_and_fewer_rays():
     assert (blind.targets.depth_m > 0).any(), "depth is withheld from the field, not from the loss"
 
 
-def test_known_labels_of_source_views_are_given_only_when_asked_for():
-    assert batch().sources.channel is None
-    given = batch(known_labels=True, label_dropout=0.0).sources.channel
-    assert given is not None and (given >= 0).any()
-
-
 def test_source_images_come_from_the_copies_on_the_device_and_targets_from_the_host():
     bright = [replace(view, rgb=torch.ones_like(view.rgb)) for view in VIEWS]
     step = TrainStepConfig(rays=64, colour_jitter=0.0)
@@ -68,12 +60,6 @@ def test_source_images_come_from_the_copies_on_the_device_and_targets_from_the_h
     drawn = draw_batch(VIEWS, 1, (0, 2), step, generator, len(ROOMS), torch.device("cpu"), bright)
     assert drawn is not None
     assert drawn.sources.rgb.min() == 1 and drawn.targets.rgb.min() < 1
-
-
-def test_draws_follow_from_the_generator():
-    a, b, c = batch(seed=1), batch(seed=1), batch(seed=2)
-    assert torch.equal(a.rays.direction, b.rays.direction) and torch.equal(a.sources.rgb, b.sources.rgb)
-    assert not torch.equal(a.rays.direction, c.rays.direction)
 
 
 def test_rooms_encoded_together_give_the_loss_and_gradient_of_rooms_encoded_one_by_one():
@@ -110,18 +96,3 @@ def test_named_parts_compute_in_bfloat16_and_hand_back_float32():
     loss.backward()
     assert loss.dtype == torch.float32 and torch.isfinite(loss)
     assert rounded.state_dict().keys() == exact.state_dict().keys()
-
-
-def test_a_part_that_the_field_has_not_is_refused_with_those_it_has():
-    with pytest.raises(ConfigError, match="no part 'decoder'; there are encoder, "):
-        compute_in_bfloat16(tiny_field(), ("decoder",), "cpu")
-
-
-def test_more_processes_than_gpus_are_refused():
-    with pytest.raises(ConfigError, match="has no GPU"):
-        choose_device("cuda", local_rank=64)
-    assert choose_device("cpu", local_rank=3).type == "cpu"
-
-
-def test_finetuning_keeps_its_own_defaults():
-    assert StepConfig().known_labels and StepConfig().no_depth == 0

@@ -30,7 +30,6 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
-from semantic_mapper.mapping.map_types import InstanceLayer
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
@@ -63,7 +62,6 @@ _ARRAYS = {  # name -> dtype; in the order of the file
     "evidence": "<f4",  # (V, L)
     "votes": "<f4",  # (V,)
 }
-_INSTANCES = {"packed": "<i8", "number": "<i4"}  # (N,) each, of ``InstanceLayer``; only where there is one
 _PLACES = {  # of ``Place``; only where there are any
     "pose": "<f8",  # (P, 4, 4)
     "stamp_ns": "<i8",  # (P,)
@@ -87,18 +85,6 @@ class MapChunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blocks: Annotated[int, msgspec.Meta(ge=1, le=CHUNK_BLOCKS)]
     measured: Annotated[int, msgspec.Meta(ge=0, le=CHUNK_BLOCKS * BLOCK_VOXELS)]
     voted: Annotated[int, msgspec.Meta(ge=0, le=CHUNK_BLOCKS * BLOCK_VOXELS)]
-    sha256: Digest
-
-
-class InstanceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The voxels that belong to things (``instance_layer``).
-
-    Args:
-        voxels: How many.
-        sha256: Of its arrays, in their order.
-    """
-
-    voxels: NotNegative
     sha256: Digest
 
 
@@ -131,7 +117,6 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         chunks: In the order of the file.
         scale: Whether lengths are metres.
         refined: Digest of the weights that refined the map; empty where none did.
-        instances: Which voxels belong to which thing, of maps that were refined so.
         places: What it is found again by.
     """
 
@@ -146,7 +131,6 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     chunks: tuple[MapChunk, ...] = ()
     scale: Literal["metres", "unknown"] = "metres"
     refined: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
-    instances: InstanceTable | None = None
     places: PlaceTable | None = None
 
     @property
@@ -190,7 +174,6 @@ def write_map(
     path: Path,
     manifest: MapManifest,
     parts: Iterable[BlockPart],
-    instances: InstanceLayer | None = None,
     places: Sequence[Place] = (),
 ) -> MapManifest:
     """Write a map, replacing a file of that name in one step.
@@ -199,7 +182,6 @@ def write_map(
         path: The file.
         manifest: Its settings, classes and counters; what depends on the blocks is filled in here.
         parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
-        instances: Of the map, if it has them.
         places: What the map is found again by.
 
     Returns:
@@ -220,10 +202,9 @@ def write_map(
                 corners += [keys.min(axis=0), keys.max(axis=0) + 1]
             blocks = sum(chunk.blocks for chunk in chunks)
             bounds = _bounds_m(corners, manifest.config.voxel_size_m)
-            table = None if instances is None else _write_instances(archive, instances)
             found = _write_places(archive, places) if places else None
             manifest = msgspec.structs.replace(
-                manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks), instances=table, places=found
+                manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks), places=found
             )
             content = encode_manifest(manifest)
             with archive.open(_MANIFEST, "w") as member:
@@ -317,22 +298,6 @@ class MapReader:
         except MemoryError as error:
             raise MapError(f"{self._path}: no memory for its {saved.blocks:,} blocks: {error}") from error
 
-    def instances(self) -> InstanceLayer | None:
-        """Which voxels belong to which thing; None where the map does not say.
-
-        Raises:
-            MapError: what it says is damaged.
-        """
-        table = self.manifest.instances
-        if table is None:
-            return None
-        where = f"{self._path}: its instances"
-        shapes = dict.fromkeys(_INSTANCES, (table.voxels,))
-        layer = InstanceLayer(**self._read_arrays("instances", shapes, _INSTANCES, table.sha256, where))
-        if not layer.is_sound:
-            raise MapError(f"{where}: voxels are not in order, or numbers are negative. {ADVICE}")
-        return layer
-
     def places(self) -> tuple[Place, ...]:
         """What the map is found again by; nothing where it does not say.
 
@@ -398,11 +363,6 @@ def _write_chunk(archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], valu
     }
     found = _write_arrays(archive, f"{n:06d}", arrays, _ARRAYS)
     return MapChunk(blocks=len(keys), measured=int(measured.sum()), voted=int(voted.sum()), sha256=found)
-
-
-def _write_instances(archive: zipfile.ZipFile, layer: InstanceLayer) -> InstanceTable:
-    found = _write_arrays(archive, "instances", {"packed": layer.packed, "number": layer.number}, _INSTANCES)
-    return InstanceTable(voxels=len(layer.packed), sha256=found)
 
 
 def _write_places(archive: zipfile.ZipFile, places: Sequence[Place]) -> PlaceTable:
@@ -484,7 +444,6 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
     if archive.comment != _COMMENT + digest(content).encode():
         raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {ADVICE}")
     expected = [f"{n:06d}/{name}.npy" for n in range(len(manifest.chunks)) for name in _ARRAYS]
-    expected += [] if manifest.instances is None else [f"instances/{name}.npy" for name in _INSTANCES]
     expected += [] if manifest.places is None else [f"places/{name}.npy" for name in _PLACES]
     if names != [*expected, _MANIFEST]:
         raise MapError(f"{path}: damaged: arrays are missing, or others are there. {ADVICE}")

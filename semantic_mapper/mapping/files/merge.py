@@ -122,13 +122,12 @@ def add_values(target: BlockGrid, packed: NDArray[np.int64], added: BlockValues,
     target.mark_changed(blocks, version)
 
 
-def copy_blocks(target: BlockGrid, source: BlockGrid, version: int, *, measured: bool) -> None:
-    """Make ``target``, which is empty, hold what ``source`` holds.
+def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
+    """Make ``target``, which is empty, hold what ``source`` has measured.
 
     Args:
         target, source: Grids of the same classes.
         version: That the blocks are marked as changed at.
-        measured: Leave out blocks without a measurement.
 
     Raises:
         MapError: the target has no room.
@@ -137,9 +136,8 @@ def copy_blocks(target: BlockGrid, source: BlockGrid, version: int, *, measured:
     for start in range(0, len(packed), MERGED_AT_ONCE):
         part = packed[start : start + MERGED_AT_ONCE]
         values = source.read(part)
-        if measured:
-            holds = (values.weight > 0).any(axis=1)
-            part, values = part[holds], BlockValues(*(array[holds] for array in values))
+        holds = (values.weight > 0).any(axis=1)
+        part, values = part[holds], BlockValues(*(array[holds] for array in values))
         target.mark_changed(target.fill(part, values), version)
 
 

@@ -5,8 +5,7 @@ measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise
 thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far
 as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth edges and grazing views are
 safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). A pixel without depth,
-or farther than ``depth_max``, clears nothing: black and shiny things return nothing. (``clear_without_return`` is for
-sensors that return something wherever there is something.) Nor does a pixel as near to the
+or farther than ``depth_max``, clears nothing: black and shiny things return nothing. Nor does a pixel as near to the
 edge of the image as a pose may be off, nor computed or rendered depth: where pictures are matched wrongly, that lies
 far behind, frame after frame.
 
@@ -139,22 +138,6 @@ def clear_in_view(
             _, cleared = _clear(blocks, grid.buffers(), camera, limits, depth, rgb, bounds, changes=True)
             grid.mark_changed(blocks, version)
             yield changing, cleared
-
-
-def clear_without_return(
-    grid: BlockGrid, camera: Camera, limits: FusionLimits, depth: Float32, rgb: UInt8, range_m: float, version: int
-) -> Iterator[tuple[Int64, Int64]]:
-    """As ``clear_in_view``, but what pixels without depth see through, up to ``range_m``; in all blocks.
-
-    A frame without any depth clears nothing: its sensor has failed.
-    """
-    empty = ~(depth > 0)  # NaN, too
-    if empty.all() or not empty.any():
-        return
-    bounds = depth_bounds(np.where(empty, np.float32(range_m), depth), np.inf)
-    free = np.where(empty, np.float32(range_m), np.float32(0))
-    reach, no_band = limits._replace(depth_max=range_m), np.empty(0, np.int64)
-    yield from clear_in_view(grid, no_band, camera, reach, free, rgb, bounds, version)
 
 
 def _candidates(

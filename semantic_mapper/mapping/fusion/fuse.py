@@ -40,7 +40,6 @@ ProbabilityTable = tuple[Float32, NDArray[np.int32]]  # probabilities (K, L), ro
 _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
     "voxel_size_m": (1e-4, 10.0),
     "depth_max_m": (1e-3, 1000.0),
-    "no_return_range_m": (0.0, 1000.0),
     "max_blocks": (1, 1 << 27),
 }
 

@@ -51,13 +51,6 @@ def test_a_device_is_listed_by_what_opens_it(monkeypatch: pytest.MonkeyPatch) ->
     assert oak.list_devices() == [FoundCamera("oak", "18443010D1", "18443010D1", "usb/vsc 3.17, unbooted")]
 
 
-def test_what_keeps_one_from_opening_a_device_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
-    found(monkeypatch, info("X_LINK_BOOTED"))
-    assert "another process has it" in oak.list_devices()[0].note
-    found(monkeypatch, info("X_LINK_UNBOOTED", "X_LINK_INSUFFICIENT_PERMISSIONS"))
-    assert "udevadm" in oak.list_devices()[0].note
-
-
 def test_the_only_device_needs_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     found(monkeypatch, info("X_LINK_UNBOOTED"))
     assert devices.find_device("", 0.1).getDeviceId() == "18443010D1"

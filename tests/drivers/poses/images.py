@@ -9,7 +9,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
@@ -39,17 +39,19 @@ def as_image(frame: PosedFrame) -> CameraImage:
     return CameraImage(frame.stamp_ns, frame.seq, frame.camera_id, frame.rgb, frame.depth_m, frame.intrinsics)
 
 
-class ListCamera:
+class ListCamera(Camera):
     """Gives the images of a list."""
 
     def __init__(self, images: Iterable[CameraImage]) -> None:
+        super().__init__("cam")
         self.images = list(images)
         self.is_open = False
         self.stopped = False
-        self.can_wait = False
-        self.last_poll_time = 0.0
-        self.warnings: tuple[str, ...] = ("the lens cap is on",)
-        self.info = StreamInfo("list", {"cam": INTRINSICS})
+        self._info = StreamInfo("list", {"cam": INTRINSICS})
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return ("the lens cap is on",)
 
     def __enter__(self) -> Self:
         self.is_open = True

@@ -61,5 +61,3 @@ def test_late_and_doubled_samples_are_left_out_and_old_ones_forgotten() -> None:
     assert not made.add(StampedPose(300 * MS, np.eye(4)))
     assert not made.add(StampedPose(250 * MS, np.eye(4)))
     assert made.at(150 * MS) == "before" and made.newest_ns == 300 * MS
-    made.clear()
-    assert made.newest_ns == -1 and len(made) == 0

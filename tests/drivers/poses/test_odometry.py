@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
-from semantic_mapper.drivers.poses import odometry
+from semantic_mapper.drivers.poses import loop_closure, odometry
 from semantic_mapper.drivers.poses.config import OdometryPoses
-from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource, find_turn
 from semantic_mapper.errors import CameraError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import camera_matrix, invert_pose, rotation_vector
-from semantic_mapper.localization.depth_alignment import Target
-from semantic_mapper.localization.features import find_features
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 from tests.drawn_room import truth_of, walk_frames
 
@@ -115,12 +112,13 @@ def test_a_camera_that_stays_lost_begins_a_new_world_and_goes_on_there() -> None
     here = [as_image(f) for f in walk()[:8]]
     there = [replace(as_image(f), stamp_ns=8 * 10**9 + k * 10**9) for k, f in enumerate(other_room(9))]
     source = OdometryPoseSource(CONFIG)
-    assert all(e is not None and e.world == 0 for e in follow(here, source))
+    (world,) = {e.world for e in follow(here, source) if e is not None}
+    assert world > 0
     found = follow(there, source)
     assert found[:5] == [None] * 5  # it may see an old place again
     assert source.counters["new_sessions"] == 1 and source.warnings == ()
     later = [e for e in found[5:] if e is not None]
-    assert len(later) == 4 and {e.world for e in later} == {1}
+    assert len(later) == 4 and {e.world for e in later} == {world + 1}
     assert np.array_equal(later[0].T_world_camera, np.eye(4)) and source.counters["loops_closed"] == 0
     in_place = started()  # where the world is a given one, no other can begin
     follow(here, in_place)
@@ -132,22 +130,19 @@ def test_a_covered_lens_tells_of_no_other_place() -> None:
     dark = [replace(here[-1], depth_m=np.zeros((120, 160), np.float32), stamp_ns=k * 10**9) for k in range(2, 12)]
     there = [replace(as_image(f), stamp_ns=12 * 10**9 + k * 10**9) for k, f in enumerate(other_room(7))]
     source = OdometryPoseSource(CONFIG)
-    assert all(e is not None for e in follow(here, source))
+    (world,) = {e.world for e in follow(here, source) if e is not None}
     found = follow([*dark, *there], source)
     assert found[:14] == [None] * 14, "old places are looked for as long as without the dark"
-    assert [e.world for e in found[14:] if e is not None] == [1] * 3
+    assert [e.world for e in found[14:] if e is not None] == [world + 1] * 3
 
 
-@pytest.mark.parametrize("loop_closure", [False, True])
-def test_keyframes_that_have_gone_are_not_needed_when_a_world_ends(
-    loop_closure: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(odometry, "KeyframeMap", lambda: KeyframeMap(capacity=5))
+def test_keyframes_that_have_gone_are_not_needed_when_a_world_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_closure, "MAX_KEYFRAMES", 5)
     monkeypatch.setattr(odometry, "KEYFRAME_M", 0.05)
-    source = OdometryPoseSource(OdometryPoses(loop_closure=loop_closure))
+    source = OdometryPoseSource(CONFIG)
     follow([as_image(f) for f in walk()], source)
     found = follow([replace(as_image(f), stamp_ns=8 * 10**9 + f.seq * 10**9) for f in other_room(15)], source)
-    assert {e.world for e in found if e is not None} == {1} and source.counters["keyframes"] > 10
+    assert len({e.world for e in found if e is not None}) == 1 and source.counters["keyframes"] > 10
     source.correction(final=True)
 
 
@@ -156,19 +151,8 @@ def test_first_images_that_show_too_little_are_left_behind() -> None:
     elsewhere = as_image(other_room(1)[0])
     source = OdometryPoseSource(CONFIG)
     found = follow([replace(elsewhere, stamp_ns=frames[0].stamp_ns - 10**7), *frames], source)
-    assert [e.world for e in found if e is not None] == [0, *[1] * 6] and source.counters["lost"] == 0
-
-
-def test_a_camera_that_was_away_is_looked_for_among_all_keyframes() -> None:
-    """It was unplugged at the end of its way, and is plugged in again at the beginning."""
-    frames = [as_image(f) for f in walk()]
-    source = started()
-    with source:
-        for f in frames[:30]:
-            assert source.pose(f) is not None
-        back = source.pose(replace(frames[1], stamp_ns=frames[29].stamp_ns + 10**10))
-    assert back is not None and source.counters["relocalised"] == 1
-    assert np.linalg.norm(back.T_world_camera[:3, 3] - truth()[1, :3, 3]) < 0.02
+    first, *others = [e.world for e in found if e is not None]
+    assert others == [first + 1] * 6 and source.counters["lost"] == 0
 
 
 def blank_corner(x_m: float, number: int) -> CameraImage:
@@ -187,13 +171,6 @@ def test_a_camera_that_stands_before_a_blank_wall_stays_but_is_not_sure() -> Non
     assert np.allclose(found[-1].T_world_camera, found[0].T_world_camera, atol=1e-3)
 
 
-def test_a_single_dark_image_costs_itself_only() -> None:
-    frames = [as_image(f) for f in walk()[:12]]
-    frames[6] = replace(frames[6], depth_m=None)
-    found = follow(frames, started())
-    assert [e is None for e in found] == [i == 6 for i in range(12)]
-
-
 def test_a_camera_without_depth_is_refused_with_the_ways_out() -> None:
     with pytest.raises(CameraError, match=r"has no depth.*scale.*kind = \"topic\".*kind = \"device\""):
         OdometryPoseSource(CONFIG).pose(images.image(5, depth=False))
@@ -205,21 +182,6 @@ def test_another_camera_or_size_in_between_is_refused() -> None:
     source.pose(first)
     with pytest.raises(CameraError, match="a pose source of its own"):
         source.pose(replace(first, camera_id="other"))
-
-
-def test_the_most_crowded_keyframe_goes_and_old_ones_are_preferred() -> None:
-    features = find_features(np.full((120, 160, 3), 50, np.uint8), np.ones((120, 160), np.float32), 10)
-    made = KeyframeMap(capacity=4)
-    gone = []
-    for number, x in enumerate((0.0, 0.3, 0.35, 1.5, 1.8)):
-        gone.append(made.add(OdometryKeyframe(number, Target((), rigid(shift=(x, 0, 0))), features, features, x)))
-    assert gone == [None, None, None, None, (2, 1)]
-    assert [k.way_m for k in made.frames] == [0.0, 0.3, 1.5, 1.8]  # 0.35 was next to 0.3, and younger
-    assert [k.way_m for k in made.near(rigid(shift=(0.25, 0, 0)), 3)] == [0.3, 0.0]
-    assert [k.way_m for k in made.near(rigid(shift=(1.7, 0, 0)), 2)] == [1.8, 1.5]
-    assert [k.way_m for k in made.near(rigid(shift=(9, 0, 0)), 3)] == [1.8]
-    way, turn = made.distances(rigid((0, 0.2, 0), (0, 1.0, 0)))
-    assert way[0] == pytest.approx(1.0) and turn[0] == pytest.approx(0.2)
 
 
 def test_same_images_same_poses_bit_for_bit() -> None:

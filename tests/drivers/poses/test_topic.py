@@ -6,7 +6,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +18,7 @@ from semantic_mapper.drivers.poses import topic
 from semantic_mapper.drivers.poses.config import TopicPoses
 from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import CameraError
-from semantic_mapper.transport.keys import allow, forget, make_keys, secure_server
+from semantic_mapper.transport.keys import allow, make_keys, secure_server
 from semantic_mapper.transport.pose_message import PoseMessage, encode_pose
 
 from .images import MS, image, rigid
@@ -96,15 +95,6 @@ def test_an_image_gets_the_pose_at_its_stamp_of_where_the_camera_sits(endpoint: 
         assert source.warnings == ()
 
 
-def test_an_image_waits_for_the_pose_that_comes_after_it(endpoint: str, robot: Robot) -> None:
-    with listening(endpoint, robot) as source:
-        robot.send(1000)
-        eventually(lambda: source.counters["messages"] == 1)
-        robot.send(1040)  # may arrive while ``pose`` waits already
-        found = source.pose(image(1020 * MS))
-    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.02)
-
-
 def test_beyond_the_last_pose_the_motion_goes_on_for_a_while_and_no_longer(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot, wait_s=0.0) as source:
         robot.send(1000)
@@ -113,42 +103,10 @@ def test_beyond_the_last_pose_the_motion_goes_on_for_a_while_and_no_longer(endpo
         found = source.pose(image(1060 * MS))
         assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.06)
         assert source.pose(image(1071 * MS)) is None and source.counters["stale"] == 1
-        assert "too far ahead" in source.warnings[0] and "0.051 s older" in source.warnings[0]
+        assert "0.051 s older" in source.warnings[0] and "clock_offset_ns" in source.warnings[0]
         robot.send(1080)
         eventually(lambda: source.counters["messages"] == 3)
         assert source.pose(image(1075 * MS)) is not None and source.warnings == ()
-
-
-def test_other_clocks_are_refused_with_the_difference_and_fixed_by_the_offset(endpoint: str, robot: Robot) -> None:
-    with listening(endpoint, robot) as source:
-        robot.send(5000)
-        robot.send(5020)
-        eventually(lambda: source.counters["messages"] == 2)
-        assert source.pose(image(1000 * MS)) is None  # at once, not after ``wait_s``
-        assert source.counters["clock"] == 1 and "+4.020 s" in source.warnings[0]
-        assert "clock_offset_ns" in source.warnings[0]
-        assert "raise max_clock_difference_s (now 1)" in source.warnings[0]
-    with listening(endpoint, robot, clock_offset_ns=-4000 * MS) as source:
-        robot.send(5000)
-        robot.send(5020)
-        found = source.pose(image(1010 * MS))
-    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(5.01)
-
-
-def test_a_publisher_that_restarts_with_an_earlier_clock_is_followed(endpoint: str, robot: Robot) -> None:
-    with listening(endpoint, robot) as source:
-        robot.send(4000)
-        eventually(lambda: source.counters["messages"] == 1)
-        clock = count(1000)
-
-        def followed() -> bool:
-            robot.send(next(clock))
-            return source.counters["messages"] > 2
-
-        eventually(followed)
-        newest = source.counters["messages"] + source.counters["out_of_order"] + 998
-        found = source.pose(image(newest * MS))
-    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(newest / 1e3)
 
 
 @pytest.fixture
@@ -159,70 +117,44 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("stopped_clock")
-def test_a_second_publisher_on_a_clock_that_is_behind_disturbs_nothing(endpoint: str, robot: Robot) -> None:
-    with listening(endpoint, robot) as source:
-        for ms in range(9800, 10_000, 20):
-            robot.send(ms)
-            robot.send(ms - 3000)
-        eventually(lambda: source.counters["out_of_order"] == 10)
-        assert source.counters["messages"] == 10
-        found = source.pose(image(9850 * MS))
-    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(9.85)
-
-
-@pytest.mark.usefixtures("stopped_clock")
-@pytest.mark.parametrize("ahead_ms", [300, 3_600_000])
-def test_messages_of_moments_that_have_not_come_disturb_nothing(endpoint: str, robot: Robot, ahead_ms: int) -> None:
-    with listening(endpoint, robot) as source:
-        for ms in range(9800, 10_000, 20):
-            robot.send(ms)
-            robot.send(ms + ahead_ms)
-        eventually(lambda: source.counters["future"] == 10)
-        assert source.counters == {"messages": 10, "future": 10}
-        assert "ahead of this machine's CLOCK_MONOTONIC" in source.warnings[0]
-        assert "clock_offset_ns" in source.warnings[0]
-        found = source.pose(image(9850 * MS))
-    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(9.85)
-
-
-@pytest.mark.usefixtures("stopped_clock")
-def test_a_pose_may_be_ahead_by_as_much_as_a_robot_looks_ahead(endpoint: str, robot: Robot) -> None:
+def test_poses_of_another_clock_are_left_out(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot, wait_s=0.0) as source:
-        robot.send(10_051)
+        robot.send(10_051)  # 50 ms ahead may be a prediction
         eventually(lambda: source.counters["future"] == 1)
         assert source.pose(image(10_000 * MS)) is None
         ahead, empty = source.warnings
-        assert "it is stamped 0.051 s ahead" in ahead and "no pose that came from" in empty  # not reported as silence
-        robot.send(10_050)
-        eventually(lambda: source.counters["messages"] == 1)
-        assert source.pose(image(10_050 * MS)) is not None and source.warnings == ()
+        assert "it is stamped 0.051 s ahead" in ahead and "clock_offset_ns" in ahead
+        assert "no pose that came from" in empty  # not reported as silence
+        for ms in range(9800, 10_051, 25):
+            robot.send(ms)
+            robot.send(ms - 3000)  # a second publisher, on a clock that is behind
+            robot.send(ms + 3_600_000)
+        eventually(lambda: source.counters["future"] == 12)
+        assert source.counters["messages"] == source.counters["out_of_order"] == 11
+        found = source.pose(image(9860 * MS))
+        assert found is not None and found.T_world_camera[0, 3] == pytest.approx(9.86)
+
+
+def test_a_known_difference_of_clocks_is_taken_off(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot, clock_offset_ns=-4000 * MS) as source:
+        robot.send(5000)
+        robot.send(5020)
+        found = source.pose(image(1010 * MS))
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(5.01)
 
 
 def test_what_is_no_pose_costs_itself_only(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot) as source:
         robot.socket.send(b"garbage")
         robot.socket.send_multipart([b"pose", *[b"{}"] * 5000])
+        robot.socket.send(b"x" * 100_000)
         robot.send(1000)
         robot.send(1000)
         message = {"v": 1, "stamp_ns": 1040 * MS, "position": [1.04, 0, 0], "quaternion": [0, 0, 0, 1]}
         robot.socket.send(json.dumps(message).encode())
         found = source.pose(image(1020 * MS))
         assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.02)
-        assert source.counters == {"rejected": 2, "out_of_order": 1, "messages": 2}
-
-
-def test_a_message_that_is_too_long_never_gets_in(endpoint: str, robot: Robot) -> None:
-    with listening(endpoint, robot) as source:
-        robot.socket.send(b"x" * 100_000)  # cuts the connection, which is made again
-
-        clock = count(1000)
-
-        def gets_through() -> bool:
-            robot.send(next(clock))
-            return source.counters["messages"] > 0
-
-        eventually(gets_through)
-        assert source.counters["rejected"] == 0
+        assert source.counters == {"rejected": 3, "out_of_order": 1, "messages": 2}
 
 
 def test_silence_is_reported(endpoint: str) -> None:
@@ -266,33 +198,3 @@ def test_a_robot_with_keys_is_listened_to_and_one_in_its_place_is_not(tmp_path: 
                 message = PoseMessage(stamp_ns=5, position=(0, 0, 0), quaternion=(0, 0, 0, 1))
                 socket.send_multipart(encode_pose(message))
                 eventually(lambda: source.counters["messages"] == 1)
-
-
-def test_a_key_that_is_missing_for_a_while_is_reported_and_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(topic, "_SILENCE_S", 0.1)
-    robot, desk = (make_keys(tmp_path / name) for name in ("robot", "desk"))
-    allow(robot.folder, "desk", desk.public.decode())
-    allow(desk.folder, "robot", robot.public.decode())
-    with zmq.Context.instance().socket(zmq.XPUB) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        secure_server(socket, robot)
-        port = socket.bind_to_random_port("tcp://127.0.0.1")
-        settings = TopicPoses(endpoint=f"tcp://127.0.0.1:{port}", server="robot", keys=str(desk.folder))
-        stamps = count(5)
-
-        def gets_through() -> bool:
-            message = PoseMessage(stamp_ns=next(stamps), position=(0, 0, 0), quaternion=(0, 0, 0, 1))
-            socket.send_multipart(encode_pose(message))
-            return source.counters["messages"] > before
-
-        with TopicPoseSource(settings) as source:
-            before = 0
-            forget(desk.folder, "robot")
-            eventually(lambda: bool(source.warnings))
-            assert "no peer 'robot'" in source.warnings[0]
-            allow(desk.folder, "robot", robot.public.decode())
-            eventually(lambda: not source.warnings)
-            before = source.counters["messages"]
-            eventually(gets_through)

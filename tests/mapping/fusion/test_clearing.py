@@ -109,25 +109,6 @@ def test_holes_and_what_is_too_far_clear_nothing(hole: float) -> None:
     np.testing.assert_array_equal(before[before[:, 2] < 2.5], after[after[:, 2] < 2.5])
 
 
-@pytest.mark.parametrize("range_m", [0.0, THING_M, 4.0])
-@pytest.mark.parametrize("hole", [0.0, np.nan])
-def test_no_return_clears_up_to_the_range_of_a_sensor_that_is_trusted_so(hole: float, range_m: float) -> None:
-    voxel_map = small_map(no_return_range_m=range_m)
-    see(voxel_map, wall(thing=True), times=10)
-    before = thing_points(voxel_map)
-    depth = wall()
-    depth[60:180, 80:240] = hole  # around the thing, too: the wall there is as far as the one beside it
-    see(voxel_map, np.full_like(depth, hole), times=9)  # the sensor has failed
-    assert thing_points(voxel_map) == before and voxel_map.cleared == 0
-    see(voxel_map, depth, times=3)
-    xyz = voxel_map.points(1e-3).xyz
-    behind = (np.abs(xyz[:, 2] - WALL_M) < 0.1) & (np.abs(xyz[:, :2]).max(axis=1) < 0.3)
-    if range_m == 4.0:
-        assert thing_points(voxel_map) == 0 < before and not behind.any()
-    else:
-        assert thing_points(voxel_map) == before and voxel_map.cleared == 0
-
-
 def test_computed_depth_clears_nothing_and_measured_depth_clears_what_was_computed() -> None:
     voxel_map = small_map()
     see(voxel_map, wall(thing=True), times=10)

@@ -156,8 +156,8 @@ def test_a_correction_rebuilds_the_map_without_virtual_votes():
     for f in stepped:
         silent.step(f)
     assert pipeline.render_virtual_views(2)
-    pipeline.correct_poses({stepped[0].stamp_ns: stepped[0].T_world_camera})
-    while pipeline.advance_correction(3):
+    pipeline.corrector.start({stepped[0].stamp_ns: stepped[0].T_world_camera})
+    while pipeline.corrector.advance(3):
         pass
     x, y = pipeline.voxel_map.block_state(), silent.voxel_map.block_state()
     assert all(x[k].tobytes() == y[k].tobytes() for k in x)

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.rig import solve
-from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer
 from semantic_mapper.drivers.calibration import load_calibration, load_mount, load_stereo
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
@@ -110,32 +106,6 @@ def test_a_live_camera_is_looked_through_until_nothing_is_lacking(tmp_path: Path
     assert len(gathering.cameras["camera"].kept) >= SETTINGS.calibration.min_views
 
 
-def test_a_camera_may_come_while_the_others_are_reported() -> None:
-    stopped = threading.Event()
-    gathering = Gathering(BOARD, CalibrationConfig())
-
-    class Waiting:
-        live = stream = True
-        known = False
-
-        def images(self) -> Iterator[tuple[str, CameraImage]]:
-            stopped.wait(60)
-            return iter(())
-
-        def stop(self) -> None:
-            stopped.set()
-
-    class Slow(list[BoardView]):
-        def __len__(self) -> int:  # meanwhile another thread has the first image of its camera
-            gathering.cameras.setdefault("late", ViewGatherer(BOARD, CalibrationConfig(), stream=True))
-            return 0
-
-    gathering.cameras["early"] = ViewGatherer(BOARD, CalibrationConfig(), stream=True)
-    gathering.cameras["early"].kept = Slow()
-    gathering.run([Waiting(), Waiting(), Waiting()], StopRequest(), 0.3, rig=True)
-    assert list(gathering.cameras) == ["early", "late"]
-
-
 def test_poor_coverage_is_refused_in_one_line(pictures: Path, tmp_path: Path) -> None:
     left = tmp_path / "left"
     left.mkdir()
@@ -159,19 +129,6 @@ def test_a_board_that_does_not_fit_on_the_disk_is_named_and_leaves_nothing(tmp_p
     assert not list(tmp_path.iterdir())
     assert run_here("calibrate", "--board", tmp_path / "board.png")[0] == 0
     assert [file.name for file in tmp_path.iterdir()] == ["board.png"]
-
-
-@pytest.mark.parametrize(("room", "failed"), [(10, "camera.toml"), (2000, "camera.png")])
-def test_results_that_do_not_fit_on_the_disk_leave_those_that_were_there(
-    pictures: Path, tmp_path: Path, room: int, failed: str
-) -> None:
-    gathered = gather(str(pictures))
-    found = solve(gathered.cameras, set(), SETTINGS.calibration, rig=False)
-    (tmp_path / failed).write_text("old")
-    with files_at_most(room), pytest.raises(ConfigError, match=rf"{failed}: cannot be written \(File too large\)"):
-        write_files(tmp_path, found, SETTINGS)
-    assert (tmp_path / failed).read_text() == "old"
-    assert {file.name for file in tmp_path.iterdir()} <= {"camera.toml", "camera.png"}
 
 
 @pytest.mark.parametrize("swapped", [False, True])

@@ -9,9 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.replay.boxes import BoxFile, save_boxes
 from tests.nodes.support import error_line, run
 from tests.small import tiny_frames
 
@@ -19,12 +17,14 @@ from tests.small import tiny_frames
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     """A chair a metre in front of the first frame of the log, and a wall behind it."""
-    T = tiny_frames(6)[0].T_world_camera.copy()
-    chair = Primitive(2, "chair", "box", np.eye(4), np.array([0.3, 0.3, 0.4]), True)
-    chair.T_world_box[:3, 3] = (T @ (0, 0, 1.0, 1))[:3]
-    wall = Primitive(5, "wall", "box", np.eye(4), np.array([1.0, 1, 2]), False)
-    wall.T_world_box[:3, 3] = (T @ (0, 0, -3.0, 1))[:3]
-    save_boxes(path := tmp_path / "boxes.json", BoxFile((chair, wall)))
+    T = tiny_frames(6)[0].T_world_camera
+    chair, wall = np.eye(4), np.eye(4)
+    chair[:3, 3], wall[:3, 3] = (T @ (0, 0, 1.0, 1))[:3], (T @ (0, 0, -3.0, 1))[:3]
+    boxes = [
+        {"id": 2, "class": "chair", "T_world_box": chair.tolist(), "size": [0.3, 0.3, 0.4]},
+        {"id": 5, "class": "wall", "T_world_box": wall.tolist(), "size": [1, 1, 2]},
+    ]
+    (path := tmp_path / "boxes.json").write_text(json.dumps({"boxes": boxes}))
     return path
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from semantic_mapper.evaluation.bootstrap import miou_of_sums
+from semantic_mapper.evaluation.metrics import miou_of_sums
 from semantic_mapper.nodes.fleet.store import Event, Failure, Findings, MethodScores, Store, TaskResult
 
 NAMES = ("wall", "floor", "chair", "lamp")

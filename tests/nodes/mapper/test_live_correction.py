@@ -368,7 +368,7 @@ def test_it_ends_although_frames_never_stop_coming(bundle_of):
     frames = tiny_frames(14)
     session = session_of(bundle_of(), drifted(frames)[:6])
     correction = LiveCorrection(session.pipeline)
-    session.pipeline.correct_poses(true_poses(frames[:6], 1))
+    session.pipeline.corrector.start(true_poses(frames[:6], 1))
     steps = 0
     while correction.running:
         session.process(frames[6 + steps])
@@ -382,7 +382,7 @@ def test_what_was_not_finished_is_told(bundle_of, monkeypatch):
     frames = tiny_frames(4)
     session = session_of(bundle_of(), drifted(frames))
     correction = LiveCorrection(session.pipeline)
-    session.pipeline.correct_poses(true_poses(frames, 1))
+    session.pipeline.corrector.start(true_poses(frames, 1))
     monkeypatch.setattr("semantic_mapper.nodes.mapper.live_correction.STOPPED_S", 0.0)
     waits: list[int] = []
     with capture_logs() as logs:
@@ -398,7 +398,7 @@ def test_what_was_not_finished_is_told(bundle_of, monkeypatch):
 def test_a_correction_that_fails_leaves_the_mapper_running_and_is_told(bundle_of):
     frames = tiny_frames(4)
     session = session_of(bundle_of(), drifted(frames))
-    session.pipeline.correct_poses(true_poses(frames, 1))
+    session.pipeline.corrector.start(true_poses(frames, 1))
     session.pipeline.corrector._end_history("the disk is full")
     correction = LiveCorrection(session.pipeline)
     correction.advance(session, mapped=False)

@@ -14,7 +14,6 @@ import msgpack
 import numpy as np
 import pytest
 
-from semantic_mapper.drivers.base import FrameSource
 from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
 from semantic_mapper.nodes.cli.info import describe_log
@@ -39,7 +38,7 @@ def chunk_starts(path: Path) -> list[tuple[int, int]]:
 
 def test_frames_come_back_bit_for_bit(small_log: Path) -> None:
     with LogReader(small_log) as reader:
-        assert isinstance(reader, FrameSource) and len(reader) == FRAMES and reader.finished
+        assert len(reader) == FRAMES and reader.finished
         assert reader.info == StreamInfo("test", {samples.CAMERA: samples.INTRINSICS}, NYU40)
         for seq, frame in enumerate(reader):
             expected = samples.make_frame(seq)

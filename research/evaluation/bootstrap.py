@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, class_sums, miou_of_sums
 from semantic_mapper.types import Float64
 
 RESAMPLES = 10_000
@@ -84,19 +84,3 @@ def _difference(counts: Float64, times: Float64, factor: float) -> Float64:
 def miou_of_counts(counts: NDArray[np.float64]) -> Float64:
     """(B, L, L + 1) -> (B,), the rules of ``ConfusionMatrix.iou``: means over classes in the truth, NaN for none."""
     return miou_of_sums(class_sums(counts))
-
-
-def class_sums(counts: NDArray[np.float64]) -> Float64:
-    """What IoU needs of confusion matrices, and what adds up: (B, L, L + 1) -> (B, 3, L) hits, truth and union."""
-    hits = np.diagonal(counts, axis1=1, axis2=2)
-    occurring = counts.sum(axis=2)
-    union = occurring + counts[:, :, :-1].sum(axis=1) - hits
-    return np.stack((hits, occurring, union), axis=1)
-
-
-def miou_of_sums(sums: Float64) -> Float64:
-    """(B, 3, L) of ``class_sums`` -> (B,), as ``miou_of_counts``."""
-    hits, occurring, union = sums[:, 0], sums[:, 1], sums[:, 2]
-    iou = np.divide(hits, union, out=np.zeros_like(hits), where=occurring > 0)
-    present = (occurring > 0).sum(axis=1)
-    return np.divide(iou.sum(axis=1), present, out=np.full(len(sums), np.nan), where=present > 0)

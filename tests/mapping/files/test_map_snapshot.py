@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.files import map_saving
-from semantic_mapper.mapping.files.map_file import describe_map
-from semantic_mapper.mapping.files.map_saving import GridSnapshot
+from semantic_mapper.mapping.files import map_snapshot
+from semantic_mapper.mapping.files.map_file import MapManifest, describe_map
+from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.storage import scratch
 from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT, BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.storage.block_store import BlockValues
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from tests.mapping.rendered_views import small_map
+from tests.mapping.rendered_views import LABELS, small_map
 from tests.mapping.storage.test_block_store import CLASSES, some_blocks
 from tests.mapping.storage.test_paging import MEMORY_MB, walk
 from tests.mapping.test_voxel_map import same
@@ -35,26 +37,36 @@ def filled_grid(memory_bytes: int) -> BlockGrid:
     return grid
 
 
-@pytest.mark.parametrize("most_in_memory", [map_saving.MOST_IN_MEMORY, 30], ids=["copies in memory", "on disk"])
+def snapshot_of(grid: BlockGrid) -> MapSnapshot:
+    manifest = MapManifest(config=VoxelMapConfig(), label_set=LABELS, frames=1, last_stamp_ns=0)
+    return MapSnapshot(grid, threading.Lock(), manifest, ())
+
+
+@pytest.mark.parametrize("most_in_memory", [map_snapshot.MOST_IN_MEMORY, 30], ids=["copies in memory", "on disk"])
 @pytest.mark.parametrize("memory_bytes", [0, 1], ids=["in memory", "most blocks on disk"])
 def test_a_snapshot_does_not_change_with_the_grid(
     memory_bytes: int, most_in_memory: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(map_saving, "MOST_IN_MEMORY", most_in_memory)
+    monkeypatch.setattr(map_snapshot, "MOST_IN_MEMORY", most_in_memory)
+    monkeypatch.setattr(map_snapshot, "CHUNK_BLOCKS", 100)
     grid = filled_grid(memory_bytes)
     assert grid.stored_count >= BLOCKS - LEAST_RESIDENT if memory_bytes else grid.stored_count == 0
     before = grid.read(KEYS)
     new = pack_keys(np.array([[-5, 0, 0], [3, 3, 90], [50, 0, 0]], np.int32))
-    snapshot = GridSnapshot(grid)
-    parts: list[BlockValues] = []
-    for start in range(0, BLOCKS, 100):
-        changing = np.sort(np.append(rng.choice(KEYS, 120, replace=False), new))
-        grid.fill(changing, some_blocks(len(changing), 9999))
-        parts.append(snapshot.take(snapshot.keys[start : start + 100]))
+    snapshot = snapshot_of(grid)
+
+    def changing(last: bool) -> Iterator[BlockValues]:
+        for _, values in snapshot.parts(last=last):
+            yield values
+            keys = np.sort(np.append(rng.choice(KEYS, 120, replace=False), new))
+            grid.fill(keys, some_blocks(len(keys), 9999))
+
+    for last in (False, True):
+        parts = list(changing(last))
+        now = grid.read(KEYS)
+        for n, name in enumerate(BlockValues._fields):
+            assert b"".join(part[n].tobytes() for part in parts) == before[n].tobytes() != now[n].tobytes(), name
     snapshot.close()
-    now = grid.read(KEYS)
-    for n, name in enumerate(BlockValues._fields):
-        assert b"".join(part[n].tobytes() for part in parts) == before[n].tobytes() != now[n].tobytes(), name
     assert not grid.watchers and grid.block_count == BLOCKS + 3
 
 
@@ -67,14 +79,14 @@ def test_a_full_disk_fails_the_snapshot_and_not_the_frame(monkeypatch: pytest.Mo
         return database
 
     connect = sqlite3.connect
-    monkeypatch.setattr(map_saving, "MOST_IN_MEMORY", 20)
+    monkeypatch.setattr(map_snapshot, "MOST_IN_MEMORY", 20)
     monkeypatch.setattr(scratch.sqlite3, "connect", tiny)
-    snapshot = GridSnapshot(grid)
+    snapshot = snapshot_of(grid)
     changed = some_blocks(100, 5)
     grid.fill(KEYS[300:400], changed)
     assert grid.read(KEYS[300:400]).tsdf.tobytes() == changed.tsdf.tobytes()
     with pytest.raises(MapError, match="full"):
-        snapshot.take(KEYS[:100])
+        next(snapshot.parts())
     snapshot.close()
 
 

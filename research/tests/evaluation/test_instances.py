@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semantic_mapper.evaluation.instances import FoundInstances, average_precision, match_instances
+from research.evaluation.instances import FoundInstances, average_precision, match_instances
 from semantic_mapper.labels import make_label_set
 
 LABELS = make_label_set("things", ["wall", "chair", "cup"])

@@ -1,19 +1,23 @@
-"""The overview picture of a run: views and their rendered semantics, the map from above and from an angle, legend."""
+"""Pictures of a run: views and their rendered semantics, the map from above and from an angle, legend.
+
+Points are drawn on the CPU: parallel projection, z-buffer, shading from the depth buffer.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import scipy  # loads `spatial` when it is first used
 from numpy.typing import NDArray
 
-from semantic_mapper.errors import ShapeError
-from semantic_mapper.evaluation.splat import draw_points, fitted, from_above, from_angle, hides_the_room, open_side
 from semantic_mapper.evaluation.upright import ceiling_height, plan_rotation, upright_rotation
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.plots import (
     DIM_TEXT,
     PANEL,
@@ -27,7 +31,7 @@ from semantic_mapper.plots import (
     put_title,
     rendered,
 )
-from semantic_mapper.types import Bool, Float32, Float64, UInt8
+from semantic_mapper.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,36 +43,12 @@ MAP_HEIGHT = 620
 LEGEND_WIDTH = 250
 MAX_POINTS = 2_000_000
 ELEVATION = float(np.deg2rad(42))
+SUPERSAMPLING = 2  # pixels drawn a side for each pixel of the picture
+MAX_SPLAT = 13  # largest side of a splat, drawn pixels
+COLUMN_M = 0.12  # side of the upright columns in which walls are looked for
+EDGE_STRENGTH = 1.1  # of the shading
+AZIMUTHS = tuple(float(np.deg2rad(degrees)) for degrees in (35, 55, 125, 145, 215, 235, 305, 325))
 STRIPES, STRIPE_LIGHT = 40, 0.45  # across computed surface: how many, and how bright
-
-
-class LabelledPoints(Protocol):
-    """What is drawn of a map; ``MapPoints`` of the voxel map is one."""
-
-    @property
-    def xyz(self) -> Float32:
-        """(N, 3) metres."""
-        ...
-
-    @property
-    def rgb(self) -> UInt8:
-        """(N, 3)."""
-        ...
-
-    @property
-    def label(self) -> UInt8:
-        """(N,) class ids."""
-        ...
-
-    @property
-    def confidence(self) -> Float32:
-        """(N,) of ``label``, in [0, 1]."""
-        ...
-
-    @property
-    def measured(self) -> Bool | None:
-        """(N,), False where no sensor measured the surface; None = unknown."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +75,7 @@ class ViewStrip:
 @rendered
 def draw_overview(
     strips: Sequence[ViewStrip],
-    points: LabelledPoints,
+    points: MapPoints,
     label_set: LabelSet,
     *,
     title: str,
@@ -115,11 +95,7 @@ def draw_overview(
             estimates it from the points alone.
         unit: Of lengths.
         rooms: Name and outline (N, 3) in the world of each room, drawn into the map from above.
-
-    Raises:
-        ShapeError: the arrays of ``points`` do not fit together.
     """
-    _check(points)
     top = HEADER + sum(_strip_height(strip) + GAP for strip in strips)
     figure = new_figure(WIDTH, top + CAPTION + MAP_HEIGHT + MARGIN)
     put_title(figure, title, subtitle)
@@ -174,13 +150,6 @@ def _put_strip(figure: Figure, y: int, strip: ViewStrip, label_set: LabelSet, un
         put_picture(figure, box, picture, caption, smooth=column == 0)
 
 
-def _check(points: LabelledPoints) -> None:
-    count = len(points.xyz)
-    shapes = (points.xyz.shape, points.rgb.shape, points.label.shape, points.confidence.shape)
-    if shapes != ((count, 3), (count, 3), (count,), (count,)):
-        raise ShapeError(f"map points: expected xyz (N, 3), rgb (N, 3), label (N,), confidence (N,), got {shapes}")
-
-
 def _color_depth(depth_m: Float32, unit: str) -> tuple[str, UInt8]:
     known = np.isfinite(depth_m) & (depth_m > 0)
     if not known.any():
@@ -196,7 +165,7 @@ def _color_depth(depth_m: Float32, unit: str) -> tuple[str, UInt8]:
 def _put_map(
     figure: Figure,
     y: int,
-    points: LabelledPoints,
+    points: MapPoints,
     label_set: LabelSet,
     up: Float64 | None,
     unit: str,
@@ -216,7 +185,7 @@ def _put_map(
     plan = from_above(xyz[inside].astype(np.float64) @ R_plan_world.T)
     camera = fitted(plan, size) if len(plan) else (np.zeros(2), 1.0)
     above, scale = draw_points(plan, colors, size, PANEL, camera=camera)
-    azimuth = open_side(upright, ELEVATION)
+    azimuth = open_side(upright)
     seen = ~hides_the_room(upright, azimuth)
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
@@ -228,7 +197,7 @@ def _put_map(
     put_picture(figure, (MARGIN + width + GAP, y, *size), angled, f"map from an angle{cut}")
 
 
-def _point_colors(points: LabelledPoints, label_set: LabelSet) -> UInt8:
+def _point_colors(points: MapPoints, label_set: LabelSet) -> UInt8:
     """Class colours; the camera's brightness shows through a little, and what is not sure is paler."""
     colors = class_colors(points.label, label_set).astype(np.float32)
     if not len(colors):
@@ -280,3 +249,127 @@ def _put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
     axes.plot((16, 16 + metres * scale), (y, y), color="white", linewidth=3, solid_capstyle="butt")
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 2}  # points may lie here
     put_text(axes, (16, y - 15), f"{metres:g} {unit}", bbox=behind)
+
+
+def draw_points(
+    xyz_view: Float64,
+    colors: UInt8,
+    size: tuple[int, int],
+    background: tuple[int, int, int],
+    *,
+    camera: tuple[Float64, float] | None = None,
+) -> tuple[UInt8, float]:
+    """Draw points in parallel projection, fitted into the picture unless a camera is given.
+
+    Args:
+        xyz_view: (N, 3) metres: x to the right, y down, z away from the viewer.
+        colors: (N, 3) uint8.
+        size: (width, height) of the picture.
+        background: (r, g, b).
+        camera: The x and y (2,) of the picture's centre and pixels a metre, to draw several maps alike.
+
+    Returns:
+        (H, W, 3) uint8 picture and its scale in pixels a metre.
+    """
+    width, height = size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING
+    canvas = np.full((height, width, 3), background, np.uint8)
+    if not len(xyz_view):
+        return cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.uint8), 1.0
+    centre, scale = fitted(xyz_view, size) if camera is None else camera
+    scale *= SUPERSAMPLING
+    side = int(np.clip(np.ceil(point_spacing(xyz_view) * scale * 1.1), 1, MAX_SPLAT))
+    pixel = np.floor((xyz_view[:, :2] - centre) * scale + (width / 2, height / 2)).astype(np.int64)
+    nearest = _nearest_points(pixel, xyz_view[:, 2], width, height, side)
+    hit = nearest >= 0
+    depth = xyz_view[:, 2].astype(np.float32)[nearest]
+    shade = _shading(np.where(hit, depth, depth[hit].max(initial=0.0) + np.float32(0.05)), scale)
+    canvas[hit] = np.clip(colors[nearest[hit]] * shade[hit][:, None], 0, 255).astype(np.uint8)
+    return cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.uint8), scale / SUPERSAMPLING
+
+
+def fitted(xyz_view: Float64, size: tuple[int, int]) -> tuple[Float64, float]:
+    """The ``camera`` of ``draw_points`` that fits points (N, 3), N > 0, into a picture (width, height)."""
+    low, high = np.percentile(xyz_view[:, :2], (0.1, 99.9), axis=0)
+    extent = np.maximum(high - low, 0.1) * 1.04 + 0.05
+    return (low + high) / 2, float(min(size[0] / extent[0], size[1] / extent[1]))
+
+
+def from_above(xyz_upright: Float64) -> Float64:
+    """View coordinates (N, 3) of a look straight down on upright points (z up)."""
+    return xyz_upright * (1.0, -1.0, -1.0)
+
+
+def from_angle(xyz_upright: Float64, azimuth: float, elevation: float) -> Float64:
+    """View coordinates (N, 3) of a look at upright points (z up) from a direction, in radians."""
+    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    right = np.array((-sa, ca, 0.0))
+    towards_viewer = np.array((ca * ce, sa * ce, se))
+    return xyz_upright @ np.stack((right, np.cross(right, towards_viewer), -towards_viewer)).T
+
+
+def hides_the_room(xyz_upright: Float64, azimuth: float) -> NDArray[np.bool_]:
+    """Which points of tall things stand in front and would hide the rest from a viewer at ``azimuth``.
+
+    Leaving them out opens the map like a doll's house: walls, and what leans on them, on the viewer's side.
+
+    Args:
+        xyz_upright: (N, 3) metres, z up.
+        azimuth: Direction of the viewer in the x-y plane, radians.
+
+    Returns:
+        (N,) bool; never the floor.
+    """
+    towards = np.array((np.cos(azimuth), np.sin(azimuth)))
+    low, high = np.percentile(xyz_upright[:, 2], (2, 99)) if len(xyz_upright) else (0.0, 0.0)
+    cells = np.floor(xyz_upright[:, :2] / COLUMN_M).astype(np.int64)
+    columns, column = np.unique(cells, axis=0, return_inverse=True)
+    column = column.ravel()
+    top = np.full(len(columns), -np.inf)
+    np.maximum.at(top, column, xyz_upright[:, 2])
+    tall = top - low > 0.6 * (high - low)
+    centre = (columns + 0.5) * COLUMN_M
+    along = (centre - centre.sum(axis=0) / max(len(centre), 1)) @ towards
+    # Of the tall columns in one line of sight, those of the front one's thickness hide what is behind them.
+    line = np.floor(centre @ (-towards[1], towards[0]) / COLUMN_M).astype(np.int64)
+    line -= line.min(initial=0)
+    front = np.full(line.max(initial=0) + 1, -np.inf)
+    np.maximum.at(front, line[tall], along[tall])
+    hiding = tall & (along > front[line] - 2.5 * COLUMN_M) & (along > 0)
+    return hiding[column] & (xyz_upright[:, 2] > low + 0.1)
+
+
+def _nearest_points(pixel: NDArray[np.int64], z: Float64, width: int, height: int, side: int) -> NDArray[np.int64]:
+    """Index (H, W) of the nearest point a pixel, each a square of ``side`` pixels; -1 where there is none."""
+    inside = np.flatnonzero(((pixel >= 0) & (pixel < (width, height))).all(axis=1))
+    near_to_far = inside[np.argsort(z[inside], kind="stable")]
+    rank = np.full((height, width), len(inside), np.float32)  # exact below 2^24 points
+    x, y = pixel[near_to_far[::-1]].T
+    rank[y, x] = np.arange(len(inside), dtype=np.float32)[::-1]  # the last one written stays
+    rank = cv2.erode(rank, np.ones((side, side), np.uint8))
+    return np.append(near_to_far, -1)[rank.astype(np.int64)]
+
+
+def _shading(depth: Float32, scale: float) -> Float32:
+    """(H, W), 1 = unshaded: a pixel is darker the further it lies behind its surroundings (Luft et al., 2006)."""
+    total = np.zeros_like(depth)
+    for radius, weight in ((2, 1.0), (5, 0.6), (11, 0.4)):
+        behind = depth - cv2.blur(depth, (2 * radius + 1, 2 * radius + 1))
+        reach = 3 * radius / scale + 0.025  # metres on the picture
+        total += np.float32(weight) * np.clip(behind / np.float32(reach), 0, 1)
+    return np.exp(-EDGE_STRENGTH * total).astype(np.float32)
+
+
+def point_spacing(xyz: Float64) -> float:
+    """Typical distance of a point to its fourth neighbour, metres: the pitch of a surface sampled on a grid."""
+    if len(xyz) < 5:
+        return 0.05
+    check_room_for_scipy()
+    asking = xyz[:: max(1, len(xyz) // 500)]
+    distances, _ = scipy.spatial.KDTree(xyz).query(asking, k=5)
+    return float(np.percentile(distances[:, 4], 75))
+
+
+def open_side(xyz_upright: Float64) -> float:
+    """Azimuth, in radians, of the corner from which the least of upright points (N, 3) hides the rest."""
+    few = xyz_upright[:: max(1, len(xyz_upright) // 60_000)]
+    return min(AZIMUTHS, key=lambda azimuth: float(hides_the_room(few, azimuth).sum()))
