@@ -9,7 +9,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
@@ -21,6 +21,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
@@ -198,29 +199,18 @@ def frame_progress(
 ) -> Iterator[FrameProgress]:
     """Show progress while inside; ``total`` None where nobody knows it. ``stop`` is what ends the job early."""
     columns = (
-        _TextColumn(lambda task: task.description, "bold"),
+        TextColumn("{task.description}", "bold", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         _RateColumn(unit),
-        _TextColumn(lambda task: "eta"),
+        TextColumn("eta"),
         TimeRemainingColumn(),
         TimeElapsedColumn(),
-        _TextColumn(lambda task: task.fields["note"]),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     console = stderr_console()
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit, stop)
-
-
-class _TextColumn(ProgressColumn):
-    """Rich's own reads markup."""
-
-    def __init__(self, text: Callable[[Task], str], style: str = "") -> None:
-        super().__init__()
-        self._text, self._style = text, style
-
-    def render(self, task: Task) -> Text:
-        return Text(visible(self._text(task)), style=self._style)
 
 
 class _RateColumn(ProgressColumn):

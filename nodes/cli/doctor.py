@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.text import Text
 
 from semantic_mapper.drivers.registry import KINDS, find_cameras
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, SetOption, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, verb
 from semantic_mapper.nodes.console import Output, table
 from semantic_mapper.nodes.doctor import examine
-from semantic_mapper.nodes.launcher.launch_file import find_launch
 
 _STYLES = {"ok": "green", "note": "yellow", "bad": "bold red"}
 
@@ -22,20 +19,16 @@ _STYLES = {"ok": "green", "note": "yellow", "bad": "bold red"}
 @verb
 def doctor(
     output: JsonOutput,
-    launch: Annotated[Path | None, typer.Argument(metavar="[LAUNCH.toml]")] = None,  # its ports and keys are looked at
     *,
-    set_: SetOption = None,
     cameras: bool = False,  # list the cameras that are connected instead, as a config names them
     kind: list[str] | None = None,  # --cameras: only this kind (v4l2, stereo, oak, realsense); may be repeated
 ) -> int:
     """Look for what this machine lacks, with a fix for each thing; or list its cameras.
 
-    Exit code 1 where something needed is missing. With a launch file what `up` and its nodes would refuse is looked
-    for, too. Video files and streams (kind opencv) are named, not found. A kind of camera whose packages are missing is
-    reported, too.
+    Exit code 1 where something needed is missing. Video files and streams (kind opencv) are named, not found. A kind of
+    camera whose packages are missing is reported, too.
 
     Example: semantic-mapper doctor
-    Example: semantic-mapper doctor onboard --set keys=~/.config/semantic-mapper/keys
     Example: semantic-mapper doctor --cameras --kind v4l2 --json
     """
     if kind and not cameras:
@@ -43,7 +36,7 @@ def doctor(
     if cameras:
         _list_cameras(output, kind or ())
         return 0
-    checks = examine(find_launch(launch) if launch else None, set_ or ())
+    checks = examine()
     rows = [(Text(check.state, _STYLES[check.state]), check.name, check.found, check.fix) for check in checks]
     output.print(table(rows, ("", "what", "found", "fix"), title="doctor"))
     output.json([asdict(check) for check in checks])

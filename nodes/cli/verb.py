@@ -312,15 +312,13 @@ def _check_values(options: Mapping[str, object]) -> None:
     """Options know lower bounds only, and NaN passes these.
 
     Raises:
-        typer.BadParameter: a number that nothing can be computed with, or a NUL character.
+        typer.BadParameter: a number that nothing can be computed with.
     """
     for name, value in options.items():
-        hint = f"--{name.replace('_', '-')}"
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, float) and not -MAX_OPTION <= item <= MAX_OPTION:
+                hint = f"--{name.replace('_', '-')}"
                 raise typer.BadParameter(f"{item:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
-            if isinstance(item, str | Path) and "\0" in str(item):
-                raise typer.BadParameter("holds a NUL character, which no name may", param_hint=hint)
 
 
 def show_error(message: str) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import pytest
-
 from tests.nodes.support import run_here
 
 
@@ -25,32 +23,6 @@ def test_what_is_no_file_is_refused_by_its_name(tmp_path: Path) -> None:
         code, shown = run_here(*map(str, words))
         assert code == 1 and said in " ".join(shown.split()), shown
         assert "sys.set_int" not in shown
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("replay", "room\0.mcap", "--out", "x"),
-        ("up", "replay\0", "--set", "camera.log=a"),
-        ("query", "map\0.npz", "info"),
-        ("view", "tcp://127.0.0.1:1\0"),
-        ("label", "room.mcap", "--out", "x\0y"),
-        ("export", "room.mcap", "--out", "x\0.rrd"),
-        ("record", "a.mcap", "--topic", "fra\0me"),
-        ("fleet", "table", "runs\0", "frames"),
-    ],
-)
-def test_a_nul_in_a_name_is_wrong_usage(
-    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    code, said = run_here(*words)
-    assert code == 2 and ("NUL" in said or "null byte" in said), said
-
-
-def test_a_nul_in_a_value_of_a_launch_is_named(log: Path) -> None:
-    code, said = run_here("up", "replay", "--set", f"camera.log={log}", "--set", 'out="a\\u0000b"')
-    assert code == 1 and "NUL" in said, said
 
 
 def test_rates_and_numbers_that_overflow_are_refused_where_they_stand(tmp_path: Path, log: Path) -> None:

@@ -179,3 +179,10 @@ def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path
                 assert stranger.receive(0.2) is None
         with PublicPublisher(own, "", "") as plain:  # free again
             assert plain.public_endpoint == ""
+
+
+def test_missing_numbers_are_counted_camera_by_camera() -> None:
+    missing = MissingFrames()
+    for camera, seq in (("left", 4), ("right", 0), ("left", 7), ("right", 1), ("left", 0), ("left", 1)):
+        missing.note(camera, seq)
+    assert (missing.missed, missing.restarts) == (2, 1)

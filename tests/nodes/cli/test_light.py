@@ -112,7 +112,6 @@ def test_errors_that_need_no_heavy_package_load_none(files: Path) -> None:
         "info none.json": 1,
         "view none.mcap": 1,
         "up none.toml": 1,
-        "doctor none.toml": 1,
         "keys show --keys none": 1,
         "fly": 2,
     }

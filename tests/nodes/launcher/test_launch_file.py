@@ -216,7 +216,7 @@ def test_each_start_has_a_folder_of_its_own_even_where_the_clock_is_set_back(
         ([], ("[[node]]", "heartbeat_s = inf\n[[node]]"), "heartbeat_s = inf"),
         ([], ("[[node]]", "heartbeat_s = " + "9" * 5000 + "\n[[node]]"), "not valid TOML"),
         ([], ("[[node]]", "x = " + "[" * 20000 + "\n[[node]]"), "not valid TOML"),
-        ([], ('mode = "realtime"', "subscriber_timeout_s = nan"), "options.subscriber_timeout_s = nan"),
+        ([], ('mode = "realtime"', "ack_timeout_s = nan"), "options.ack_timeout_s = nan"),
         (["eye.rate=1e-300"], ("", ""), "rate"),
         (["eye.rate=" + "9" * 4094], ("", ""), "rate = a number of"),
         (["eye.rate=" + "[" * 4000], ("", ""), "rate"),
