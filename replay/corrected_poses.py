@@ -49,10 +49,10 @@ def read_corrections(path: Path) -> Trajectory:
     Raises:
         ImportSourceError: missing, empty, or with an invalid line.
     """
-    found = read_trajectory(path)
-    if found.left_out:  # a recording can do without a frame; who corrects poses wants all of them
-        raise ImportSourceError(f"{found.left_out[0]} ({len(found.left_out)} lines); fix or remove them")
-    return Trajectory(path, found.stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in found.rows]))
+    stamps_ns, rows, left_out = read_trajectory(path)
+    if left_out:  # a recording can do without a frame; who corrects poses wants all of them
+        raise ImportSourceError(f"{left_out[0]} ({len(left_out)} lines); fix or remove them")
+    return Trajectory(path, stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in rows]))
 
 
 def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:

@@ -1,13 +1,14 @@
-"""What can be done with a log or a map, from a typed request to a typed result: nothing here prints.
+"""What can be done with a log or a map: nothing here prints.
 
 The command line, the nodes and the fleet call these; ``finetune_log`` and ``autolabel_log`` have a module of their own.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -32,8 +33,7 @@ from semantic_mapper.replay.evaluate.methods import (
     field_predictors,
     thing_tellers,
 )
-from semantic_mapper.replay.evaluate.panoptic_truth import InstanceFolder, PanopticTruth
-from semantic_mapper.replay.evaluate.shortfall import explain_shortfall
+from semantic_mapper.replay.evaluate.things import InstanceFolder, PanopticTruth
 from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.finetune_log import FinetuneRequest, FinetuneResult, finetune_log
 from semantic_mapper.replay.job_monitor import JobMonitor
@@ -47,14 +47,8 @@ from semantic_mapper.types import PosedFrame
 __all__ = [
     "OFFLINE",
     "AutolabelRequest",
-    "EvaluateRequest",
-    "EvaluateResult",
     "FinetuneRequest",
     "FinetuneResult",
-    "RefineRequest",
-    "RefineResult",
-    "ReplayRequest",
-    "ReplayResult",
     "autolabel_log",
     "evaluate_log",
     "finetune_log",
@@ -69,12 +63,31 @@ OFFLINE = {"depth.from_motion.delay_frames": 6}
 _log = get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayRequest:
-    """What to replay.
+class ReplayResult(NamedTuple):
+    """What a replay came to: the summary, as in ``summary.json``, and the session that it is of."""
+
+    summary: dict[str, Any]
+    session: MapSession
+
+
+def replay_log(
+    log: Path | Sequence[Path],
+    out: Path,
+    weights: Path | None = None,
+    config: MapperConfig | None = None,
+    max_frames: int = 0,
+    *,
+    exclude: Path | None = None,
+    rerun: Path | None = None,
+    corrections: Path | None = None,
+    monitor: JobMonitor | None = None,
+) -> ReplayResult:
+    """Map a log and write summary, map, pictures and report; after a stop request, those of the frames so far.
+
+    Damaged frames of the log and frames that the mapper refuses are counted and reported; the rest is mapped.
 
     Args:
-        log: The log, or a folder with the parts of a recording.
+        log: The log, a folder with the parts of a recording, or these parts.
         out: Folder for the results.
         weights: None = those that ship with the package.
         config: Of the mapper.
@@ -82,80 +95,50 @@ class ReplayRequest:
         exclude: Weights whose finetuning frames are left out of the scores, beyond those of ``weights``.
         rerun: Where to write a Rerun recording.
         corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
-        further_parts: Of the recording that ``log`` is a part of.
-    """
-
-    log: Path
-    out: Path
-    weights: Path | None = None
-    config: MapperConfig = field(default_factory=MapperConfig)
-    max_frames: int = 0
-    exclude: Path | None = None
-    rerun: Path | None = None
-    corrections: Path | None = None
-    further_parts: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReplayResult:
-    """What a replay came to.
-
-    Args:
-        summary: As in ``summary.json``; ``stopped_by`` names the signal that ended it early, else null.
-        session: That the summary is of.
-    """
-
-    summary: dict[str, Any]
-    session: MapSession
-
-
-def replay_log(request: ReplayRequest, monitor: JobMonitor | None = None) -> ReplayResult:
-    """Map a log and write summary, map, pictures and report; after a stop request, those of the frames so far.
-
-    Damaged frames of the log and frames that the mapper refuses are counted and reported; the rest is mapped.
+        monitor: Gets the progress, and may end it early; ``stopped_by`` of the summary names the signal.
 
     Raises:
         LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
         ImportSourceError: the corrections cannot be read.
     """
     monitor = monitor or JobMonitor()
-    trajectory = read_corrections(request.corrections) if request.corrections else None
-    exclude = load_checkpoint(request.exclude).train_stamps_ns if request.exclude else frozenset[int]()
-    with hold_folder(request.out), open_log((request.log, *request.further_parts)) as log:
-        for notice in log.notices:
+    trajectory = read_corrections(corrections) if corrections else None
+    seen = load_checkpoint(exclude).train_stamps_ns if exclude else frozenset[int]()
+    with hold_folder(out), open_log(log) as source:
+        for notice in source.notices:
             _log.warning("log_notice", notice=notice)
-        config, fitted = fit_to_scene(request.config, log.info)
+        config, fitted = fit_to_scene(config or MapperConfig(), source.info)
         if fitted:
             _log.warning("settings_fitted", to=fitted)
-        config = config if trajectory is None else keeping_frames(config, len(log))
-        bundle = Mapper.load(request.weights, config)
-        clear_results(request.out)
+        config = config if trajectory is None else keeping_frames(config, len(source))
+        bundle = Mapper.load(weights, config)
+        clear_results(out)
         session = MapSession(
             bundle,
-            stream_labels=log.info.label_set,
-            exclude_stamps=exclude,
-            source=log.info.source,
-            scale_known=log.info.scale_known,
-            rerun=open_recording(request.rerun, bundle.pipeline),
+            stream_labels=source.info.label_set,
+            exclude_stamps=seen,
+            source=source.info.source,
+            scale_known=source.info.scale_known,
+            rerun=open_recording(rerun, bundle.pipeline),
         )
-        session.left_out = read_left_out(log.attachments())
-        for error in log.errors:  # stretches of the file in which no frame can be made out
+        session.left_out = read_left_out(source.attachments())
+        for error in source.errors:  # stretches of the file in which no frame can be made out
             session.note_damage(str(error))
-        total = min(len(log), request.max_frames or len(log))
+        total = min(len(source), max_frames or len(source))
         monitor.start(total)
-        _log.info("mapping", log=request.log.name, frames=total, weights=bundle.weights_path.name)
+        _log.info("mapping", log=source.path.name, frames=total, weights=bundle.weights_path.name)
         try:
-            done = _map_frames(session, log, total, monitor)
+            done = _map_frames(session, source, total, monitor)
             if trajectory is not None and not monitor.stopped_by:
                 correct_session(session, trajectory)
         except SemanticMapperError:  # the map is full, for one: what is in it is worth keeping
-            finish_session(session, request.out, "error")
+            finish_session(session, out, "error")
             raise
-        summary = finish_session(session, request.out, monitor.stopped_by)
+        summary = finish_session(session, out, monitor.stopped_by)
     if not session.fused:
         reason = summary["map"]["nearly_empty"] or "no frame has depth or finds a source view"
         reason = session.refusals.first[0].reason if session.refusals else reason
-        raise LogError(f"{request.log}: none of {counted(done, 'frame')} could be mapped; the first: {reason}")
+        raise LogError(f"{source.path}: none of {counted(done, 'frame')} could be mapped; the first: {reason}")
     return ReplayResult(summary, session)
 
 
@@ -174,9 +157,17 @@ def _map_frames(session: MapSession, log: Log, total: int, monitor: JobMonitor) 
     return done
 
 
-@dataclass(frozen=True, slots=True)
-class EvaluateRequest:
-    """What to score.
+def evaluate_log(
+    log: Path,
+    weights: Path | None = None,
+    config: MapperConfig | None = None,
+    max_frames: int = 0,
+    *,
+    baseline_s: float = 0.0,
+    instances: Path | None = None,
+    monitor: JobMonitor | None = None,
+) -> Evaluation:
+    """Score a log with several methods.
 
     Args:
         log: The log, or a folder with the parts of a recording.
@@ -185,45 +176,20 @@ class EvaluateRequest:
         max_frames: 0 = all.
         baseline_s: Also fit the baselines to the keyframes of the weights, the U-Net for so long; 0 = no baselines.
         instances: Folder with images of the frames' true objects; None = things are not scored.
-    """
-
-    log: Path
-    weights: Path | None = None
-    config: MapperConfig = field(default_factory=MapperConfig)
-    max_frames: int = 0
-    baseline_s: float = 0.0
-    instances: Path | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EvaluateResult:
-    """Scores of a log.
-
-    Args:
-        scores: ``methods`` (metrics by name), ``scored``, ``excluded``, ``refused``, ``damaged``, ``weights``, and
-            ``notes``: why the field is below its own image alone or the U-Net, where it is.
-        evaluation: What they were made of.
-    """
-
-    scores: dict[str, Any]
-    evaluation: Evaluation
-
-
-def evaluate_log(request: EvaluateRequest, monitor: JobMonitor | None = None) -> EvaluateResult:
-    """Score a log with several methods.
+        monitor: Gets the progress.
 
     Raises:
         LogError, LabelError, WeightsError: nothing can be scored.
     """
-    monitor = monitor or JobMonitor()
-    from_motion = msgspec.structs.replace(request.config.depth.from_motion, delay_frames=0)
-    depth = msgspec.structs.replace(request.config.depth, from_motion=from_motion)
-    with open_log(request.log) as log:
-        stream_labels = log.info.label_set
+    monitor, config = monitor or JobMonitor(), config or MapperConfig()
+    from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=0)
+    depth = msgspec.structs.replace(config.depth, from_motion=from_motion)
+    with open_log(log) as source:
+        stream_labels = source.info.label_set
         if stream_labels is None:
-            raise LabelError(f"{request.log}: has no label images to score against")
-        _check_scorable(log)
-        bundle = Mapper.load(request.weights, msgspec.structs.replace(request.config, depth=depth))
+            raise LabelError(f"{log}: has no label images to score against")
+        _check_scorable(source)
+        bundle = Mapper.load(weights, msgspec.structs.replace(config, depth=depth))
         checkpoint = bundle.checkpoint
         if not checkpoint.model.knows_classes:
             raise WeightsError(
@@ -231,23 +197,23 @@ def evaluate_log(request: EvaluateRequest, monitor: JobMonitor | None = None) ->
                 "there is nothing to score; give weights that were trained on labels"
             )
         panoptic = None
-        if request.instances is not None:
-            require_metres(log.info.scale_known, "instances")
-            panoptic = PanopticTruth(InstanceFolder(request.instances, log), stream_labels, checkpoint.label_set)
+        if instances is not None:
+            require_metres(source.info.scale_known, "instances")
+            panoptic = PanopticTruth(InstanceFolder(instances, source), stream_labels, checkpoint.label_set)
         predictors = field_predictors(bundle)
-        if request.baseline_s:
+        if baseline_s:
             monitor.start(100)
             predictors |= baseline_predictors(
-                _frames_at(log, checkpoint.train_stamps_ns),
+                _frames_at(source, checkpoint.train_stamps_ns),
                 checkpoint.label_set,
-                request.baseline_s,
-                request.config.seed,
+                baseline_s,
+                config.seed,
                 lambda fraction: monitor.set(int(fraction * 100), "fitting the U-Net"),
             )
-        total = min(len(log), request.max_frames or len(log))
+        total = min(len(source), max_frames or len(source))
         monitor.start(total)
         found = evaluate_frames(
-            (frame for _, frame in zip(range(total), log, strict=False)),
+            (frame for _, frame in zip(range(total), source, strict=False)),
             predictors,
             stream_labels,
             checkpoint.label_set,
@@ -257,13 +223,7 @@ def evaluate_log(request: EvaluateRequest, monitor: JobMonitor | None = None) ->
             panoptic=panoptic,
             things=thing_tellers(bundle),
         )
-        scores = {
-            **found.plain(),
-            "damaged": len(log.errors),
-            "weights": bundle.weights_path.name,
-            "notes": list(explain_shortfall(checkpoint.model.kind, found.methods, checkpoint.recipe)),
-        }
-        return EvaluateResult(scores, found)
+        return replace(found, damaged=len(source.errors), weights=bundle.weights_path.name)
 
 
 def _check_scorable(log: Log) -> None:
@@ -296,60 +256,50 @@ def _frames_at(log: Log, stamps: frozenset[int]) -> list[PosedFrame]:
     return [log.frame(i) for i in numbers]
 
 
-@dataclass(frozen=True, slots=True)
-class RefineRequest:
-    """What to refine.
-
-    Args:
-        map: Saved map.
-        out: Map to write.
-        weights: Of a network, or ``smoothed``; None = those that ship, or smoothing for a map of other classes.
-        fill: Surface without votes gets a class that is at least so likely; 1 = never.
-        up: Up in the world: ``auto``, an axis, or three numbers.
-        by_name: Whether weights of other classes are matched by the names of these.
-    """
-
-    map: Path
-    out: Path
-    weights: Path | None = None
-    fill: float = 0.5
-    up: str = "auto"
-    by_name: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class RefineResult:
-    """What refining has changed.
-
-    Args:
-        report: The figures.
-        weights: Digest of the network, or ``smoothed``.
-        label_set: Name of the map's.
-    """
+class RefineResult(NamedTuple):
+    """What refining has changed; the digest of the network, or ``smoothed``; and the name of the map's label set."""
 
     report: RefineReport
     weights: str
     label_set: str
 
 
-def refine_map(request: RefineRequest, monitor: JobMonitor | None = None) -> RefineResult:
+def refine_map(
+    path: Path,
+    out: Path,
+    weights: Path | None = None,
+    *,
+    fill: float = 0.5,
+    up: str = "auto",
+    by_name: bool = False,
+    monitor: JobMonitor | None = None,
+) -> RefineResult:
     """Relabel a saved map by its shape, colour and votes, into a new one.
+
+    Args:
+        path: Saved map.
+        out: Map to write.
+        weights: Of a network, or ``smoothed``; None = those that ship, or smoothing for a map of other classes.
+        fill: Surface without votes gets a class that is at least so likely; 1 = never.
+        up: Up in the world: ``auto``, an axis, or three numbers.
+        by_name: Whether weights of other classes are matched by the names of these.
+        monitor: Gets the progress.
 
     Raises:
         ConfigError: ``up`` is no direction, or the new map cannot be written there.
         MapError, WeightsError: map and weights cannot be read, or do not go together.
     """
     monitor = monitor or JobMonitor()
-    up = parse_up(request.up)
-    prepare_file(request.out)
-    voxel_map = VoxelMap.load(request.map)
-    network = find_nesf(request.weights, voxel_map.label_set)
+    direction = parse_up(up)
+    prepare_file(out)
+    voxel_map = VoxelMap.load(path)
+    network = find_nesf(weights, voxel_map.label_set)
 
     def on_tile(done: int, total: int) -> None:
         if done == 1:
             monitor.start(total)
         monitor.set(done)
 
-    report = refine(voxel_map, network, fill=request.fill, up=up, by_name=request.by_name, on_tile=on_tile)
-    voxel_map.save(request.out)
+    report = refine(voxel_map, network, fill=fill, up=direction, by_name=by_name, on_tile=on_tile)
+    voxel_map.save(out)
     return RefineResult(report, network.digest, voxel_map.label_set.name)

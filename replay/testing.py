@@ -20,7 +20,7 @@ from semantic_mapper.queries.nearest import NearestSurface, at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.replay.compare import MAP_FILE, Comparison, Run, Tolerances, compare_runs, read_run
-from semantic_mapper.replay.jobs import ReplayRequest, replay_log
+from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.summary import SUMMARY_FILE
 
 UPDATE_OPTION = "--update-runs"
@@ -223,5 +223,5 @@ class LogReplays:
 
     def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
         folder = self._make_folder(path.stem)
-        result = replay_log(ReplayRequest(path, folder, weights, config, max_frames))
+        result = replay_log(path, folder, weights, config, max_frames)
         return ReplayedMap(folder, result.session.pipeline.voxel_map, result.summary, self._root, self._update)

@@ -6,9 +6,10 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,20 +44,23 @@ _KEEPS_INTRINSICS = ("oak", "realsense")  # rectifies with what its maker has me
 _log = structlog.get_logger(__name__)
 
 
-class Source(Protocol):
-    """Images of one camera or, of a log, of several."""
+@dataclass(slots=True)
+class Source:
+    """Images of one camera or, of a log, of several.
 
-    live: bool
-    stream: bool  # images follow each other closely
-    known: bool  # the intrinsics that it gives are right
+    Args:
+        images: Gives them with what to call each, to the end; a live camera's until ``stop``.
+        live: It has no end.
+        stream: Its images follow each other closely.
+        known: The intrinsics that it gives are right.
+        stop: Ends ``images`` soon, from any thread.
+    """
 
-    def images(self) -> Iterator[tuple[str, CameraImage]]:
-        """Images with what to call each, to the end; a live camera's until ``stop``."""
-        ...
-
-    def stop(self) -> None:
-        """End ``images`` soon, from any thread."""
-        ...
+    images: Callable[[], Iterator[tuple[str, CameraImage]]]
+    live: bool = False
+    stream: bool = True
+    known: bool = False
+    stop: Callable[[], None] = lambda: None
 
 
 def check_places(texts: Sequence[str]) -> None:
@@ -93,9 +97,9 @@ def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
     names: list[str] = []
     for name, place in named:
         if Path(place).is_dir():
-            found.append(_Folder(name, Path(place), stems))
+            found.append(Source(partial(_folder_images, name, Path(place), stems), stream=False))
         elif place.endswith(".mcap"):
-            found.append(_Log(Path(place)))
+            found.append(Source(partial(_log_images, Path(place))))
             continue  # names its cameras itself
         else:
             found.append(_camera_source(name, place, size))
@@ -122,7 +126,7 @@ def parse_stereo(texts: Sequence[str], size: str) -> tuple[str, Source]:
         raise ConfigError("--stereo calibrates one device that gives both images side by side; name one")
     name, _ = _split(texts[0], alone=True)
     (source,) = parse_sources(texts, size)
-    return ("stereo" if name == "camera" else name), _Halves(source)
+    return ("stereo" if name == "camera" else name), replace(source, images=partial(_halves, source), known=False)
 
 
 def _split(text: str, *, alone: bool) -> tuple[str, str]:
@@ -145,10 +149,11 @@ def _camera_source(name: str, place: str, size: str) -> Source:
             config["width"], config["height"] = _read_size(size)
         live = kind != "opencv" or "://" in address
         camera = open_camera(kind, config, name, place)
-        return _Camera(camera, live=live, known=kind in _KEEPS_INTRINSICS)
+        return Source(partial(_camera_images, camera), live=live, known=kind in _KEEPS_INTRINSICS, stop=camera.stop)
     check_places([place])
     plain = {"source": place, "uncalibrated": True, "pace": "fast"}
-    return _Camera(open_camera("opencv", plain, name, place), live=False, known=False)
+    film = open_camera("opencv", plain, name, place)
+    return Source(partial(_camera_images, film), stop=film.stop)
 
 
 def _read_size(text: str) -> tuple[int, int]:
@@ -162,90 +167,41 @@ def _pictures(folder: Path) -> list[Path]:
     return sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES)
 
 
-@dataclass(slots=True)
-class _Folder:
-    """Pictures; those of one name in several folders were taken at once."""
-
-    name: str
-    folder: Path
-    stems: Sequence[str]  # of all folders
-    live: bool = False
-    stream: bool = False
-    known: bool = False
-
-    def images(self) -> Iterator[tuple[str, CameraImage]]:
-        pictures = _pictures(self.folder)
-        if not pictures:
-            raise CameraError(f"{self.folder}: no pictures in it ({', '.join(PICTURES)})")
-        for seq, path in enumerate(pictures):
-            bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-            if bgr is None:
-                raise CameraError(f"{path}: is no picture that OpenCV can read; take it out of the folder")
-            rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-            stamp_ns = self.stems.index(path.stem) * 1_000_000_000
-            plain = guess_intrinsics(rgb.shape[1], rgb.shape[0])
-            yield path.name, CameraImage(stamp_ns, seq, self.name, rgb, None, plain)
-
-    def stop(self) -> None:
-        pass
+def _folder_images(name: str, folder: Path, stems: Sequence[str]) -> Iterator[tuple[str, CameraImage]]:
+    """Pictures; those of one stem in several folders were taken at once (``stems``: of all folders)."""
+    pictures = _pictures(folder)
+    if not pictures:
+        raise CameraError(f"{folder}: no pictures in it ({', '.join(PICTURES)})")
+    for seq, path in enumerate(pictures):
+        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise CameraError(f"{path}: is no picture that OpenCV can read; take it out of the folder")
+        rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+        stamp_ns = stems.index(path.stem) * 1_000_000_000
+        yield path.name, CameraImage(stamp_ns, seq, name, rgb, None, guess_intrinsics(rgb.shape[1], rgb.shape[0]))
 
 
-@dataclass(slots=True)
-class _Camera:
-    """A live camera or a video."""
-
-    camera: Camera
-    live: bool
-    known: bool
-    stream: bool = True
-
-    def images(self) -> Iterator[tuple[str, CameraImage]]:
-        with self.camera as camera:
-            for image in camera:
-                yield f"image {image.seq}", image
-
-    def stop(self) -> None:
-        self.camera.stop()
+def _camera_images(camera: Camera) -> Iterator[tuple[str, CameraImage]]:
+    with camera:
+        for image in camera:
+            yield f"image {image.seq}", image
 
 
-class _Halves:
+def _halves(source: Source) -> Iterator[tuple[str, CameraImage]]:
     """The images of a device that gives two side by side, as those of two cameras."""
-
-    def __init__(self, source: Source) -> None:
-        self._source = source
-        self.live = source.live
-        self.stream = source.stream
-        self.known = False
-
-    def images(self) -> Iterator[tuple[str, CameraImage]]:
-        for name, image in self._source.images():
-            for side, rgb in zip(SIDES, halves(image.rgb), strict=True):
-                plain = guess_intrinsics(rgb.shape[1], rgb.shape[0])
-                yield name, CameraImage(image.stamp_ns, image.seq, side, rgb, None, plain)
-
-    def stop(self) -> None:
-        self._source.stop()
+    for name, image in source.images():
+        for side, rgb in zip(SIDES, halves(image.rgb), strict=True):
+            plain = guess_intrinsics(rgb.shape[1], rgb.shape[0])
+            yield name, CameraImage(image.stamp_ns, image.seq, side, rgb, None, plain)
 
 
-@dataclass(slots=True)
-class _Log:
-    """The images of a log."""
-
-    path: Path
-    live: bool = False
-    stream: bool = True
-    known: bool = False
-
-    def images(self) -> Iterator[tuple[str, CameraImage]]:
-        # What comes of it is right for the log's images; the camera's own are another matter.
-        _log.warning("log_is_rectified", log=str(self.path), fix="calibrate the lens from the camera itself or a video")
-        with open_log(self.path) as log:
-            for frame in log:
-                image = CameraImage(frame.stamp_ns, frame.seq, frame.camera_id, frame.rgb, None, frame.intrinsics)
-                yield f"frame {frame.seq}", image
-
-    def stop(self) -> None:
-        pass
+def _log_images(path: Path) -> Iterator[tuple[str, CameraImage]]:
+    # What comes of it is right for the log's images; the camera's own are another matter.
+    _log.warning("log_is_rectified", log=str(path), fix="calibrate the lens from the camera itself or a video")
+    with open_log(path) as log:
+        for frame in log:
+            image = CameraImage(frame.stamp_ns, frame.seq, frame.camera_id, frame.rgb, None, frame.intrinsics)
+            yield f"frame {frame.seq}", image
 
 
 class Gathering:

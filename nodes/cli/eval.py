@@ -76,18 +76,19 @@ def evaluate(
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
             output.print(f"{name}: {_surface_line(figures)}")
-    from semantic_mapper.replay.jobs import EvaluateRequest, evaluate_log
+    from semantic_mapper.replay.jobs import evaluate_log
 
     settings = mapper.load()
     tables: dict[str, Table] = {}
     for log in logs:
-        request = EvaluateRequest(log, weights, settings, max_frames, seconds if baselines else 0.0, instances)
         with frame_progress("score", None) as bar:
-            scores = evaluate_log(request, bar).scores
+            baseline_s = seconds if baselines else 0.0
+            scores = evaluate_log(
+                log, weights, settings, max_frames, baseline_s=baseline_s, instances=instances, monitor=bar
+            ).plain()
         found["logs"][str(log)] = scores
         tables[str(log)] = score_table(log.name, scores)
-        for part in (tables[str(log)], *scores["notes"]):
-            output.print(part)
+        output.print(tables[str(log)])
     write_json(path, found)
     write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)
     output.print(f"written to {path} and, for a browser, {page}")

@@ -42,10 +42,10 @@ def refine(
     path = map_path(source)
     refuse_overwriting(out, path)
     from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED
-    from semantic_mapper.replay.jobs import RefineRequest, refine_map
+    from semantic_mapper.replay.jobs import refine_map
 
     with frame_progress("refine", None, unit="tiles") as bar:
-        result = refine_map(RefineRequest(path, out, weights, fill, up, by_name), bar)
+        result = refine_map(path, out, weights, fill=fill, up=up, by_name=by_name, monitor=bar)
     report = result.report
 
     def percent(count: int) -> str:

@@ -56,7 +56,7 @@ def replay(
     """
     must_be_there(*source)
     from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
-    from semantic_mapper.replay.jobs import OFFLINE, ReplayRequest, replay_log
+    from semantic_mapper.replay.jobs import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)
     if not is_log(source[0]):
@@ -70,19 +70,11 @@ def replay(
         source, weights = [log], weights or (None if with_depth else COMPUTED_DEPTH)
     elif options.given:
         raise typer.BadParameter("a log is mapped as it is; options of films go with films", param_hint="SOURCE")
-    request = ReplayRequest(
-        source[0],
-        out,
-        weights,
-        config,
-        max_frames,
-        rerun=rerun,
-        corrections=corrections,
-        further_parts=tuple(source[1:]),
-    )
     with StopRequest() as stop:
         with frame_progress("replay", None, stop=stop) as bar:
-            summary = replay_log(request, bar).summary
+            summary = replay_log(
+                source, out, weights, config, max_frames, rerun=rerun, corrections=corrections, monitor=bar
+            ).summary
         show_replay(output, summary, out)
         output.json(summary)
         if stop:
@@ -106,13 +98,13 @@ def demo(
 
     Example: semantic-mapper demo --out runs/demo
     """
-    from semantic_mapper.replay.jobs import ReplayRequest, replay_log
+    from semantic_mapper.replay.jobs import replay_log
 
     began = time.monotonic()
     prepare_folder(out)
     with StopRequest() as stop:
         with frame_progress("map", None, stop=stop) as bar:
-            summary = replay_log(ReplayRequest(demo_log(), out, weights, mapper.load()), bar).summary
+            summary = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar).summary
         show_replay(output, summary, out)
         output.print(f"  {demo_log()}  (the log it was made from)")
         ended = "stopped after" if stop else "done in"

@@ -28,10 +28,7 @@ from semantic_mapper.replay.evaluate.report import score_table, write_eval_repor
 from semantic_mapper.replay.jobs import (
     OFFLINE,
     AutolabelRequest,
-    EvaluateRequest,
     FinetuneRequest,
-    RefineRequest,
-    ReplayRequest,
     autolabel_log,
     evaluate_log,
     finetune_log,
@@ -142,8 +139,7 @@ def read_settings(
 
 def _replay(job: Job) -> Findings:
     settings: LogSettings = job.settings
-    request = ReplayRequest(job.log, job.out, job.weights, _part(settings, MapperConfig), settings.max_frames)
-    result = replay_log(request)
+    result = replay_log(job.log, job.out, job.weights, _part(settings, MapperConfig), settings.max_frames)
     summary = result.summary
     metrics = {name: dig(summary, f"metrics.{name}") for name in (*_SCORES, "map_miou")}
     metrics |= {f"frames_{name}": count for name, count in summary["frames"].items()}
@@ -163,9 +159,8 @@ def _replay(job: Job) -> Findings:
 
 def _eval(job: Job) -> Findings:
     settings: LogSettings = job.settings
-    request = EvaluateRequest(job.log, job.weights, _part(settings, MapperConfig), settings.max_frames)
-    result = evaluate_log(request)
-    scores, name = result.scores, job.log.name
+    result = evaluate_log(job.log, job.weights, _part(settings, MapperConfig), settings.max_frames)
+    scores, name = result.plain(), job.log.name
     found: dict[str, Any] = {"replays": {}, "logs": {name: scores}}
     write_json(job.out / "eval.json", found)
     write_eval_report(job.out / "eval.html", {}, [], {name: score_table(name, scores)}, found)
@@ -174,11 +169,9 @@ def _eval(job: Job) -> Findings:
     metrics = {key: main.get(key) for key in (*_SCORES, "ece")}
     metrics |= {f"miou {method}": figures.get("miou") for method, figures in methods.items()}
     metrics |= {f"frames_{key}": scores[key] for key in ("scored", "excluded", "refused", "damaged", "pseudo_labelled")}
-    segments = result.evaluation.segments
     return Findings(
         metrics=metrics,
-        scores=tuple(_scores(method, f["per_class"], segments.get(method)) for method, f in methods.items()),
-        events=tuple(Event("note", note) for note in scores["notes"]),
+        scores=tuple(_scores(method, f["per_class"], result.segments.get(method)) for method, f in methods.items()),
     )
 
 
@@ -227,8 +220,8 @@ def _finetune(job: Job) -> Findings:
 
 def _refine(job: Job) -> Findings:
     settings: RefineSettings = job.settings
-    request = RefineRequest(job.log, job.out / "map.npz", job.weights, settings.fill, settings.up, settings.by_name)
-    report = refine_map(request).report
+    more = {"fill": settings.fill, "up": settings.up, "by_name": settings.by_name}
+    report = refine_map(job.log, job.out / "map.npz", job.weights, **more).report
     return Findings(metrics={name: getattr(report, name) for name in ("surface", "relabelled", "filled", "things")})
 
 

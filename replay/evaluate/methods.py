@@ -23,7 +23,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.evaluate.panoptic_truth import SEEN, PanopticTruth
+from semantic_mapper.replay.evaluate.things import SEEN, PanopticTruth
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.instance_images import thing_image
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
@@ -55,7 +55,7 @@ ThingTeller = Callable[[PosedFrame, UInt8], NDArray[np.uint16]]  # ids (H, W) of
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Metrics by method, and how many frames were scored, left out, and refused, or have pseudo labels.
+    """Metrics by method, and how many frames were scored, left out, and refused, have pseudo labels, or are damaged.
 
     In addition to the figures of ``SegmentationMetrics`` a method has ``ece``, ``sure`` (fraction of the pixels above a
     confidence of 0.9), ``sure_right`` (of those), and ``open_set_auroc`` where some labels are of classes that it
@@ -68,12 +68,13 @@ class Evaluation:
     excluded: int
     refused: int
     pseudo_labelled: int = 0
+    damaged: int = 0
+    weights: str = ""
     segments: Mapping[str, Segments] = field(default_factory=dict[str, Segments])  # by method, but for that of the map
 
     def plain(self) -> dict[str, Any]:
         """As plain data, without ``segments``."""
-        names = ("methods", "scored", "excluded", "refused", "pseudo_labelled")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in self.__slots__ if name != "segments"}
 
 
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
@@ -215,7 +216,7 @@ def evaluate_frames(
         methods[SEEN] = {**panoptic.score(voxel_map)}
         for name, figures in panoptic.score_methods().items():
             methods[name] |= figures
-    return Evaluation(methods, scored, excluded, refused, pseudo, segments)
+    return Evaluation(methods, scored, excluded, refused, pseudo, segments=segments)
 
 
 def _panoptic(tell: ThingTeller, frame: PosedFrame, opinion: Opinion) -> PanopticImage:

@@ -39,7 +39,7 @@ def write_eval_report(
         settings = {"Settings that were in force": json.dumps(summary.get("config"), indent=1)}
         sections.append(Section(name, notes(summary), pictures=pictures, folded=settings))
     for log, table in logs.items():
-        sections.append(Section(Path(log).name, found["logs"][log]["notes"], tables=[table]))
+        sections.append(Section(Path(log).name, tables=[table]))
     if found.get("surface"):
         rows = [
             (

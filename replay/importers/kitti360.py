@@ -19,34 +19,32 @@ from __future__ import annotations
 
 import re
 from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
+from semantic_mapper.drivers.calibration import Rectifier
+from semantic_mapper.errors import FrameError, ImportSourceError
 from semantic_mapper.geometry import check_pose, invert_pose, transform
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
-    LoadedFrame,
-    Skipped,
-    check_frame_pose,
-    image_size_must_be,
-    numbered_files,
+    check_label,
     read_bytes,
+    read_plane,
+)
+from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
+from semantic_mapper.replay.importers.tables import (
+    left_out_notice,
+    numbered_files,
     read_lines,
     read_numbers,
-    read_plane,
-    read_rgb,
     read_rows,
     split_row,
 )
-from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 CAMERAS = ("image_00", "image_01")
 SOURCE = "kitti360 "  # begins the name of the source of such logs, whose frames have the numbers of the drive
@@ -73,7 +71,7 @@ def _label_set() -> LabelSet:
 LABELS = _label_set()
 
 
-class Kitti360Recording:
+def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
     """A drive, opened; a frame for each image of the left camera and, where they are there, of the right one.
 
     Args:
@@ -83,145 +81,103 @@ class Kitti360Recording:
     Raises:
         ImportSourceError: calibration, images or poses are missing or cannot be understood.
     """
-
-    def __init__(self, folder: Path, options: ImportOptions) -> None:
-        self.notices: list[str] = []
-        root, drive = find_drive(folder)
-        self._drive_folder = root / "data_2d_raw" / drive
-        self._semantics = root / "data_2d_semantics" / "train" / drive
-        self._files = {
-            name: numbered_files(self._drive_folder / name / "data_rect", (".png",), self.notices) for name in CAMERAS
-        }
-        self._cameras = [name for name in CAMERAS if self._files[name]]
-        if not self._cameras:
-            where = self._drive_folder / CAMERAS[0] / "data_rect"
-            raise ImportSourceError(f"{where}: no rectified images; download 'Perspective Images' of this drive")
-        calibration = root / "calibration" / "perspective.txt"
-        self._intrinsics: dict[str, CameraIntrinsics] = {}
-        self._T_cam0_camera: dict[str, Float64] = {}
-        values = _read_calibration(calibration)
-        for name in self._cameras:
-            self._intrinsics[name], self._T_cam0_camera[name] = rectified_camera(values, name[-2:], calibration)
-        self._scans = root / "data_3d_raw" / drive / "velodyne_points" / "data"
-        self._T_cam0_scanner = _scanner_pose(root / "calibration", values) if self._scans.is_dir() else None
-        if self._T_cam0_scanner is None or options.without_depth:
-            self._T_cam0_scanner = None
-            self.notices.append(f"no laser scans of {self._scans}: frames come without depth")
-        self.depth_scale = DepthScale(1000.0, convention="depth comes from laser scans, in metres")
-        self._poses_file = root / "data_poses" / drive / "cam0_to_world.txt"
-        self._poses = self._read_poses()
-        self._stamps = self._read_stamps(options.frame_hz)
-        labelled = any((self._semantics / name / "semantic").is_dir() for name in self._cameras)
-        if not labelled:
-            self.notices.append(f"no labels: {self._semantics} has no semantic/; test drives have none")
-        # The two cameras fire together: the left one first, so that stamps never fall.
-        self._order = sorted((number, name) for name in self._cameras for number in self._files[name])
-        self.info = StreamInfo(
-            source=f"{SOURCE}{drive}",
-            cameras=self._intrinsics,
-            label_set=LABELS if labelled else None,
-            frame_count=len(self._order),
-            frame_hz=options.frame_hz or NOMINAL_HZ,
+    notices: list[str] = []
+    root, drive = find_drive(folder)
+    raw, semantics = root / "data_2d_raw" / drive, root / "data_2d_semantics" / "train" / drive
+    files = {name: numbered_files(raw / name / "data_rect", (".png",), notices) for name in CAMERAS}
+    cameras = [name for name in CAMERAS if files[name]]
+    if not cameras:
+        raise ImportSourceError(
+            f"{raw / CAMERAS[0] / 'data_rect'}: no rectified images; download 'Perspective Images' of this drive"
         )
+    calibration = _read_calibration(root / "calibration" / "perspective.txt")
+    rectified = {
+        name: _rectified_camera(calibration, name[-2:], root / "calibration" / "perspective.txt") for name in cameras
+    }
+    scans_folder = root / "data_3d_raw" / drive / "velodyne_points" / "data"
+    scans = numbered_files(scans_folder, (".bin",), notices)
+    if not scans:
+        notices.append(f"no laser scans of {scans_folder}: frames come without depth")
+    T_cam0_scanner = _scanner_pose(root / "calibration", calibration) if scans else np.eye(4)
+    poses_file = root / "data_poses" / drive / "cam0_to_world.txt"
+    poses = _read_poses(poses_file, notices)
+    labels = {name: numbered_files(semantics / name / "semantic", (".png",), notices) for name in cameras}
+    if not any(labels.values()):
+        notices.append(f"no labels: {semantics} has no semantic/; test drives have none")
 
-    def __len__(self) -> int:
-        return len(self._order)
-
-    def load(self, number: int) -> LoadedFrame:
-        """Read one frame.
-
-        Raises:
-            BadFrameError: it cannot be used.
-        """
-        index, camera = self._order[number]
-        file = self._files[camera][index]
-        pose = self._pose(index, camera)
-        rgb, encoded = read_rgb(file)
-        intrinsics = self._intrinsics[camera]
-        image_size_must_be(rgb, intrinsics, file)
-        label, label_error = None, None
-        if (self._semantics / camera / "semantic").is_dir():
-            try:
-                size = (intrinsics.height, intrinsics.width)
-                label = read_semantics(self._semantics / camera / "semantic" / f"{index:010d}.png", size)
-            except BadFrameError as error:
-                label_error = Skipped(error.file, error.reason, number, label_only=True)
-        frame = PosedFrame(
-            stamp_ns=self._stamp(index, camera),
-            seq=index,
-            camera_id=camera,
-            rgb=rgb,
-            depth_m=self._depth(index, camera),
-            label=label,
-            intrinsics=intrinsics,
-            T_world_camera=pose,
-        )
-        return LoadedFrame(frame, encoded, label_error)
-
-    def _pose(self, index: int, camera: str) -> Float64:
-        if index not in self._poses:
-            raise BadFrameError(self._poses_file, f"has no pose for image {index}; the drive has poses where it moved")
-        line, pose = self._poses[index]
-        return check_frame_pose(pose, self._poses_file, line) @ self._T_cam0_camera[camera]
-
-    def _depth(self, index: int, camera: str) -> Float32 | None:
-        """Depth image (H, W) of the scan of a frame; None without scans, and of a frame that has none."""
-        file = self._scans / f"{index:010d}.bin"
-        if self._T_cam0_scanner is None or not file.exists():
-            return None
-        T_camera_scanner = invert_pose(self._T_cam0_camera[camera]) @ self._T_cam0_scanner
-        return depth_of_scan(read_scan(file), T_camera_scanner, self._intrinsics[camera])
-
-    def _stamp(self, index: int, camera: str) -> int:
-        stamps = self._stamps.get(camera)
-        if stamps is None:
-            return round(index * 1e9 / self.info.frame_hz)
-        if index >= len(stamps):
-            file = self._drive_folder / camera / "timestamps.txt"
-            raise BadFrameError(file, f"has {len(stamps)} rows and so no time for image {index}")
-        line, text = stamps[index]
-        return _time_ns(text, self._drive_folder / camera / "timestamps.txt", line)
-
-    def _read_poses(self) -> dict[int, tuple[int, Float64]]:
-        poses: dict[int, tuple[int, Float64]] = {}
-        bad: list[str] = []
-        for line, text in read_lines(self._poses_file):
-            try:
-                index, *numbers = split_row(text)
-                T_world_cam0 = np.array([float(n) for n in numbers], np.float64).reshape(4, 4)
-                number = int(float(index))
-            except (ValueError, OverflowError) as error:
-                bad.append(f"line {line} ({error})")
-                continue
-            if number in poses:
-                self.notices.append(
-                    f"{self._poses_file}, line {line}: a second pose of image {number}; the first counts"
+    pictures: list[PosedPicture] = []
+    for name in cameras:
+        intrinsics, T_cam0_camera = rectified[name]
+        stamps = _read_stamps(raw / name / "timestamps.txt", max(files[name]) + 1, notices)
+        for number, file in files[name].items():
+            stamp, pose = stamps[number], poses.get(number)
+            if isinstance(stamp, BadFrameError):
+                pose = stamp
+            elif pose is None:
+                pose = BadFrameError(poses_file, f"has no pose for image {number}; the drive has poses where it moved")
+            else:
+                pose = pose @ T_cam0_camera
+            pictures.append(
+                PosedPicture(
+                    file,
+                    intrinsics,
+                    pose,
+                    None if isinstance(stamp, BadFrameError) else stamp,
+                    depth_file=scans.get(number),
+                    label_file=labels[name].get(number),
+                    seq=number,
+                    camera_id=name,
                 )
-            poses.setdefault(number, (line, T_world_cam0))
-        if not poses:
-            raise ImportSourceError(
-                f"{self._poses_file}: holds no pose: no row of a frame number and the 16 numbers of a 4x4 matrix"
-                f"{' (' + bad[0] + ')' if bad else ''}; poses.txt, with 12, is another file"
             )
-        if bad:
-            self.notices.append(f"{self._poses_file}: {counted(len(bad), 'row')} left out, no pose: {bad[0]}")
-        return poses
+    pictures.sort(key=lambda picture: (picture.seq, picture.camera_id))  # the two cameras fire together
 
-    def _read_stamps(self, frame_hz: float | None) -> dict[str, list[tuple[int, str]]]:
-        files = {name: self._drive_folder / name / "timestamps.txt" for name in self._cameras}
-        missing = [str(file) for file in files.values() if not file.exists()]
-        if missing or frame_hz is not None:
-            why = f"{missing[0]} is missing" if missing else "a rate is given"
-            self.notices.append(f"{why}: stamps are made up at {frame_hz or NOMINAL_HZ:g} frames a second")
-            return {}
-        stamps: dict[str, list[tuple[int, str]]] = {}
-        for name, file in files.items():
-            stamps[name] = read_rows(file, max(self._files[name]) + 1, self.notices)
-            # Of one form, so that their order is that of time.
-            texts = [text.strip() for _, text in stamps[name] if text]
-            if any(a >= b for a, b in pairwise(texts)):
-                self.notices.append(f"{file}: stamps go back, or are there twice")
-        return stamps
+    def read_depth(picture: PosedPicture, _: Rectifier) -> Float32:
+        assert picture.depth_file is not None
+        intrinsics, T_cam0_camera = rectified[picture.camera_id]
+        T_camera_scanner = invert_pose(T_cam0_camera) @ T_cam0_scanner
+        return depth_of_scan(_read_scan(picture.depth_file), T_camera_scanner, intrinsics)
+
+    return PosedPictures(
+        f"{SOURCE}{drive}",
+        pictures,
+        options,
+        DepthScale(1000.0, convention="depth comes from laser scans, in metres"),
+        notices,
+        hz=NOMINAL_HZ,
+        labels=LABELS if any(labels.values()) else None,
+        read_label=_read_semantics,
+        read_depth=read_depth,
+    )
+
+
+def _read_poses(file: Path, notices: list[str]) -> dict[int, Float64]:
+    """``T_world_cam0`` by the number of the image."""
+    poses: dict[int, Float64] = {}
+    bad: list[str] = []
+    for line, text in read_lines(file):
+        try:
+            index, *numbers = split_row(text)
+            T_world_cam0 = np.array([float(n) for n in numbers], np.float64).reshape(4, 4)
+            poses.setdefault(int(float(index)), T_world_cam0)
+        except (ValueError, OverflowError) as error:
+            bad.append(f"{file}, line {line}: {error}")
+    if not poses:
+        raise ImportSourceError(
+            f"{file}: holds no pose: no row of a frame number and the 16 numbers of a 4x4 matrix"
+            f"{' (' + bad[0] + ')' if bad else ''}; poses.txt, with 12, is another file"
+        )
+    notices += left_out_notice("pose", bad)
+    return poses
+
+
+def _read_stamps(file: Path, count: int, notices: list[str]) -> list[int | BadFrameError]:
+    """Of each image below ``count`` the stamp, or why there is none."""
+    if not file.exists():
+        notices.append(f"{file} is missing: stamps are made up at {NOMINAL_HZ:g} frames a second")
+        return [round(number * 1e9 / NOMINAL_HZ) for number in range(count)]
+    rows = read_rows(file, count)
+    missing = [BadFrameError(file, f"has {len(rows)} rows and so no time for image {n}") for n in range(count)]
+    return [*(_time_ns(text, file, line) for line, text in rows), *missing[len(rows) :]]
 
 
 def find_drive(folder: Path) -> tuple[Path, str]:
@@ -244,7 +200,7 @@ def find_drive(folder: Path) -> tuple[Path, str]:
     )
 
 
-def rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> tuple[CameraIntrinsics, Float64]:
+def _rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> tuple[CameraIntrinsics, Float64]:
     """Intrinsics of a rectified camera, and ``T_cam0_camera`` (4, 4): where it stands next to the left one.
 
     Args:
@@ -272,31 +228,24 @@ def rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> 
     return intrinsics, T_cam0_camera
 
 
-def read_semantics(file: Path, size: tuple[int, int]) -> UInt8:
+def _read_semantics(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt8:
     """Label image (H, W) with the ids of the data set; those of its category "void" become 0.
 
     Raises:
         BadFrameError: missing, damaged, of another size, or an id that the data set does not have.
     """
     ids = read_plane(file, "uint8", size, "label").astype(np.uint8)
-    ids[np.isin(ids, _VOID)] = LABELS.ignore_id
-    try:
-        LABELS.to_channels(ids, "label image")
-    except LabelError as error:
-        raise BadFrameError(file, str(error)) from error
-    return ids
+    ids[np.isin(ids, _VOID)] = labels.ignore_id
+    return check_label(ids, labels, file)
 
 
-def read_scan(file: Path) -> Float64:
+def _read_scan(file: Path) -> Float64:
     """Points (N, 3) of a scan, metres, in the scanner's axes.
 
     Raises:
         BadFrameError: it cannot be read, or does not hold four numbers a point.
     """
-    try:
-        data = read_bytes(file)
-    except OSError as error:
-        raise BadFrameError(file, f"the scan cannot be read ({error.strerror or error})") from error
+    data = read_bytes(file)
     if len(data) % 16:
         raise BadFrameError(file, f"a scan has 16 bytes a point, this one {len(data)} bytes; download it again")
     return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
@@ -363,11 +312,11 @@ def _read_calibration(file: Path) -> dict[str, list[float]]:
     return values
 
 
-def _time_ns(text: str, file: Path, line: int) -> int:
+def _time_ns(text: str, file: Path, line: int) -> int | BadFrameError:
     """``2013-05-28 08:46:02.904547200`` -> nanoseconds since 1970."""
     seconds, _, fraction = text.strip().replace("T", " ").partition(".")
     try:
         whole = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
         return int(whole.timestamp()) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
     except ValueError as error:
-        raise BadFrameError(file, f"line {line}: expected a date and a time: {error}") from error
+        return BadFrameError(file, f"line {line}: expected a date and a time: {error}")

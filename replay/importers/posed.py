@@ -1,118 +1,155 @@
-"""What importers of posed picture collections share: OpenGL axes, lenses that are undone, depth of another size, and
-where models of structure from motion lie, whose unit and axes are their own: by GPS, or upright by the cameras."""
+"""The reader that all formats of files fill in: posed pictures, with depth, labels, lenses and times."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import msgspec
 import numpy as np
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ConfigError, ImportSourceError
-from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
+    CAMERA_ID,
     BadFrameError,
     DepthScale,
     ImportOptions,
-    LoadedFrame,
     check_frame_pose,
-    inside,
-    numpy_notice,
     read_depth,
+    read_label,
     read_plane,
     read_rgb,
     same_view,
 )
-from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, place_by_gps, read_position
-from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, scene_depth, upright
+from semantic_mapper.replay.importers.tables import left_out_notice
+from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 KEPT_RECTIFIERS = 8  # of some megabytes each
 SHIFT_NS = 1_000_000  # between pictures of one time
 DEFAULT_HZ = 2.0  # at which pictures without times count as taken
 T_Z_UP_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of ARKit's world frame
 GL_AXES = np.diag((1.0, -1.0, -1.0, 1.0))  # T_gl_cv: OpenGL's cameras look along -z, with y up
+_SAME_PIXEL = 0.25  # px; pictures that are off by less are not resampled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedPicture:
-    """One picture of a collection.
+    """One picture of a recording.
 
     Args:
         file: The picture.
-        intrinsics: With distortion, as the collection gives them.
-        T_world_camera: (4, 4), OpenCV's axes.
-        depth_file: 16-bit PNG or NumPy's file, of any size with the same view; None = no depth.
+        intrinsics: With distortion, of the picture at any size.
+        pose: T_world_camera (4, 4), OpenCV's axes; or why the picture cannot be used.
         stamp_ns: None = not known.
+        depth_file: 16-bit PNG or NumPy's file, of any size with the same view; None = no depth.
         confidence_file: 8-bit PNG of the depth image's size, whose 0 means that the depth is not to be trusted.
+        sigma_file: The depth is computed, and this is its one-sigma spread.
+        label_file: 8-bit PNG of the picture's size.
+        pseudo_label: Weights have rendered the label image.
+        view: Another camera at the same place, to whose pixels picture and labels are brought; depth has them.
+        seq: Number of the frame in the log; None = its place in the recording.
+        camera_id: Name of the camera in the log.
     """
 
     file: Path
     intrinsics: CameraIntrinsics
-    T_world_camera: Float64
-    depth_file: Path | None = None
+    pose: Float64 | BadFrameError
     stamp_ns: int | None = None
+    depth_file: Path | None = None
     confidence_file: Path | None = None
+    sigma_file: Path | None = None
+    label_file: Path | None = None
+    pseudo_label: bool = False
+    view: CameraIntrinsics | None = None
+    seq: int | None = None
+    camera_id: str = CAMERA_ID
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedFrame:
+    """One frame of a recording.
+
+    Args:
+        frame: Ready for the log.
+        encoded_rgb: Its colour image as the file holds it; None where it had to be changed.
+        label_error: Why it has no label image although there is a file; None where all is well.
+    """
+
+    frame: PosedFrame
+    encoded_rgb: EncodedImage | None
+    label_error: BadFrameError | None = None
 
 
 class PosedPictures:
-    """A collection as a ``Recording``.
+    """The pictures of a recording; ``load`` may be called in any order.
 
     Args:
-        source: What it is, for people.
+        source: What the log names as its source.
         pictures: In their order; where each has a time, in that of the times.
-        options: See ``ImportOptions``; ``scale`` makes metres of a collection's own unit.
-        depth_scale: Of its depth images.
-        metric: Whether its lengths are metres.
+        options: See ``ImportOptions``; ``scale`` makes metres of poses in a unit of their own.
+        depth_scale: Of the depth images.
+        notices: What is to be said of the recording so far.
+        metric: Whether lengths are metres.
+        hz: About the rate of the pictures.
+        labels: Classes of the label images; None = there are none.
+        read_rgb: Reads a picture.
+        read_depth: Reads the depth image of a picture, in metres and in the pixels of its rectified image; None = by
+            ``depth_scale``, where its file is there.
+        read_label: Reads a label image of a size (height, width).
 
     Raises:
-        ImportSourceError: it holds no picture.
+        ImportSourceError: there is no picture.
     """
 
     def __init__(
         self,
         source: str,
-        folder: Path,
         pictures: Sequence[PosedPicture],
         options: ImportOptions,
-        *,
         depth_scale: DepthScale,
-        metric: bool,
+        notices: Sequence[str],
+        *,
+        metric: bool = True,
+        hz: float = DEFAULT_HZ,
+        labels: LabelSet | None = None,
+        read_rgb: Callable[[Path], tuple[UInt8, EncodedImage | None]] = read_rgb,
+        read_depth: Callable[[PosedPicture, Rectifier], Float32] | None = None,
+        read_label: Callable[[Path, LabelSet, tuple[int, int]], UInt8] = read_label,
     ) -> None:
         if not pictures:
-            raise ImportSourceError(f"{folder}: holds no posed picture")
-        self.notices: list[str] = []
-        self._options = options
-        self._hz = options.frame_hz or DEFAULT_HZ
-        self._pictures, self._stamps_ns = _in_time(_once_each(pictures, self.notices), self._hz, self.notices)
+            raise ImportSourceError(f"{source}: holds no posed picture")
+        self.notices = list(notices)
+        self.depth_scale = depth_scale
+        self._with_depth = not options.without_depth
+        self._read_rgb, self._read_depth, self._read_label = read_rgb, read_depth, read_label
+        self._pictures, self._stamps_ns = _in_time(_once_each(pictures, self.notices), hz, self.notices)
         self._factor = options.scale or 1.0
         self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
-        self.depth_scale = depth_scale
         metric = metric or options.scale is not None
         if not metric:
             self.notices.append(
                 "the scale is unknown: lengths of the log are not metres; give --scale, metres per unit of the poses"
             )
         named = [picture.depth_file for picture in self._pictures if picture.depth_file is not None]
-        missing = [] if options.without_depth else [file for file in named if not file.exists()]
-        if missing:
-            self.notices.append(f"{len(missing)} of {len(named)} depth images are missing; the first: {missing[0]}")
-        if not options.without_depth:
-            self.notices += numpy_notice(named, depth_scale)
-        first = self._rectifier(self._pictures[0].intrinsics, self._pictures[0].file)
+        missing = [str(file) for file in named if not file.exists()] if self._with_depth and read_depth is None else []
+        self.notices += left_out_notice("depth image", missing, "missing")
+        cameras = {
+            picture.camera_id: self._rectifier(picture.view or picture.intrinsics, picture.file).intrinsics
+            for picture in {picture.camera_id: picture for picture in reversed(self._pictures)}.values()
+        }
         self.info = StreamInfo(
-            source=f"{source} {folder.resolve().name}",
-            cameras={options.camera_id: first.intrinsics},
+            source=source,
+            cameras=dict(sorted(cameras.items())),
+            label_set=labels,
             frame_count=len(self._pictures),
-            frame_hz=self._hz,
+            frame_hz=hz,
             metadata={} if metric else {SCALE_KEY: SCALE_UNKNOWN},
         )
 
@@ -126,48 +163,55 @@ class PosedPictures:
             BadFrameError: it cannot be used.
         """
         picture = self._pictures[number]
-        rgb, encoded = read_rgb(picture.file)
-        height, width = rgb.shape[:2]
-        given = picture.intrinsics
-        if (given.width, given.height) != (width, height):
-            if not same_view((given.width, given.height), (width, height)):
-                raise BadFrameError(
-                    picture.file, f"the picture is {width}x{height}, its camera {given.width}x{given.height}"
-                )
-            given = scale_intrinsics(given, width, height)
-        rectifier = self._rectifier(given, picture.file)
-        changed = given.distorted
-        pose = picture.T_world_camera.copy()
+        if isinstance(picture.pose, BadFrameError):
+            raise picture.pose
+        pose = picture.pose.copy()
         pose[:3, 3] *= self._factor
+        check_frame_pose(pose, picture.file)
+        rgb, encoded = self._read_rgb(picture.file)
+        size = (rgb.shape[0], rgb.shape[1])
+        own = _at_size(picture, size)
+        lens = self._rectifier(picture.view or own, picture.file)
+        label, label_error = None, None
+        if picture.label_file is not None and self.info.label_set is not None:
+            try:
+                label = self._read_label(picture.label_file, self.info.label_set, size)
+            except BadFrameError as error:
+                label_error = error
+        changed = own.distorted or (picture.view is not None and _differs(own, picture.view))
+        if picture.view is not None and changed:
+            rgb = _in_view(rgb, own, picture.view, cv2.INTER_AREA)
+            label = None if label is None else _in_view(label, own, picture.view, cv2.INTER_NEAREST)
+        elif changed:
+            rgb = lens(np.ascontiguousarray(rgb[..., ::-1]))
+        depth = sigma = None
+        if picture.depth_file is not None and self._with_depth:
+            if self._read_depth is not None:
+                depth = self._read_depth(picture, lens)
+            elif picture.depth_file.exists():
+                depth = self._depth(picture.depth_file, lens, rgb, picture.confidence_file)
+        if picture.sigma_file is not None and depth is not None:
+            sigma = self._depth(picture.sigma_file, lens, rgb)
         frame = PosedFrame(
             stamp_ns=self._stamps_ns[number],
-            seq=number,
-            camera_id=self._options.camera_id,
-            rgb=rectifier(np.ascontiguousarray(rgb[..., ::-1])) if changed else rgb,
-            depth_m=self._depth(picture, rectifier, (height, width)),
-            label=None,
-            intrinsics=rectifier.intrinsics,
-            T_world_camera=check_frame_pose(pose, picture.file),
+            seq=number if picture.seq is None else picture.seq,
+            camera_id=picture.camera_id,
+            rgb=rgb,
+            depth_m=depth,
+            label=None if label is None else lens.nearest(label),
+            intrinsics=lens.intrinsics,
+            T_world_camera=pose,
+            depth_sigma_m=sigma,
+            label_is_pseudo=picture.pseudo_label and label is not None,
         )
-        return LoadedFrame(frame, None if changed else encoded)
+        return LoadedFrame(frame, None if changed else encoded, label_error)
 
-    def _depth(self, picture: PosedPicture, rectifier: Rectifier, size: tuple[int, int]) -> Float32 | None:
-        """Depth image (H, W) in metres, of the size and the lens of the picture; None without depth."""
-        if picture.depth_file is None or self._options.without_depth or not picture.depth_file.exists():
-            return None
-        depth_m = read_depth(picture.depth_file, self.depth_scale, None)
-        if picture.confidence_file is not None and picture.confidence_file.exists():
-            of = (depth_m.shape[0], depth_m.shape[1])
-            depth_m[read_plane(picture.confidence_file, "uint8", of, "confidence") == 0] = 0
-        if not same_view((depth_m.shape[0], depth_m.shape[1]), size):
-            raise BadFrameError(
-                picture.depth_file,
-                f"the depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, its picture {size[1]}x{size[0]}, which is "
-                "another form: register depth to the picture, or import without it (--topic depth=none)",
-            )
-        if depth_m.shape != size:
-            depth_m = np.asarray(cv2.resize(depth_m, size[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
-        return rectifier.nearest(depth_m)
+    def _depth(self, file: Path, lens: Rectifier, rgb: UInt8, confidence: Path | None = None) -> Float32:
+        """Depth, or its spread, (H, W) in metres, in the pixels of the rectified picture."""
+        depth_m = read_depth(file, self.depth_scale)
+        if confidence is not None and confidence.exists():
+            depth_m[read_plane(confidence, "uint8", (depth_m.shape[0], depth_m.shape[1]), "confidence") == 0] = 0
+        return lens.nearest(depth_of_size(depth_m, (rgb.shape[0], rgb.shape[1]), file))
 
     def _rectifier(self, intrinsics: CameraIntrinsics, file: Path) -> Rectifier:
         if intrinsics not in self._rectifiers:
@@ -180,100 +224,92 @@ class PosedPictures:
         return self._rectifiers[intrinsics]
 
 
-def _once_each(pictures: Sequence[PosedPicture], notices: list[str]) -> list[PosedPicture]:
-    """The pictures without those that are there before, and a sentence on what is odd about their order."""
-    first = {picture.file: picture for picture in reversed(pictures)}
-    kept = [picture for picture in pictures if first[picture.file] is picture]
-    if len(kept) < len(pictures):
-        again = next(picture.file for picture in pictures if first[picture.file] is not picture)
-        notices.append(
-            f"{len(pictures) - len(kept)} pictures are there twice; of each the first pose counts; the first: {again}"
+def _at_size(picture: PosedPicture, size: tuple[int, int]) -> CameraIntrinsics:
+    """Intrinsics of a picture of a size (height, width)."""
+    k, (height, width) = picture.intrinsics, size
+    if (k.width, k.height) == (width, height):
+        return k
+    if not same_view((k.width, k.height), (width, height)):
+        raise BadFrameError(
+            picture.file,
+            f"the image is {width}x{height}, the camera's intrinsics say {k.width}x{k.height}; resize it or fix the "
+            "intrinsics",
         )
-    return kept
+    return scale_intrinsics(k, width, height)
+
+
+def depth_of_size(depth_m: Float32, size: tuple[int, int], file: Path) -> Float32:
+    """Depth (H, W) of the size (height, width) of its picture, each pixel from the nearest one.
+
+    Raises:
+        BadFrameError: it shows another part of the view.
+    """
+    if depth_m.shape == size:
+        return depth_m
+    (rows, columns), (height, width) = depth_m.shape, size
+    if not same_view((rows, columns), size):
+        raise BadFrameError(
+            file,
+            f"the depth image is {columns}x{rows}, the colour image {width}x{height}, which is another form: register "
+            "depth to the colour image, or import without it (--topic depth=none)",
+        )
+    return np.asarray(cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def _differs(own: CameraIntrinsics, view: CameraIntrinsics) -> bool:
+    corners = np.array(((0, 0, 1), (view.width - 1, view.height - 1, 1)), np.float64)
+    moved = np.abs(corners @ _pixel_map(view, own).T - corners[:, :2]).max() > _SAME_PIXEL
+    return bool(moved) or (own.width, own.height) != (view.width, view.height)
+
+
+def _pixel_map(a: CameraIntrinsics, b: CameraIntrinsics) -> Float64:
+    """(2, 3) affine map from pixels of camera a to those of b, both in one point and turned alike."""
+    sx, sy = b.fx / a.fx, b.fy / a.fy
+    return np.array(((sx, 0, b.cx - sx * a.cx), (0, sy, b.cy - sy * a.cy)))
+
+
+def _in_view(image: UInt8, own: CameraIntrinsics, view: CameraIntrinsics, interpolation: int) -> UInt8:
+    """Colour or classes of a camera in the pixels of another one; classes outside are 0, unknown."""
+    size, border = (view.width, view.height), cv2.BORDER_CONSTANT
+    if interpolation == cv2.INTER_AREA:
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        own, interpolation, border = scale_intrinsics(own, *size), cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+        if not _differs(own, view):
+            return image
+    flags = interpolation | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(image, _pixel_map(view, own), size, flags=flags, borderMode=border), np.uint8)
+
+
+def _once_each(pictures: Sequence[PosedPicture], notices: list[str]) -> list[PosedPicture]:
+    """The pictures without those that are there before."""
+    first = {picture.file: picture for picture in reversed(pictures)}
+    again = [str(picture.file) for picture in pictures if first[picture.file] is not picture]
+    notices += left_out_notice("picture", again, "which are there twice: the first pose of each counts")
+    return [picture for picture in pictures if first[picture.file] is picture]
 
 
 def _in_time(pictures: Sequence[PosedPicture], hz: float, notices: list[str]) -> tuple[list[PosedPicture], list[int]]:
     """The pictures in the order of their times and their stamps, which are made up where not each has a time."""
-    timed = [(picture.stamp_ns, picture) for picture in pictures if picture.stamp_ns is not None]
-    if len(timed) < len(pictures):
-        why = (
-            f"{len(pictures) - len(timed)} of {len(pictures)} pictures have no time" if timed else "there are no times"
-        )
+    usable = [picture for picture in pictures if not isinstance(picture.pose, BadFrameError)]
+    missing = sum(picture.stamp_ns is None for picture in usable)
+    if missing:
+        why = "there are no times" if missing == len(usable) else f"{missing} of {len(usable)} pictures have no time"
         notices.append(f"{why}: stamps are made up at {hz:g} frames a second")
         return list(pictures), [round(number * 1e9 / hz) for number in range(len(pictures))]
-    if any(a > b for (a, _), (b, _) in pairwise(timed)):
+    times: list[int] = []
+    for picture in pictures:  # those that cannot be used stay behind the one before them
+        times.append(picture.stamp_ns if picture.stamp_ns is not None else (times or [0])[-1])
+    order = sorted(range(len(times)), key=times.__getitem__)
+    if order != list(range(len(times))):
         notices.append("the times of the pictures go back; pictures are sorted by them")
-        timed.sort(key=lambda pair: pair[0])
+    last: dict[str, int] = {}
     stamps_ns: list[int] = []
-    for stamp_ns, _ in timed:
-        stamps_ns.append(max(stamp_ns, stamps_ns[-1] + SHIFT_NS) if stamps_ns else stamp_ns)
-    shifted = sum(mine != given for mine, (given, _) in zip(stamps_ns, timed, strict=True))
+    for number in order:
+        camera = pictures[number].camera_id
+        stamps_ns.append(max(times[number], last.get(camera, -SHIFT_NS) + SHIFT_NS))
+        if not isinstance(pictures[number].pose, BadFrameError):
+            last[camera] = stamps_ns[-1]
+    shifted = sum(stamp != times[number] for stamp, number in zip(stamps_ns, order, strict=True))
     if shifted:
         notices.append(f"{counted(shifted, 'picture')} with the time of another one; stamps are put behind it by 1 ms")
-    return [picture for _, picture in timed], stamps_ns
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedModel:
-    """A model in the world of a log.
-
-    Args:
-        poses: (N, 4, 4) T_world_camera.
-        metric: Whether lengths are metres, but for a scale that is given.
-        notices: What is to be said of it.
-        metadata: Of the log.
-    """
-
-    poses: Float64
-    metric: bool
-    notices: list[str] = field(default_factory=list[str])
-    metadata: dict[str, str] = field(default_factory=dict[str, str])
-
-    def pictures(
-        self, source: str, folder: Path, pictures: list[PosedPicture], options: ImportOptions
-    ) -> PosedPictures:
-        """The recording, once its pictures, posed as in the model, are moved."""
-        moved = [replace(picture, T_world_camera=T) for picture, T in zip(pictures, self.poses, strict=True)]
-        scale = DepthScale(1000.0, convention=f"a model of {source} has no depth images")
-        opened = PosedPictures(source, folder, moved, options, depth_scale=scale, metric=self.metric)
-        opened.notices += self.notices
-        opened.info = msgspec.structs.replace(opened.info, metadata={**opened.info.metadata, **self.metadata})
-        return opened
-
-
-def has_picture(root: Path, name: str) -> bool:
-    """Whether a model's picture is in this folder; one whose name leads out of it, or cannot be one, is not."""
-    try:
-        return inside(root, name).is_file()
-    except (ImportSourceError, OSError):
-        return False
-
-
-def place_model(
-    poses: Float64, pictures: list[PosedPicture], options: ImportOptions, depth: Callable[[], float]
-) -> PosedModel:
-    """Place a model by the positions of its pictures if they have some and no scale is given, else upright.
-
-    Args:
-        poses: (N, 4, 4) T_model_camera.
-        pictures: Theirs.
-        options: Of the import.
-        depth: Tells the median depth of the model's points; 0 = it has none.
-    """
-    notices: list[str] = []
-    median = depth()
-    if options.scale is None:
-        try:
-            fit = place_by_gps(poses, [read_position(picture.file) for picture in pictures])
-        except ImportSourceError as error:
-            notices.append(f"GPS is not used: {error}")
-        else:
-            if fit is not None:
-                said = [f"scale, up and north: {fit}"]
-                moved = np.stack([fit.moved(pose) for pose in poses])
-                return PosedModel(moved, True, said, {ORIGIN_KEY: str(fit.origin), **scene_depth(fit.scale * median)})
-    posed = upright(poses[0], camera_up(poses)) @ poses
-    if options.scale is not None:
-        return PosedModel(posed, False, notices, scene_depth(options.scale * median))
-    posed[:, :3, 3] *= UNSCALED_DEPTH_M / median if median > 0 else 1.0
-    return PosedModel(posed, False, notices)
+    return [pictures[number] for number in order], stamps_ns

@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.geometry import interpolate_pose, invert_pose, pose_matrix
+from semantic_mapper.geometry import invert_pose, pose_matrix
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers.base import MATCH_NS
+from semantic_mapper.replay.importers.ros_bags import frame_name
+from semantic_mapper.replay.importers.tables import MAX_NORM_ERROR
+from semantic_mapper.replay.importers.tum import pose_at
 from semantic_mapper.types import Float64
 
 WORLD_FRAMES = ("map", "world", "odom")  # names of a world by REP 105 and habit, the preferred first
-MAX_NORM_ERROR = 0.1  # of a unit quaternion; more is no rotation
 MAX_GAP_NS = 1_000_000_000  # over a longer gap nothing is interpolated
 _SAME = 1e-3  # of a transform's entries; two that are published may differ by it
 # How two sources that take turns show, in poses whose unit is metres and radians (see Track.jump_m).
@@ -38,12 +41,11 @@ class Track:
         rows: tx ty tz qx qy qz qw of each.
 
     Attributes:
+        stamps_ns: (N,) rising.
         doubled: How many poses have the stamp of another one, and are different.
-        back: How often stamps go back.
     """
 
     def __init__(self, stamps_ns: list[int], rows: list[tuple[float, ...]]) -> None:
-        self.back = sum(b < a for a, b in pairwise(stamps_ns))
         stamps = np.array(stamps_ns, np.int64)
         order = np.argsort(stamps, kind="stable")
         self._all_stamps_ns: NDArray[np.int64] = stamps[order]
@@ -53,6 +55,10 @@ class Track:
         last = np.append(~again, [True] * bool(rows))
         self.stamps_ns: NDArray[np.int64] = self._all_stamps_ns[last]
         self._rows = self._all_rows[last]
+
+    def at(self, stamp_ns: int, within_ns: int = MATCH_NS) -> Float64 | None:
+        """Pose (4, 4) at a time, see ``pose_at``."""
+        return pose_at(stamp_ns, self.stamps_ns, self._rows, MAX_GAP_NS, within_ns)
 
     def jump_m(self) -> float:
         """How far the poses jump to and fro between two sources that take turns, in metres (or radians); 0 = not.
@@ -104,37 +110,6 @@ class Track:
         """Whether all poses are this one (4, 4)."""
         return all(_same(self._pose(i), T) for i in _some(np.arange(len(self._rows))))
 
-    def oddities(self, name: str) -> list[str]:
-        """Sentences on what is odd about the poses, for people."""
-        found: list[str] = []
-        if self.doubled:
-            found.append(f"{name}: {counted(self.doubled, 'pose')} with the stamp of another one; the last counts")
-        if self.back:
-            found.append(f"{name}: stamps go back {counted(self.back, 'time')}; poses are sorted by them")
-        return found
-
-    def at(self, stamp_ns: int, within_ns: int) -> Float64 | None:
-        """Pose (4, 4) at a time; None where there are no poses round it.
-
-        Args:
-            stamp_ns: When.
-            within_ns: How far before the first, after the last, or from one at a gap, the nearest still counts.
-        """
-        after = int(np.searchsorted(self.stamps_ns, stamp_ns))
-        before = after - 1
-        if after < len(self.stamps_ns) and self.stamps_ns[after] == stamp_ns:
-            return self._pose(after)
-        if before >= 0 and after < len(self.stamps_ns):
-            gap = int(self.stamps_ns[after] - self.stamps_ns[before])
-            if gap <= MAX_GAP_NS:
-                fraction = (stamp_ns - int(self.stamps_ns[before])) / gap
-                return interpolate_pose(self._pose(before), self._pose(after), fraction)
-        near = [i for i in (before, after) if 0 <= i < len(self.stamps_ns)]
-        best = min(near, key=lambda i: abs(int(self.stamps_ns[i]) - stamp_ns), default=None)
-        if best is None or abs(int(self.stamps_ns[best]) - stamp_ns) > within_ns:
-            return None
-        return self._pose(best)
-
     def _pose(self, index: int) -> Float64:
         return pose_matrix(self._rows[index, :3], self._rows[index, 3:])
 
@@ -149,13 +124,7 @@ class _Published:
     stamps_ns: list[int] = field(default_factory=list[int])
     rows: list[tuple[float, ...]] = field(default_factory=list[tuple[float, ...]])
     received_ns: list[int] = field(default_factory=list[int])
-    unstamped: int = 0
     track: Track | None = None
-
-    @property
-    def space(self) -> str:
-        """Namespace of the topic."""
-        return self.topic.rsplit("/", 1)[0]
 
     def contradicts(self, other: _Published) -> bool:
         """Whether both cannot be true."""
@@ -171,14 +140,10 @@ class _Published:
 
 
 class TransformTree:
-    """All transforms of a bag; ``close`` it once they are in.
-
-    Attributes:
-        refused: How many transforms were left out since they hold NaN or no rotation.
-    """
+    """All transforms of a bag; ``close`` it once they are in."""
 
     def __init__(self) -> None:
-        self.refused = 0
+        self._refused = 0  # transforms that hold NaN or no rotation
         self._published: dict[str, dict[str, _Published]] = {}  # by child and source
         self._parents: dict[str, set[str]] = {}
         self._fixed: dict[str, Float64] = {}
@@ -198,7 +163,7 @@ class TransformTree:
             row = pose_row(stamped.transform.translation, stamped.transform.rotation)
             child, parent = frame_name(stamped.child_frame_id), frame_name(stamped.header.frame_id)
             if row is None or not child or child == parent:
-                self.refused += 1
+                self._refused += 1
                 continue
             given = self._published.setdefault(child, {}).setdefault(source, _Published(topic))
             given.parents.add(parent)
@@ -207,60 +172,32 @@ class TransformTree:
                 if not any(_same(T, known) for known in given.fixed):
                     given.fixed.append(T)
             else:
-                stamp_ns = stamp_of(stamped.header)
-                given.stamps_ns.append(stamp_ns)
+                given.stamps_ns.append(stamp_of(stamped.header))
                 given.received_ns.append(received_ns)
                 given.rows.append(row)
 
-    def close(self, image: str) -> list[str]:
-        """Sort what was taken in; sentences on what is odd about it.
-
-        Args:
-            image: Topic of the images. Of two robots that give their frames the same names, the one in whose namespace
-                it is counts.
-        """
+    def close(self) -> list[str]:
+        """Sort what was taken in; sentences on what is odd about it."""
         notices: list[str] = []
-        for given in (given for sources in self._published.values() for given in sources.values()):
-            given.unstamped = fill_stamps(given.stamps_ns, given.received_ns)
-            given.track = Track(given.stamps_ns, given.rows) if given.rows else None
-        others = self._other_robots(image)
-        for space in sorted(others):
-            notices.append(f"transforms of {space}/tf are left out: {image} is not in its namespace")
+        if self._refused:
+            notices.append(f"{self._refused} transforms of tf are left out: they hold NaN or no rotation")
         for child, sources in self._published.items():
-            for source in [source for source, given in sources.items() if given.space in others]:
-                del sources[source]
+            stamps_ns: list[int] = []
+            rows: list[tuple[float, ...]] = []
             for given in sources.values():
                 self._parents.setdefault(child, set()).update(given.parents)
                 if given.fixed:
                     self._fixed[child] = given.fixed[-1]
-            moving = [given for given in sources.values() if given.track is not None]
-            if not moving:
-                continue
-            unstamped = sum(given.unstamped for given in moving)
-            self._tracks[child] = Track(
-                [ns for given in moving for ns in given.stamps_ns],
-                [row for given in moving for row in given.rows],
-            )
-            for given in moving:
-                notices += given.track.oddities(f"tf of '{child}'") if given.track is not None else []
-                given.stamps_ns, given.received_ns, given.rows = [], [], []
-            if unstamped:
-                notices.append(
-                    f"tf of '{child}': {counted(unstamped, 'pose')} without a stamp; the time of receipt stands for it"
-                )
+                if given.rows:
+                    notices += fill_stamps(given.stamps_ns, given.received_ns, f"tf of '{child}'")
+                    given.track = Track(given.stamps_ns, given.rows)
+                    notices += doubled_notice(given.track, f"tf of '{child}'")
+                    stamps_ns += given.stamps_ns
+                    rows += given.rows
+                    given.stamps_ns, given.received_ns, given.rows = [], [], []
+            if rows:
+                self._tracks[child] = Track(stamps_ns, rows)
         return notices
-
-    def _other_robots(self, image: str) -> set[str]:
-        """Namespaces whose transforms contradict those of a namespace that is nearer to the images'."""
-        others: set[str] = set()
-        for sources in self._published.values():
-            for a, b in combinations(sources.values(), 2):
-                rank = {
-                    given.space: len(given.space) if image.startswith(given.space + "/") else -1 for given in (a, b)
-                }
-                if len(set(rank.values())) == 2 and not others & set(rank) and a.contradicts(b):
-                    others.add(min(rank, key=lambda space: rank[space]))
-        return others
 
     def check(self, target: str, source: str) -> None:
         """Refuse two truths about a transform between two frames.
@@ -323,7 +260,7 @@ class TransformTree:
         """Whether the two frames are in one tree."""
         return self.way_up(a)[-1] == self.way_up(b)[-1]
 
-    def lookup(self, target: str, source: str, stamp_ns: int, within_ns: int) -> Float64 | None:
+    def lookup(self, target: str, source: str, stamp_ns: int, within_ns: int = MATCH_NS) -> Float64 | None:
         """``T_target_source`` (4, 4) at a time; None where tf tells nothing of that time, or the two do not meet."""
         up, down = self.way_up(source), self.way_up(target)
         meeting = next((frame for frame in up if frame in down), None)
@@ -347,27 +284,31 @@ class TransformTree:
         return T
 
 
-def frame_name(name: str) -> str:
-    """As ROS 2 writes it: ROS 1 begins some names with a slash."""
-    return name.lstrip("/")
-
-
 def stamp_of(header: Any) -> int:
     """Nanoseconds of a ``std_msgs/Header``."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-def fill_stamps(stamps_ns: list[int], received_ns: list[int]) -> int:
-    """Put the time of receipt where a stamp is 0, which no stamp is; returns how often.
+def fill_stamps(stamps_ns: list[int], received_ns: list[int], name: str) -> list[str]:
+    """Put the time of receipt where a stamp is 0, which no stamp is; a sentence on it, if need be.
 
     A simulated clock begins at 0, so there it is one.
     """
     if any(0 < stamp < received / 2 for stamp, received in zip(stamps_ns, received_ns, strict=True)):
-        return 0
+        return []
     missing = [i for i, stamp in enumerate(stamps_ns) if not stamp]
     for i in missing:
         stamps_ns[i] = received_ns[i]
-    return len(missing)
+    if not missing:
+        return []
+    return [f"{name}: {counted(len(missing), 'message')} without a stamp; the time of receipt stands for it"]
+
+
+def doubled_notice(track: Track, name: str) -> list[str]:
+    """A sentence on two poses of one stamp; empty without any."""
+    if not track.doubled:
+        return []
+    return [f"{name}: {counted(track.doubled, 'pose')} with the stamp of another one; the last counts"]
 
 
 def pose_row(position: Any, rotation: Any) -> tuple[float, ...] | None:

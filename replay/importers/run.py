@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,23 +18,19 @@ from semantic_mapper.replay.importers.base import (
     BadFrameError,
     ImportOptions,
     ImportReport,
-    LoadedFrame,
-    Recording,
     Skipped,
     read_bytes,
 )
-from semantic_mapper.replay.importers.colmap import open_colmap
-from semantic_mapper.replay.importers.folder import FolderRecording
-from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
-from semantic_mapper.replay.importers.opensfm import find_opensfm, open_opensfm
-from semantic_mapper.replay.importers.polycam import open_polycam
-from semantic_mapper.replay.importers.record3d import open_record3d
-from semantic_mapper.replay.importers.replica import ReplicaRecording
-from semantic_mapper.replay.importers.ros_files import is_bag
-from semantic_mapper.replay.importers.rosbag import RosbagRecording
-from semantic_mapper.replay.importers.scannet import ScanNetRecording
+from semantic_mapper.replay.importers.folder import open_folder
+from semantic_mapper.replay.importers.kitti360 import open_kitti360
+from semantic_mapper.replay.importers.models import find_opensfm, open_colmap, open_opensfm
+from semantic_mapper.replay.importers.phones import open_polycam, open_record3d
+from semantic_mapper.replay.importers.posed import LoadedFrame, PosedPictures
+from semantic_mapper.replay.importers.rooms import open_replica, open_scannet
+from semantic_mapper.replay.importers.ros_bags import is_bag
+from semantic_mapper.replay.importers.rosbag import open_rosbag
 from semantic_mapper.replay.importers.transforms import open_transforms
-from semantic_mapper.replay.importers.tum import TumRecording
+from semantic_mapper.replay.importers.tum import open_tum
 from semantic_mapper.replay.log.format import LogReader, LogWriter, atomic_log
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
@@ -43,13 +39,13 @@ from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 
-FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
-    "folder": FolderRecording,
-    "tum": TumRecording,
-    "scannet": ScanNetRecording,
-    "replica": ReplicaRecording,
-    "kitti360": Kitti360Recording,
-    "rosbag": RosbagRecording,
+FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {
+    "folder": open_folder,
+    "tum": open_tum,
+    "scannet": open_scannet,
+    "replica": open_replica,
+    "kitti360": open_kitti360,
+    "rosbag": open_rosbag,
     "polycam": open_polycam,
     "record3d": open_record3d,
     "transforms": open_transforms,
@@ -57,7 +53,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "opensfm": open_opensfm,
 }
 
-# What a folder of each format has, and no other.
+# What a folder of each format has, and no other. The other formats are known by what is in their files.
 _MARKS = {
     "folder": ("color", "poses.txt", "intrinsics.json"),
     "tum": ("rgb.txt", "groundtruth.txt"),
@@ -67,15 +63,10 @@ _MARKS = {
     "polycam": ("keyframes",),
     "record3d": ("rgb", "metadata.json"),
     "transforms": ("transforms.json",),
-    "colmap": ("sparse", "images"),
-    "opensfm": ("reconstruction.json", "images"),
-    "rosbag": ("metadata.yaml",),
 }
-_NOT_ENOUGH = ("colmap", "opensfm", "rosbag")  # formats that are known by what is in their files
 
 SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
 LISTED = 5  # recordings that an error names
-_SEE = "replay/importers/ says what each format consists of"
 _VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper replay` find them"
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
@@ -93,6 +84,9 @@ _FOLDERS = {
     "associations.txt": "has associations.txt, as ICL-NUIM: write its columns as rgb.txt and depth.txt ('stamp file'), "
     "the poses as groundtruth.txt, and intrinsics.json; where fy is negative, flip y in the poses",
     "rgbd": "is Record3D's own format, unpacked; export it on the phone as 'EXR + RGB'",
+    "traj.txt": "is a room of Replica as NICE-SLAM renders it, and only Semantic-NeRF's (with traj_w_c.txt) is read. "
+    "Rewrite it as a sequence folder: color/NNNNNN.jpg, depth/NNNNNN.png, poses.txt (the rows of traj.txt), "
+    "intrinsics.json (of cam_params.json, depth_scale is its scale)",
     "database.db": "has COLMAP's database, but no model; run the mapper, and name the folder that holds sparse/",
 }
 
@@ -113,9 +107,9 @@ def detect_format(src: Path) -> str:
         raise ImportSourceError(f"{src}: {_what_file(src)}")
     if not src.is_dir():
         raise ImportSourceError(f"{src}: is neither a file nor a folder; copy its content to one")
-    for name in _MARKS:
-        if name not in _NOT_ENOUGH and not _lacks(src, name):
-            return name
+    name = _by_marks(src)
+    if name is not None:
+        return name
     if find_models(src):
         return "colmap"
     if find_opensfm(src) is not None:
@@ -130,9 +124,12 @@ def is_recording(src: Path) -> bool:
     try:
         detect_format(src)
     except ImportSourceError:
-        marks = [n for n in _MARKS if n not in _NOT_ENOUGH]
-        return any(not _lacks(folder, n) for folder in src.iterdir() if folder.is_dir() for n in marks)
+        return any(_by_marks(folder) is not None for folder in src.iterdir() if folder.is_dir())
     return True
+
+
+def _by_marks(src: Path) -> str | None:
+    return next((name for name in _MARKS if not _lacks(src, name)), None)
 
 
 def _lacks(src: Path, name: str) -> list[str]:
@@ -142,40 +139,24 @@ def _lacks(src: Path, name: str) -> list[str]:
 
 def _what_folder(src: Path) -> str:
     """Why a folder is not imported."""
-    if (src / "traj.txt").exists() and (src / "results").is_dir():
-        return (
-            "is a room of Replica as NICE-SLAM renders it (results/frame*.jpg, traj.txt); only Semantic-NeRF's is "
-            "read (rgb/, depth/, traj_w_c.txt). Rewrite it as a sequence folder: color/NNNNNN.jpg, depth/NNNNNN.png, "
-            "poses.txt (the rows of traj.txt), intrinsics.json (of cam_params.json, depth_scale is its scale)"
-        )
-    for name, advice in _FOLDERS.items():
-        if (src / name).exists():
-            return advice
-    sequences = sorted(path.parent for path in src.glob("*/traj_w_c.txt"))
-    if sequences:
-        return f"is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}"
-    below = [
-        path
-        for path in sorted(src.iterdir())
-        if is_bag(path) or (path.is_dir() and any(not _lacks(path, n) for n in _MARKS))
-    ]
+    advice = next((_FOLDERS[name] for name in _FOLDERS if (src / name).exists()), None)
+    if advice is not None:
+        return advice
+    below = [p for p in sorted(src.iterdir()) if is_bag(p) or (p.is_dir() and _by_marks(p) is not None)]
     if below:
         return f"holds recordings; name one of them: {', '.join(map(str, below[:LISTED]))}"
     name = min(_MARKS, key=lambda n: len(_lacks(src, n)))
     if len(_lacks(src, name)) < len(_MARKS[name]):
-        return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}; {_SEE}"
-    known = "; ".join(f"{name} (lacks {', '.join(_lacks(src, name))})" for name in _MARKS)
-    return f"is no recording of a known format: {known}; {_SEE}"
+        return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}"
+    return f"is no recording of a known format ({', '.join(FORMATS)}); replay/importers/ says what each consists of"
 
 
 def _what_file(src: Path) -> str:
     """Why a file is not imported."""
     if src.suffix.lower() in _FILES:
         return _FILES[src.suffix.lower()]
-    if src.name in (mark for marks in _MARKS.values() for mark in marks):
-        return f"is a file of a recording; name its folder: {src.parent}"
     if src.suffix != LOG_SUFFIX:
-        return "is a file, not the folder of a recording"
+        return f"is a file, not the folder of a recording; the folder is perhaps {src.parent}"
     try:
         LogReader(src, allow_empty=True).close()
     except LogError:
@@ -231,28 +212,68 @@ def import_recording(
     info, changed = _changes(src, recording.info, options, renames or {})
     packing = codec or CodecOptions(depth_scale=recording.depth_scale.units_per_m)
 
+    result = _Result()
     with atomic_log(dst, info, options=packing, overwrite=overwrite) as writer:
         if name == "folder" and (src / AUTOLABEL_ATTACHMENT).is_file():
             _attach_note(src / AUTOLABEL_ATTACHMENT, writer)
         keep_files = codec is None and options.quarters % 4 == 0
-        tally = _copy(recording, writer, numbers, changed, on_progress, keep_files=keep_files)
+        for done, number in enumerate(numbers, 1):
+            try:
+                loaded = recording.load(number)
+                writer.write_frame(changed(loaded.frame), encoded_rgb=loaded.encoded_rgb if keep_files else None)
+            except BadFrameError as error:
+                result.skipped.append(Skipped(error.file, error.reason, number))
+            except (FrameError, CodecError) as error:
+                result.skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
+            else:
+                result.count(loaded, number)
+            if on_progress is not None:
+                on_progress(done, len(numbers))
         frames = writer.frames
         if frames == 0:
-            different = {s.reason: s for s in reversed(tally.skipped)}  # the first of each reason
+            different = {s.reason: s for s in reversed(result.skipped)}  # the first of each reason
             reasons = "; ".join(f"{s.file}: {s.reason}" for s in list(different.values())[::-1][:3])
             raise ImportSourceError(f"{src}: none of its {len(numbers)} frames can be used: {reasons}")
+    made = ((result.pseudo_labelled, "pseudo labels, which weights have rendered"), (result.computed, "computed depth"))
     return ImportReport(
         frames=frames,
-        labelled=tally.labelled,
-        with_depth=tally.with_depth,
+        labelled=result.labelled,
+        with_depth=result.with_depth,
         depth_scale=recording.depth_scale,
-        median_depth_m=tally.median_depth_m,
-        skipped=tuple(tally.skipped),
-        notices=(*recording.notices, *tally.notices),
+        median_depth_m=result.median_depth_m,
+        skipped=tuple(result.skipped),
+        notices=(
+            *recording.notices,
+            *(f"{counted(count, 'frame')} with {what}; marked in the log" for count, what in made if count),
+        ),
         format=name,
         info=info,
         bytes=dst.stat().st_size,
     )
+
+
+@dataclass(slots=True)
+class _Result:
+    """What is counted while frames are written."""
+
+    labelled: int = 0
+    pseudo_labelled: int = 0
+    computed: int = 0
+    with_depth: int = 0
+    median_depth_m: float = 0.0
+    skipped: list[Skipped] = dataclasses.field(default_factory=list[Skipped])
+
+    def count(self, loaded: LoadedFrame, number: int) -> None:
+        frame = loaded.frame
+        self.labelled += frame.label is not None and not frame.label_is_pseudo
+        self.pseudo_labelled += frame.label is not None and frame.label_is_pseudo
+        self.computed += frame.depth_sigma_m is not None
+        if loaded.label_error is not None:
+            self.skipped.append(Skipped(loaded.label_error.file, loaded.label_error.reason, number, label_only=True))
+        if frame.depth_m is not None and frame.depth_sigma_m is None:
+            self.with_depth += 1
+            if not self.median_depth_m and (frame.depth_m > 0).any():
+                self.median_depth_m = float(np.median(frame.depth_m[frame.depth_m > 0]))
 
 
 def _attach_note(file: Path, writer: LogWriter) -> None:
@@ -261,10 +282,7 @@ def _attach_note(file: Path, writer: LogWriter) -> None:
     Raises:
         ImportSourceError: it cannot be read, or is no such note.
     """
-    try:
-        note = LogAttachment(file.name, "application/json", read_bytes(file))
-    except OSError as error:
-        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    note = LogAttachment(file.name, "application/json", read_bytes(file))
     if read_note({file.name: note}) is None:
         raise ImportSourceError(f"{file}: does not say who rendered the pseudo labels; export the log again")
     writer.attach(note)
@@ -288,59 +306,3 @@ def _changes(
         return turned if turned.label is None else dataclasses.replace(turned, label=new_ids[turned.label])
 
     return msgspec.structs.replace(info, label_set=label_set), changed
-
-
-@dataclass(slots=True)
-class _Tally:
-    labelled: int = 0
-    pseudo_labelled: int = 0
-    computed_depth: int = 0
-    with_depth: int = 0
-    median_depth_m: float = 0.0
-    skipped: list[Skipped] = dataclasses.field(default_factory=list[Skipped])
-
-    @property
-    def notices(self) -> list[str]:
-        """On what people and sensors have not made."""
-        found = (
-            (self.pseudo_labelled, "pseudo labels, which weights have rendered"),
-            (self.computed_depth, "computed depth"),
-        )
-        return [f"{counted(count, 'frame')} with {what}; marked in the log" for count, what in found if count]
-
-    def count(self, loaded: LoadedFrame) -> None:
-        frame = loaded.frame
-        self.labelled += frame.label is not None and not frame.label_is_pseudo
-        self.pseudo_labelled += frame.label is not None and frame.label_is_pseudo
-        self.computed_depth += frame.depth_sigma_m is not None
-        if loaded.label_error is not None:
-            self.skipped.append(loaded.label_error)
-        if frame.depth_m is not None and frame.depth_sigma_m is None:
-            self.with_depth += 1
-            if not self.median_depth_m and (frame.depth_m > 0).any():
-                self.median_depth_m = float(np.median(frame.depth_m[frame.depth_m > 0]))
-
-
-def _copy(
-    recording: Recording,
-    writer: LogWriter,
-    numbers: Sequence[int],
-    changed: Callable[[PosedFrame], PosedFrame],
-    on_progress: Callable[[int, int], None] | None,
-    *,
-    keep_files: bool,
-) -> _Tally:
-    tally = _Tally()
-    for done, number in enumerate(numbers, 1):
-        try:
-            loaded = recording.load(number)
-            writer.write_frame(changed(loaded.frame), encoded_rgb=loaded.encoded_rgb if keep_files else None)
-        except BadFrameError as error:
-            tally.skipped.append(Skipped(error.file, error.reason, number))
-        except (FrameError, CodecError) as error:
-            tally.skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
-        else:
-            tally.count(loaded)
-        if on_progress is not None:
-            on_progress(done, len(numbers))
-    return tally

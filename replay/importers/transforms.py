@@ -16,10 +16,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,39 +26,36 @@ import numpy as np
 from semantic_mapper.drivers.lens import is_fisheye_model, lens_intrinsics
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.files import numeric_order
-from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.importers.base import (
-    BadFrameError,
-    DepthScale,
-    ImportOptions,
+from semantic_mapper.replay.importers.base import BadFrameError, DepthScale, ImportOptions, first_size
+from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures
+from semantic_mapper.replay.importers.tables import (
     convert_known,
-    first_size,
     inside,
+    left_out_notice,
     read_plain_json,
     refuse_keys,
-    unknown_keys,
     unknown_notice,
 )
-from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
 
 FILE = "transforms.json"
-MAX_BYTES = 1 << 29  # hours of frames at 60 Hz
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # Blender's data sets leave them out
 _NEUTRAL = (  # they turn or fit the world, or are of training
     "aabb_scale", "orientation_override", "auto_scale_poses_override", "enable_depth_loading",
 )  # fmt: skip
-_OTHER_AXES = ("from_mitsuba", "from_na")  # instant-ngp's flags for poses of another convention
-_OTHER_LENS = re.compile(r"latlong|equirectangular|orthographic|ftheta\w*|distortion_params")  # instant-ngp, nerfstudio
-_AXES = re.compile(r"(camera_|world_)?(coordinate_system|coordinate_convention|convention|axes)", re.IGNORECASE)
+# Lenses of instant-ngp and nerfstudio that are not undone, and poses in other axes or units than nerfstudio's.
+_REFUSED = re.compile(
+    r"latlong|equirectangular|orthographic|ftheta\w*|distortion_params|from_mitsuba|from_na|units?"
+    r"|(camera_|world_)?(coordinate_system|coordinate_convention|convention|axes)"
+)
+_OUR_AXES = ("opengl", "blender", "nerf", "nerfstudio", "arkit")
+_BELIEVABLE_S = (1e-3, 10.0)  # between two frames
 
 
 class _Lens(msgspec.Struct, kw_only=True):
     """Of a frame, or of all of them."""
 
     camera_model: str | None = None
-    lens_model: str | None = None
-    distortion_model: str | None = None
     is_fisheye: bool | None = None
     camera_angle_x: float | None = None
     camera_angle_y: float | None = None
@@ -95,10 +91,6 @@ class _Transforms(_Lens, kw_only=True):
     integer_depth_scale: float | None = None
     applied_scale: float | None = None  # of nerfstudio: what poses were multiplied by
     applied_transform: list[list[float]] | None = None  # what they were moved by
-    units: str | None = None  # of the poses
-    unit: str | None = None
-    from_mitsuba: bool | None = None
-    from_na: bool | None = None
 
 
 def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -108,171 +100,93 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
         ImportSourceError: the file is missing or of another form, or a lens that cannot be undone.
     """
     file = folder / FILE
-    plain = cast("dict[str, Any]", read_plain_json(file, MAX_BYTES))
-    found = convert_known(plain, _Transforms, str(file))
-    for name in _OTHER_AXES:
-        if getattr(found, name):
-            raise ImportSourceError(f"{file}: '{name}' means poses in other axes than OpenGL's, which are not read")
-    refuse_keys(plain, _OTHER_LENS, str(file))
-    axes = _camera_axes(plain, file)
+    plain = {key: value for key, value in read_plain_json(file).items() if value not in _OUR_AXES}
+    found = convert_known(plain, _Transforms, file)
+    refuse_keys(plain, _REFUSED, file)
+    notices = unknown_notice(file, [plain], _Transforms, _NEUTRAL) + unknown_notice(file, found.frames, _Frame)
     left_out: list[str] = []
-    frames: list[tuple[int, _Frame]] = []
+    frames: list[_Frame] = []
+    images: list[Path] = []
     for number, frame in enumerate(found.frames):
         try:
-            refuse_keys(frame, _OTHER_LENS, f"{file}, frame {number}")
-            frames.append((number, convert_known(frame, _Frame, f"{file}, frame {number}")))
+            refuse_keys(frame, _REFUSED, f"{file}, frame {number}")
+            frames.append(convert_known(frame, _Frame, f"{file}, frame {number}"))
+            images.append(_image(folder, frames[-1].file_path))
         except ImportSourceError as error:
             left_out.append(str(error))
-    notices = unknown_notice(
-        file,
-        [
-            *unknown_keys([{k: v for k, v in plain.items() if not _AXES.fullmatch(k)}], _Transforms, _NEUTRAL),
-            *unknown_keys(found.frames, _Frame),
-        ],
-    )
-    size = _common_size(folder, found, [frame for _, frame in frames])
+            frames = frames[: len(images)]
+    size = None if found.w is not None and found.h is not None else first_size(images)
+    stamps_ns = _stamps([_time(frame) for frame in frames], file, notices)
+    factor = _metres_per_unit(found, file, notices) if options.scale is None else 1.0
     pictures: list[PosedPicture] = []
-    stamps_ns = _stamps([_time(frame) for _, frame in frames], file, notices)
-    metres = _metres_per_unit(found, file, notices) if options.scale is None else None
-    for (number, frame), stamp_ns in zip(frames, stamps_ns, strict=True):
+    for frame, image, stamp_ns in zip(frames, images, stamps_ns, strict=True):
         try:
-            where = f"{file}, frame {number} ('{frame.file_path[:80]}')"
-            pictures.append(_picture(folder, found, frame, size, axes, stamp_ns, where))
+            lens, pose = _intrinsics(found, frame, size, image), _pose(frame.transform_matrix, image)
+            pose[:3, 3] *= factor
+            depth = frame.depth_file_path or frame.depth_path
+            pictures.append(PosedPicture(image, lens, pose, stamp_ns, inside(folder, depth) if depth else None))
         except ImportSourceError as error:
             left_out.append(str(error))
-    if left_out:
-        notices.append(f"{counted(len(left_out), 'frame')} of {len(found.frames)} left out; the first: {left_out[0]}")
-    if not pictures and left_out:
-        raise ImportSourceError(f"{folder}: holds no posed picture: {left_out[0]}")
+    notices += left_out_notice("frame", left_out)
+    if not pictures:
+        raise ImportSourceError("; ".join((f"{folder}: holds no posed picture", *left_out[:1])))
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
-    if metres is not None:
-        for picture in pictures:
-            picture.T_world_camera[:3, 3] *= metres
-    scale, measured, said = _depth_scale(file, found, [frame for _, frame in frames], pictures, options, metres or 1.0)
-    opened = PosedPictures(
-        "transforms",
-        folder,
-        pictures,
-        options,
-        depth_scale=scale,
-        metric=measured or bool(_unit(found)),
-    )
-    opened.notices += [*notices, *said]
-    return opened
+    scale = _depth_scale(file, found, frames, options, factor)
+    has_sensor = any(frame.depth_file_path for frame in frames) and not options.without_depth
+    if has_sensor and options.scale is not None:
+        notices.append(
+            f"--scale {options.scale:g} is of the poses; the depth images keep their own unit: {scale}; if depth has "
+            f"the unit of the poses, multiply depth_unit_scale_factor by {options.scale:g}, too"
+        )
+    return PosedPictures(f"transforms {folder.resolve().name}", pictures, options, scale, notices, metric=has_sensor)
 
 
 def _depth_scale(
-    file: Path,
-    found: _Transforms,
-    frames: Sequence[_Frame],
-    pictures: Sequence[PosedPicture],
-    options: ImportOptions,
-    multiplied: float,
-) -> tuple[DepthScale, bool, list[str]]:
-    """Of the depth images, whether there is one that makes the poses metres, and what is to be said of them.
-
-    ``multiplied`` is what the positions of the file were multiplied by already.
-    """
-    there = [
-        picture.depth_file for picture in pictures if picture.depth_file is not None and picture.depth_file.is_file()
-    ]
-    if any(frame.depth_path and not frame.depth_file_path for frame in frames):
-        if any(frame.depth_file_path for frame in frames):
-            raise ImportSourceError(f"{file}: has depth_file_path and depth_path, of two units; keep one of them")
-        factor = found.integer_depth_scale or 0.0
-        if not 0 < factor < 1e3:
-            if options.without_depth:
-                return DepthScale(1000.0, convention="not read"), False, []
+    file: Path, found: _Transforms, frames: Sequence[_Frame], options: ImportOptions, factor: float
+) -> DepthScale:
+    """Of the depth images; ``factor`` is what the positions of the file were multiplied by."""
+    if any(f.depth_path and not f.depth_file_path for f in frames) and not options.without_depth:  # of instant-ngp
+        unit = (found.integer_depth_scale or 0.0) * (options.scale or 1.0) * factor  # depth follows the poses
+        if not 0 < unit < 1e3:
             raise ImportSourceError(
                 f"{file}: depth_path needs integer_depth_scale, the unit of the poses per number of the depth images; "
                 "write it, or import without depth (--topic depth=none)"
             )
-        units = 1 / (factor * (options.scale or 1.0) * multiplied)  # depth in the unit of the poses follows them
-        return DepthScale(units, file, float_units_per_m=units), False, []
-    factor = 0.001 if found.depth_unit_scale_factor is None else found.depth_unit_scale_factor
-    if not 0 < factor < 1e3:
-        raise ImportSourceError(f"{file}: depth_unit_scale_factor {factor:g} cannot be")
-    said: list[str] = []
-    scale = DepthScale(1 / factor, file, float_units_per_m=1 / factor)
-    if found.depth_unit_scale_factor is None:
-        scale = DepthScale(
+        return DepthScale(1 / unit, file, float_units_per_m=1 / unit)
+    unit = found.depth_unit_scale_factor
+    if unit is None:
+        return DepthScale(
             1000.0, convention="nerfstudio's millimetres; another unit belongs into depth_unit_scale_factor"
         )
-    measured = bool(there) and not options.without_depth
-    if measured and options.scale is not None:
-        said.append(
-            f"--scale {options.scale:g} is of the poses; the depth images keep their own unit: {scale}; if depth has "
-            f"the unit of the poses, multiply depth_unit_scale_factor by {options.scale:g}, too"
-        )
-    return scale, measured, said
+    if not 0 < unit < 1e3:
+        raise ImportSourceError(f"{file}: depth_unit_scale_factor {unit:g} cannot be")
+    return DepthScale(1 / unit, file, float_units_per_m=1 / unit)
 
 
-def _camera_axes(plain: Mapping[str, Any], file: Path) -> Float64:
-    """``T_given_cv`` (4, 4): OpenGL's axes, unless a key says OpenCV's.
-
-    Raises:
-        ImportSourceError: a key names other axes.
-    """
-    for key, value in plain.items():
-        if isinstance(value, str) and _AXES.fullmatch(key):
-            if value.strip().lower() in ("opencv", "colmap"):
-                return np.eye(4)
-            if value.strip().lower() not in ("opengl", "blender", "nerf", "nerfstudio", "arkit", ""):
-                raise ImportSourceError(f"{file}: '{key}' is '{value[:40]}'; camera axes of OpenGL and OpenCV are read")
-    return GL_AXES
-
-
-def _common_size(folder: Path, found: _Transforms, frames: Sequence[_Frame]) -> tuple[int, int] | None:
-    """(width, height) of the first picture that can be read, for files that do not tell it; None = none."""
-    if found.w is not None and found.h is not None:
-        return None
-
-    def images() -> Iterator[Path]:
-        for frame in frames:
-            with suppress(ImportSourceError):  # reported when its turn comes
-                yield _image(folder, frame)
-
-    return first_size(images())
-
-
-def _image(folder: Path, frame: _Frame) -> Path:
-    named = inside(folder, frame.file_path)
+def _image(folder: Path, name: str) -> Path:
+    named = inside(folder, name)
     return next((p for s in _SUFFIXES if (p := named.with_name(named.name + s)).is_file()), named)
 
 
-_UNITS = {
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
-    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 0.01),
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 0.001),
-}
-_BELIEVABLE_S = (1e-3, 10.0)  # between two frames
-
-
-def _unit(found: _Transforms) -> str:
-    return (found.units or found.unit or "").strip().lower()
-
-
-def _metres_per_unit(found: _Transforms, file: Path, notices: list[str]) -> float | None:
-    """What makes translations those that they were before a program has scaled them, in metres; None = nothing.
+def _metres_per_unit(found: _Transforms, file: Path, notices: list[str]) -> float:
+    """What makes positions those that they were before nerfstudio has scaled them.
 
     Raises:
-        ImportSourceError: a unit that is not known, or a scale that cannot be.
+        ImportSourceError: a scale that cannot be.
     """
-    unit, scale = _unit(found), found.applied_scale or 1.0
-    if unit and unit not in _UNITS:
-        raise ImportSourceError(f"{file}: the unit '{unit[:40]}' is not known, only m, cm and mm; convert the poses")
+    scale = found.applied_scale or 1.0
     if found.applied_transform is not None:
-        A = np.array(found.applied_transform, np.float64)
-        if A.shape not in ((3, 4), (4, 4)) or not np.linalg.det(A[:3, :3]) > 1e-9:
-            raise ImportSourceError(f"{file}: applied_transform is no rotation with a scale")
-        scale *= float(np.cbrt(np.linalg.det(A[:3, :3])))
+        try:
+            determinant = float(np.linalg.det(np.array(found.applied_transform, np.float64)[:3, :3]))
+        except (ValueError, IndexError, np.linalg.LinAlgError):
+            determinant = 0.0
+        scale *= float(np.cbrt(determinant))
     if not 1e-6 < scale < 1e6:
         raise ImportSourceError(f"{file}: a scale of {scale:g} (applied_scale, applied_transform) cannot be")
-    factor = _UNITS.get(unit, 1.0) / scale
-    if abs(factor - 1) < 1e-6:
-        return None
-    notices.append(f"{file}: positions are multiplied by {factor:g}, as units, applied_scale and applied_transform say")
-    return factor
+    if abs(scale - 1) < 1e-6:
+        return 1.0
+    notices.append(f"{file}: positions are multiplied by {1 / scale:g}, as applied_scale and applied_transform say")
+    return 1 / scale
 
 
 def _time(frame: _Frame) -> float | None:
@@ -300,84 +214,62 @@ def _stamps(times: Sequence[float | None], file: Path, notices: list[str]) -> li
     return [None if t is None or t * unit_ns >= MAX_STAMP_NS else round(t * unit_ns) for t in times]
 
 
-def _picture(
-    folder: Path,
-    all_frames: _Transforms,
-    frame: _Frame,
-    size: tuple[int, int] | None,
-    axes: Float64,
-    stamp_ns: int | None,
-    where: str,
-) -> PosedPicture:
-    image = _image(folder, frame)
-    T_world_gl = _matrix(frame.transform_matrix, image)
-    depth = frame.depth_file_path or frame.depth_path
-    lens = _intrinsics(all_frames, frame, size, where)
-    return PosedPicture(image, lens, T_world_gl @ axes, None if not depth else inside(folder, depth), stamp_ns)
-
-
-def _matrix(rows: list[list[float]] | None, image: Path) -> Float64:
-    if rows is None:
-        raise BadFrameError(image, "has no transform_matrix")
+def _pose(rows: list[list[float]] | None, image: Path) -> Float64:
+    """``T_world_camera`` (4, 4)."""
     try:
-        T = np.array(rows, np.float64)
-    except ValueError as error:
-        raise BadFrameError(image, f"transform_matrix has to be 4x4 numbers: {error}") from error
+        T = np.array(rows if rows is not None else [], np.float64)
+    except ValueError:
+        T = np.zeros(0)
     if T.shape == (3, 4):
         T = np.vstack((T, (0, 0, 0, 1)))
     if T.shape != (4, 4):
-        raise BadFrameError(image, f"transform_matrix has to be 4x4 numbers: it is {'x'.join(map(str, T.shape))}")
-    return T
+        raise BadFrameError(image, "has no transform_matrix of 4x4 numbers")
+    return T @ GL_AXES
 
 
-def _intrinsics(all_frames: _Lens, frame: _Lens, size: tuple[int, int] | None, where: str) -> CameraIntrinsics:
-    values = {name: own if own is not None else getattr(all_frames, name) for name, own in _fields(frame).items()}
-    width, height = values["w"], values["h"]
-    if width is None or height is None:
+def _intrinsics(of_all: _Lens, frame: _Frame, size: tuple[int, int] | None, image: Path) -> CameraIntrinsics:
+    own, shared = _given(frame), _given(of_all)
+    k: dict[str, Any] = {**shared, **own}
+    if "w" not in k or "h" not in k:
         if size is None:
-            raise ImportSourceError(f"{where}: has no w and h, and no picture that tells them")
-        width, height = size
-    own_fx, own_fy = (
-        frame.fl_x or _focal(_angle(frame.camera_angle_x, frame.x_fov), width),
-        frame.fl_y or _focal(_angle(frame.camera_angle_y, frame.y_fov), height),
-    )
-    angles = (
-        _angle(all_frames.camera_angle_x, all_frames.x_fov),
-        _angle(all_frames.camera_angle_y, all_frames.y_fov),
-    )
-    fx = own_fx or all_frames.fl_x or _focal(angles[0], width)
-    fy = own_fy or (None if own_fx else all_frames.fl_y or _focal(angles[1], height))
+            raise BadFrameError(image, "has no w and h, and no picture tells them")
+        k |= {"w": size[0], "h": size[1]}
+    (fx, fy), (all_fx, all_fy) = _focals(own, k), _focals(shared, k)
+    fx, fy = (fx, fy) if fx or fy else (all_fx, all_fy)
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
-        raise ImportSourceError(f"{where}: has no focal length: fl_x, or camera_angle_x")
-    cx = width / 2 if values["cx"] is None else values["cx"]
-    cy = height / 2 if values["cy"] is None else values["cy"]
-    k1, k2, k3, k4, p1, p2 = (values[name] or 0.0 for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = values["camera_model"] or values["lens_model"] or values["distortion_model"] or "OPENCV"
-    if values["is_fisheye"] or is_fisheye_model(model):
-        model, lens, left = "OPENCV_FISHEYE", (k1, k2, k3, k4), {"p1": p1, "p2": p2}
-    else:
-        lens, left = (k1, k2, p1, p2, k3), {"k4": k4}
-    left |= {name: values[name] or 0.0 for name in ("k5", "k6")}
-    strange = [name for name, value in left.items() if value]
+        raise BadFrameError(image, "has no focal length: fl_x, or camera_angle_x")
+    model = k.get("camera_model", "OPENCV")
+    lens, other = ("k1", "k2", "p1", "p2", "k3"), ("k4", "k5", "k6")
+    if k.get("is_fisheye") or is_fisheye_model(model):
+        model, lens, other = "OPENCV_FISHEYE", ("k1", "k2", "k3", "k4"), ("p1", "p2", "k5", "k6")
+    strange = [name for name in other if k.get(name)]
     if strange:
-        raise ImportSourceError(
-            f"{where}: camera_model '{model}' has no {', '.join(strange)} that programs agree on; undistort the images "
-            "first"
+        raise BadFrameError(
+            image,
+            f"camera_model '{model}' has no {', '.join(strange)} that programs agree on; undistort the images first",
         )
+    centre = k.get("cx", k["w"] / 2) - 0.5, k.get("cy", k["h"] / 2) - 0.5
     try:
-        return lens_intrinsics(model, lens, (fx, fy, cx - 0.5, cy - 0.5), (int(width), int(height)))
+        return lens_intrinsics(
+            model, [k.get(name, 0.0) for name in lens], (fx, fy, *centre), (int(k["w"]), int(k["h"]))
+        )
     except (ConfigError, FrameError) as error:
-        raise ImportSourceError(f"{where}: {error}") from error
+        raise BadFrameError(image, str(error)) from error
 
 
-def _fields(lens: _Lens) -> Mapping[str, Any]:
-    return {name: getattr(lens, name) for name in _Lens.__struct_fields__}
+def _given(lens: _Lens) -> dict[str, Any]:
+    values = {name: getattr(lens, name) for name in _Lens.__struct_fields__}
+    return {name: value for name, value in values.items() if value is not None}
 
 
-def _angle(radians: float | None, degrees: float | None) -> float | None:
-    return radians if radians is not None or degrees is None else math.radians(degrees)
+def _focals(lens: Mapping[str, Any], k: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """fx and fy of what a frame, or the file, says of them."""
 
+    def focal(name: str, side: float) -> float | None:
+        if lens.get(f"fl_{name}"):
+            return lens[f"fl_{name}"]
+        angle = lens.get(f"camera_angle_{name}", math.radians(lens.get(f"{name}_fov", 0.0)))
+        return side / 2 / math.tan(angle / 2) if 0 < angle < math.pi else None
 
-def _focal(angle: float | None, side: float) -> float | None:
-    return side / 2 / math.tan(angle / 2) if angle is not None and 0 < angle < math.pi else None
+    return focal("x", k["w"]), focal("y", k["h"])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +17,8 @@ import numpy as np
 
 from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
-from semantic_mapper.files import decode_text, numeric_order, read_regular
+from semantic_mapper.files import numeric_order, read_regular
 from semantic_mapper.geometry import invert_pose, pose_matrix
-from semantic_mapper.plain_text import counted
 from semantic_mapper.types import CameraIntrinsics, Float64, Int64
 
 MAX_BYTES = 1 << 31  # of one file of a model
@@ -76,8 +76,7 @@ class ColmapModel:
         images: In the order of their names, by the numbers in these.
         points: (3,) of each point by its id.
         errors_px: Mean reprojection error of each point, by its id.
-        left_out: Images that are left out, and why.
-        damaged: What is missing of cameras, features and points, and why.
+        left_out: Images whose camera cannot be used, and why.
     """
 
     cameras: dict[int, CameraIntrinsics]
@@ -85,7 +84,6 @@ class ColmapModel:
     points: dict[int, Float64]
     errors_px: dict[int, float]
     left_out: tuple[str, ...] = ()
-    damaged: tuple[str, ...] = ()
 
 
 def find_models(folder: Path) -> list[Path]:
@@ -108,52 +106,42 @@ def read_model(folder: Path) -> ColmapModel:
     """Read the model in a folder; binary files come before text.
 
     Raises:
-        ImportSourceError: a file is missing, images.bin is cut off, or no image has a pose and a camera with a lens of
+        ImportSourceError: a file is missing, cut off or of another form, or no image has a camera with a lens of
             OpenCV's models.
     """
     binary = all((folder / f"{name}.bin").exists() for name in _NAMES[:2])
-    kind = "bin" if binary else "txt"
-    files = [folder / f"{name}.{kind}" for name in _NAMES]
-    for file in files[:2]:
-        if not file.exists():
-            raise ImportSourceError(f"{file}: missing; a model has cameras, images and points3D, .bin or .txt")
+    cameras_file, images_file, points_file = (folder / f"{name}.{'bin' if binary else 'txt'}" for name in _NAMES)
+    lenses = _cameras_bin(cameras_file) if binary else _cameras_txt(cameras_file)
+    rows = _images_bin(images_file) if binary else _images_txt(images_file)
     cameras: dict[int, CameraIntrinsics] = {}
     broken: dict[int, str] = {}
-    damaged: list[str] = []
-    for camera in _cameras_bin(files[0], damaged) if binary else _cameras_txt(files[0], damaged):
+    for number, model, width, height, params in lenses:
         try:
-            cameras[camera.number] = intrinsics_of(
-                camera.model, camera.width, camera.height, camera.params, camera.where
-            )
+            cameras[number] = intrinsics_of(model, width, height, params, f"{cameras_file}, camera {number}")
         except ImportSourceError as error:
-            broken[camera.number] = str(error)
+            broken[number] = str(error)
     images: list[ColmapImage] = []
     left_out: list[str] = []
-    for row in _images_bin(files[1]) if binary else _images_txt(files[1], left_out, damaged):
-        try:
-            if row.camera_id not in cameras:
-                missing = f"{files[1]}: image '{row.name}' has camera {row.camera_id}, which is missing"
-                raise ImportSourceError(broken.get(row.camera_id, missing))
-            images.append(_image(row, files[1]))
-        except ImportSourceError as error:
-            left_out.append(str(error))
+    for name, camera_id, (w, x, y, z, *t), features in rows:
+        where = f"{images_file}, image '{name}'"
+        if not abs(np.linalg.norm((w, x, y, z)) - 1) < 0.1 or not np.isfinite(t).all():
+            raise ImportSourceError(f"{where}: its pose is no unit quaternion QW QX QY QZ and position TX TY TZ")
+        if camera_id not in cameras:
+            left_out.append(broken.get(camera_id, f"{where} has camera {camera_id}, which is missing"))
+            continue
+        T_camera_world = pose_matrix(np.array(t), np.array((x, y, z, w)))
+        xy, points = features[:, :2] - 0.5, features[:, 2].astype(np.int64)
+        images.append(ColmapImage(name, camera_id, invert_pose(T_camera_world), xy, points))
     if left_out and not images:
-        raise ImportSourceError([*damaged, *left_out][0])
+        raise ImportSourceError(left_out[0])
     images.sort(key=lambda image: numeric_order(image.name))
-    points, errors = {}, {}
-    not_finite = 0
-    try:
-        rows = () if not files[2].exists() else _points_bin(files[2]) if binary else _points_txt(files[2])
-        for number, xyz, error in rows:
-            if np.isfinite(xyz).all():
-                points[number], errors[number] = xyz, error
-            else:
-                not_finite += 1
-    except ImportSourceError as error:  # poses need no points
-        damaged.append(f"points, but for the first {len(points)}, left out: {error}")
-    if not_finite:
-        damaged.append(f"{files[2]}: {counted(not_finite, 'point')} without a finite position left out")
-    return ColmapModel(cameras, tuple(images), points, errors, tuple(left_out), tuple(damaged))
+    points = {}
+    if points_file.exists():
+        found = _points_bin(points_file) if binary else _points_txt(points_file)
+        points = {number: (xyz, error) for number, xyz, error in found if np.isfinite(xyz).all()}
+    xyz_by_id = {number: xyz for number, (xyz, _) in points.items()}
+    errors = {number: error for number, (_, error) in points.items()}
+    return ColmapModel(cameras, tuple(images), xyz_by_id, errors, tuple(left_out))
 
 
 def intrinsics_of(model: str, width: int, height: int, params: list[float], where: str) -> CameraIntrinsics:
@@ -188,23 +176,21 @@ def intrinsics_of(model: str, width: int, height: int, params: list[float], wher
         raise ImportSourceError(f"{where}: {error}") from error
 
 
+# A camera: id, model, width, height, parameters. An image: name, id of its camera, QW QX QY QZ TX TY TZ, and a row
+# (x, y, id of the point) for each feature.
+_Camera = tuple[int, str, int, int, list[float]]
+_Image = tuple[str, int, list[float], Float64]
+
+
 class _Bytes:
-    """Numbers of a binary file, in order."""
+    """Numbers of a binary file, in order, little endian; raises ImportSourceError where the file ends before."""
 
     def __init__(self, file: Path) -> None:
         self._data, self._at, self.file = _read(file), 0, file
 
     def numbers(self, form: str) -> tuple[float, ...]:
-        """Numbers as ``struct`` has them, little endian.
-
-        Raises:
-            ImportSourceError: the file ends before.
-        """
-        size = struct.calcsize("<" + form)
-        if self._at + size > len(self._data):
-            raise self._cut()
-        self._at += size
-        return struct.unpack_from("<" + form, self._data, self._at - size)
+        """Numbers as ``struct`` has them."""
+        return struct.unpack("<" + form, self._take(struct.calcsize("<" + form)))
 
     def count(self) -> int:
         """A number of things that follow."""
@@ -212,71 +198,44 @@ class _Bytes:
 
     def array(self, dtype: np.dtype, count: int) -> np.ndarray:
         """Records."""
-        size = dtype.itemsize * count
-        if count < 0 or self._at + size > len(self._data):
-            raise self._cut()
-        self._at += size
-        return np.frombuffer(self._data, dtype, count, self._at - size)
+        return np.frombuffer(self._take(dtype.itemsize * count), dtype)
 
     def text(self) -> str:
         """Up to a zero byte."""
         end = self._data.find(b"\0", self._at)
-        if end < 0:
-            raise self._cut()
-        found, self._at = self._data[self._at : end], end + 1
-        return found.decode("utf-8", "replace")
+        return self._take(max(end, self._at) + 1 - self._at)[:-1].decode("utf-8", "replace")
 
-    def _cut(self) -> ImportSourceError:
-        return ImportSourceError(f"{self.file}: is cut off, or no file of a COLMAP model; export the model again")
+    def _take(self, size: int) -> bytes:
+        self._at += size
+        if self._at > len(self._data):
+            raise ImportSourceError(f"{self.file}: is cut off, or no file of a COLMAP model; export the model again")
+        return self._data[self._at - size : self._at]
 
 
 _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 _TRACK = np.dtype([("image", "<i4"), ("feature", "<i4")])
 
 
-@dataclass(frozen=True, slots=True)
-class _CameraRow:
-    number: int
-    model: str
-    width: int
-    height: int
-    params: list[float]
-    where: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ImageRow:
-    name: str
-    camera_id: int
-    pose: list[float]  # QW QX QY QZ TX TY TZ
-    xy: Float64
-    point_ids: Int64
-
-
-def _cameras_bin(file: Path, damaged: list[str]) -> Iterator[_CameraRow]:
-    """Up to the first camera of a model that is not known: how long it is, is not known, either."""
+def _cameras_bin(file: Path) -> Iterator[_Camera]:
     data = _Bytes(file)
     for _ in range(data.count()):
         number, model, width, height = (int(n) for n in data.numbers("iiQQ"))
-        if model not in MODELS:
-            damaged.append(
-                f"{file}: camera {number} has model {model}, which is not known; it and the cameras behind it are left "
-                "out. Undistort the images (`colmap image_undistorter`) and import the model that comes out"
+        if model not in MODELS:  # how long it is, is not known
+            raise ImportSourceError(
+                f"{file}: camera {number} has model {model}, which is not known. Undistort the images (`colmap "
+                "image_undistorter`) and import the model that comes out"
             )
-            return
         name, count = MODELS[model]
-        params = list(data.numbers(f"{count}d"))
-        yield _CameraRow(number, name, width, height, params, f"{file}, camera {number}")
+        yield number, name, width, height, list(data.numbers(f"{count}d"))
 
 
-def _images_bin(file: Path) -> Iterator[_ImageRow]:
+def _images_bin(file: Path) -> Iterator[_Image]:
     data = _Bytes(file)
     for _ in range(data.count()):
         _, *pose, camera = data.numbers("i7di")
         name = data.text()
         rows = data.array(_FEATURE, data.count())
-        xy = np.stack((rows["x"], rows["y"]), axis=1) - 0.5
-        yield _ImageRow(name, int(camera), pose, xy, rows["point"].astype(np.int64))
+        yield name, int(camera), pose, np.stack((rows["x"], rows["y"], rows["point"]), axis=1)
 
 
 def _points_bin(file: Path) -> Iterator[tuple[int, Float64, float]]:
@@ -287,71 +246,44 @@ def _points_bin(file: Path) -> Iterator[tuple[int, Float64, float]]:
         yield int(number), np.array((x, y, z)), float(error)
 
 
-def _cameras_txt(file: Path, damaged: list[str]) -> Iterator[_CameraRow]:
+def _cameras_txt(file: Path) -> Iterator[_Camera]:
     for line, words in _lines(file):
-        try:
-            number, width, height, *params = _numbers([words[0], *words[2:]])
-            row = _CameraRow(int(number), words[1].strip(",;"), int(width), int(height), params, f"{file}, line {line}")
-        except (ValueError, IndexError, OverflowError) as error:
-            damaged.append(str(_bad_line(file, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", error)))
-            continue
-        yield row
+        with _explained(file, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"):
+            number, width, height = (int(word) for word in (words[0], *words[2:4]))
+            params = [float(word) for word in words[4:]]
+        yield number, words[1], width, height, params
 
 
-def _images_txt(file: Path, left_out: list[str], damaged: list[str]) -> Iterator[_ImageRow]:
-    """Two lines an image; the second one, its features, may be empty. Sentences on poses that cannot be read go into
-    ``left_out``, on features into ``damaged``."""
+def _images_txt(file: Path) -> Iterator[_Image]:
+    """Two lines an image; the second one, its features, may be empty."""
     rows = iter(_lines(file, empty=True))
     for line, words in rows:
         if not words:
             continue
-        try:
-            *pose, camera = _numbers(words[1:9])
-            camera, name = int(camera), " ".join(words[9:])
-            if len(pose) != 7 or not name:
-                raise ValueError("too few values")
-        except (ValueError, OverflowError) as error:
-            form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            left_out.append(str(_bad_line(file, line, form, error)))
-            next(rows, None)  # its features
-            continue
-        line, words = next(rows, (line + 1, []))
-        try:
-            features = np.array(_numbers(words)).reshape(-1, 3)
-            if not np.isfinite(features).all():
-                raise ValueError("not finite")
-        except ValueError as error:  # its pose is good
-            bad = _bad_line(file, line, "X Y POINT3D_ID ...", error)
-            damaged.append(f"{bad}; image '{name}' is without its features")
-            features = np.empty((0, 3))
-        points = features[:, 2].astype(np.int64)
-        yield _ImageRow(name, camera, pose, features[:, :2] - 0.5, points)
+        _, features = next(rows, (0, []))
+        with _explained(file, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID ..."):
+            pose, camera, name = [float(word) for word in words[1:8]], int(words[8]), " ".join(words[9:])
+            found = np.array(features, np.float64).reshape(-1, 3)
+        yield name, camera, pose, found
 
 
 def _points_txt(file: Path) -> Iterator[tuple[int, Float64, float]]:
     for line, words in _lines(file):
-        try:
-            yield int(words[0].strip(",;")), np.array(_numbers(words[1:4])).reshape(3), _numbers(words[7:8])[0]
-        except (ValueError, IndexError) as error:
-            raise _bad_line(file, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]", error) from error
+        with _explained(file, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]"):
+            point = int(words[0]), np.array(words[1:4], np.float64).reshape(3), float(words[7])
+        yield point
 
 
-def _image(row: _ImageRow, file: Path) -> ColmapImage:
-    w, x, y, z, *t = row.pose
-    if not np.isfinite(row.pose).all() or not abs(np.linalg.norm((w, x, y, z)) - 1) < 0.1:
-        raise ImportSourceError(
-            f"{file}, image '{row.name}': its pose is no unit quaternion QW QX QY QZ and position TX TY TZ"
-        )
-    T_camera_world = pose_matrix(np.array(t), np.array((x, y, z, w)))
-    return ColmapImage(row.name, row.camera_id, invert_pose(T_camera_world), row.xy, row.point_ids)
+@contextmanager
+def _explained(file: Path, line: int, form: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, IndexError) as error:
+        raise ImportSourceError(f"{file}, line {line}: expected {form} ({error}); export the model again") from error
 
 
 def _lines(file: Path, *, empty: bool = False) -> Iterator[tuple[int, list[str]]]:
-    data = _read(file)
-    try:
-        text = decode_text(data)
-    except UnicodeDecodeError:  # names of pictures in another character set
-        text = data.decode("utf-8", "replace")
+    text = _read(file).decode("utf-8-sig", "replace")  # names of pictures may be in another character set
     for number, line in enumerate(text.splitlines(), 1):
         if not line.startswith("#") and (empty or line.strip()):
             yield number, line.split()
@@ -361,18 +293,8 @@ def _read(file: Path) -> bytes:
     try:
         return read_regular(file, MAX_BYTES)
     except OSError as error:
-        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+        raise ImportSourceError(
+            f"{file}: cannot be read ({error.strerror or error}); a model has cameras, images, points3D, .bin or .txt"
+        ) from error
     except ConfigError as error:
         raise ImportSourceError(str(error)) from error
-
-
-def _numbers(words: list[str]) -> list[float]:
-    """Numbers with a point or a decimal comma, between spaces, also with a comma or a semicolon behind each."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        return [float(word.strip(",;").replace(",", ".")) for word in words]
-
-
-def _bad_line(file: Path, line: int, form: str, error: Exception) -> ImportSourceError:
-    return ImportSourceError(f"{file}, line {line}: expected {form} ({error})")

@@ -35,7 +35,7 @@ from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.refine import refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.evaluate.thing_surface import ThingSurface
+from semantic_mapper.replay.evaluate.things import ThingSurface
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 NEAR_M = 0.05  # a map point this near to the true surface speaks for it

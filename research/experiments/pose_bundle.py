@@ -109,7 +109,7 @@ def flow_error_px(frames: Sequence[PosedFrame], poses: Float64, gap: int, every:
 
 def refine(walk: Walk, config: PoseRefinerConfig) -> dict[str, Any]:
     """Figures of given poses, of the refined ones as they come, and after their corrections."""
-    refiner = PoseRefiner(config)
+    refiner = PoseRefiner(walk.frames[0].intrinsics, config)
     live: list[Float64] = []
     final: dict[tuple[str, int], Float64] = {}
     processor_ms: list[float] = []

@@ -35,7 +35,7 @@ from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import interpolate_pose, transform
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.importers import ImportOptions
-from semantic_mapper.replay.importers.folder import FolderRecording
+from semantic_mapper.replay.importers.folder import open_folder
 from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.reconstruct import PACKING, FilmOptions, import_film
@@ -59,7 +59,7 @@ class Walk:
 
 def recorded_walk(folder: Path) -> Walk:
     """The pictures of a sequence folder."""
-    recording = FolderRecording(folder, ImportOptions())
+    recording = open_folder(folder, ImportOptions())
     frames = [recording.load(n).frame for n in range(len(recording))]
     k = frames[0].intrinsics
     poses = np.stack([f.T_world_camera for f in frames])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -38,6 +39,14 @@ class Keyframe:
     T_world_camera: Float64
     prior: Float64
     prior_sigmas: tuple[float, float]
+
+
+class Bundle(NamedTuple):
+    """A problem to solve, and what its rows are: keyframes, and ids of points."""
+
+    problem: BundleProblem
+    keyframes: list[Keyframe]
+    ids: list[int]
 
 
 class KeyframeMap:
@@ -121,8 +130,8 @@ class KeyframeMap:
         expected[front] = project(rays[front], self.intrinsics)
         return expected
 
-    def problem(self) -> tuple[BundleProblem, list[Keyframe], list[int]] | None:
-        """What the bundle is to solve, its keyframes and its ids of points; None where nothing is seen twice."""
+    def bundle(self) -> Bundle | None:
+        """The last keyframes and what they see, held by earlier ones; None where nothing is seen twice."""
         free = self.keyframes[-self._window :]
         wanted = set(np.concatenate([k.tracks.ids for k in free]).tolist()) & self.points.keys()
         old = [
@@ -154,31 +163,29 @@ class KeyframeMap:
             np.array(columns),
             np.array(pixels),
         )
-        return problem, keyframes, ids
+        return Bundle(problem, keyframes, ids)
 
-    def apply(self, problem: BundleProblem, keyframes: list[Keyframe], ids: list[int], found: BundleResult) -> None:
-        """Take over what a bundle found. Keyframes added since move with the last one that took part."""
+    def apply(self, bundle: Bundle, found: BundleResult) -> None:
+        """Take over what a bundle found. Keyframes added since move with the last one that took part.
+
+        Sights that are far off are dropped, and points with fewer than two left.
+        """
+        problem, keyframes, ids = bundle
         moved = found.poses[-1] @ invert_pose(keyframes[-1].T_world_camera)
-        taken = set(ids)
         for keyframe, pose in zip(keyframes, found.poses, strict=True):
             keyframe.T_world_camera = pose
         for keyframe in self.keyframes:
             if keyframe.number > keyframes[-1].number:
                 keyframe.T_world_camera = moved @ keyframe.T_world_camera
-        for track in self.points.keys() - taken:
+        for track in self.points.keys() - set(ids):
             self.points[track] = transform(moved, self.points[track])
         for track, point in zip(ids, found.points, strict=True):
             if track in self.points:
                 self.points[track] = point
-        self._forget(problem, keyframes, ids, found.errors_px > _MAX_ERROR_PX)
-
-    def _forget(self, problem: BundleProblem, keyframes: list[Keyframe], ids: list[int], wrong: Bool) -> None:
-        """Drop sights that are far off, and points with fewer than two left."""
+        wrong = found.errors_px > _MAX_ERROR_PX
         for row in np.unique(problem.keyframe[wrong]).tolist():
-            bad = np.array([ids[c] for c in problem.point[wrong & (problem.keyframe == row)].tolist()])
-            tracks = keyframes[row].tracks
-            keep = ~np.isin(tracks.ids, bad)
-            keyframes[row].tracks = Tracks(tracks.ids[keep], tracks.pixels[keep])
+            bad = np.array(ids)[problem.point[wrong & (problem.keyframe == row)]]
+            keyframes[row].tracks = keyframes[row].tracks.without(bad)
         left = np.bincount(problem.point[~wrong], minlength=len(ids))
         for column in np.flatnonzero(left < 2).tolist():
             self.points.pop(ids[column], None)

@@ -26,44 +26,30 @@ class PictureChecker:
 
     Attributes:
         counters: Pictures by what was wrong: "dark", "blurred", "exposure_jump".
-        reason: What is wrong with the last picture, empty where nothing is.
+        warnings: A sentence for each thing that is wrong with the last picture.
     """
 
     def __init__(self) -> None:
         self._sharpness: deque[float] = deque(maxlen=_RECENT)
         self._brightness: float | None = None
-        self._found: tuple[str, ...] = ()
         self.counters: Counter[str] = Counter()
-
-    @property
-    def reason(self) -> str:
-        """See the class."""
-        return "; ".join(SENTENCES[name] for name in self._found)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A sentence for each thing that is wrong with the last picture."""
-        return tuple(SENTENCES[name] for name in self._found)
+        self.warnings: tuple[str, ...] = ()
 
     def look(self, rgb: UInt8) -> tuple[str, ...]:
         """Judge the next picture (H, W, 3); the names of what is wrong."""
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        gray = cv2.resize(
-            gray, (_SIDE, max(1, round(_SIDE * gray.shape[0] / gray.shape[1]))), interpolation=cv2.INTER_AREA
-        )
-        bright = float(np.log(gray.mean() + 1.0))
-        # Edges against contrast: a dim picture is as sharp as a bright one.
-        sharp = float(cv2.Laplacian(gray, cv2.CV_32F).var() / (gray.var() + 1.0))
-        found: list[str] = []
+        size = _SIDE, max(1, round(_SIDE * rgb.shape[0] / rgb.shape[1]))
+        gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+        before, self._brightness = self._brightness, float(np.log(gray.mean() + 1.0))
         if np.percentile(gray, 95) < _DARK:
-            found.append("dark")
-        elif len(self._sharpness) >= _RECENT // 3 and sharp < _BLUR * float(np.median(self._sharpness)):
-            found.append("blurred")
-        if "dark" not in found and self._brightness is not None and abs(bright - self._brightness) > _JUMP:
-            found.append("exposure_jump")
-        if "dark" not in found:
+            found = ["dark"]
+        else:
+            # Edges against contrast: a dim picture is as sharp as a bright one.
+            sharp = float(cv2.Laplacian(gray, cv2.CV_32F).var() / (gray.var() + 1.0))
+            usual = float(np.median(self._sharpness)) if len(self._sharpness) >= _RECENT // 3 else 0.0
+            found = ["blurred"] if sharp < _BLUR * usual else []
+            if before is not None and abs(self._brightness - before) > _JUMP:
+                found.append("exposure_jump")
             self._sharpness.append(sharp)
-        self._brightness = bright
-        self._found = tuple(found)
         self.counters.update(found)
-        return self._found
+        self.warnings = tuple(SENTENCES[name] for name in found)
+        return tuple(found)

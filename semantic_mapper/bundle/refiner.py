@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, adjust_bundle, reprojection_errors
-from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap
+from semantic_mapper.bundle.adjustment import BundleResult, adjust_bundle, reprojection_errors
+from semantic_mapper.bundle.keyframes import Bundle, Keyframe, KeyframeMap
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
-from semantic_mapper.errors import FrameError
-from semantic_mapper.geometry import invert_pose, nearest_pose, pose_distance, scale_intrinsics, transform
+from semantic_mapper.geometry import invert_pose, nearest_pose, pose_distance, transform
+from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 _LEAST_POINTS = 20  # that must agree on a frame's pose
@@ -64,54 +64,49 @@ class PoseRefiner:
     """Refines the poses of one camera's frames, in the order of capture. Deterministic unless ``background``.
 
     Args:
+        intrinsics: Of all frames.
         config: How.
         background: Whether the bundle runs in a thread of its own, so that no frame waits for it; the results arrive
             with one of the next frames.
     """
 
-    def __init__(self, config: PoseRefinerConfig, *, background: bool = False) -> None:
+    def __init__(self, intrinsics: CameraIntrinsics, config: PoseRefinerConfig, *, background: bool = False) -> None:
         self._config = config
+        self._intrinsics = intrinsics
         self._tracker = Tracker(config.corners)
-        self._map: KeyframeMap | None = None
-        self._camera: tuple[str, CameraIntrinsics] | None = None
+        self._map = KeyframeMap(working_intrinsics(intrinsics, config.width), config.window)
         self._frames: list[_Frame] = []
-        self._given = np.eye(4)  # of the frame before
+        self._given: Float64 | None = None  # pose of the frame before
         self._refined = np.eye(4)
-        self._count = 0
         self._sigma_m = config.sigma_m  # of the last given pose
         self._misfits: deque[float] = deque(maxlen=_MISFIT_FRAMES)  # of given poses beyond refined ones, radians
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
-        self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
+        self._pending: tuple[Bundle, Future[BundleResult]] | None = None
 
     def push(self, frame: PosedFrame) -> RefinedPose:
-        """Refine the next frame's pose.
-
-        Raises:
-            FrameError: a frame of another camera or size.
-        """
-        intrinsics, points = self._start(frame)
+        """Refine the next frame's pose."""
         self._collect(wait=False)
-        image = prepare_image(frame.rgb, intrinsics.width, intrinsics.height)
+        image = prepare_image(frame.rgb, self._map.intrinsics.width, self._map.intrinsics.height)
         given = nearest_pose(frame.T_world_camera)
-        self._sigma_m = self._sigmas(frame)[0]
-        guess = nearest_pose(self._refined @ invert_pose(self._given) @ given) if self._count else given
-        expected = points.predict(self._tracker.tracks, self._refined, guess)
+        sigmas = self._sigmas(frame)
+        self._sigma_m = sigmas[0]
+        guess = given if self._given is None else nearest_pose(self._refined @ invert_pose(self._given) @ given)
+        expected = self._map.predict(self._tracker.tracks, self._refined, guess)
         tracks = self._tracker.advance(image, expected)
-        pose, refined = self._locate(points, tracks, guess, self._sigmas(frame))
-        given_px, error_px = self._disagreement(points, tracks, given, pose)
+        pose, refined = self._locate(tracks, guess, sigmas)
+        given_px, error_px = self._disagreement(tracks, given, pose)
         if np.isfinite(given_px - error_px):
             self._misfits.append((given_px - error_px) / frame.intrinsics.fx)
         self._given, self._refined = given, pose
-        self._count += 1
-        if points.wants_keyframe(tracks):
-            tracks = self._tracker.replenish()
-            number = points.keyframes[-1].number + 1 if points.keyframes else 0
-            points.add(Keyframe(number, tracks, pose, given, self._sigmas(frame)))
-            self._adjust(points)
-        last = points.keyframes[-1]
+        is_keyframe = self._map.wants_keyframe(tracks)
+        if is_keyframe:
+            number = self._map.keyframes[-1].number + 1 if self._map.keyframes else 0
+            self._map.add(Keyframe(number, self._tracker.replenish(), pose, given, self._sigmas(frame)))
+            self._adjust()
+        last = self._map.keyframes[-1]
         relative = invert_pose(last.T_world_camera) @ self._refined
-        key = frame.camera_id, frame.stamp_ns
-        self._frames.append(_Frame(key, last, relative, self._refined, None if refined else tracks))
+        late = None if refined or is_keyframe else tracks
+        self._frames.append(_Frame((frame.camera_id, frame.stamp_ns), last, relative, self._refined, late))
         return RefinedPose(self._refined, refined, given_px, error_px)
 
     def corrections(self) -> dict[tuple[str, int], Float64]:
@@ -121,17 +116,14 @@ class PoseRefiner:
         """
         self._collect(wait=False)
         changed: dict[tuple[str, int], Float64] = {}
-        kept: list[_Frame] = []
-        alive = set() if self._map is None else {k.number for k in self._map.keyframes[-self._config.window :]}
         for frame in self._frames:
             self._locate_late(frame)
             pose = frame.keyframe.T_world_camera @ frame.T_keyframe_camera
             moved_m, turned = pose_distance(frame.reported, pose)
             if moved_m > _CORRECTED_M or turned > _CORRECTED_RAD:
                 changed[frame.key] = frame.reported = pose
-            if frame.keyframe.number in alive:
-                kept.append(frame)
-        self._frames = kept
+        alive = {k.number for k in self._map.keyframes[-self._config.window :]}
+        self._frames = [frame for frame in self._frames if frame.keyframe.number in alive]
         return changed
 
     def to_given(self, T_world_camera: Float64) -> tuple[Float64, float]:
@@ -161,29 +153,14 @@ class PoseRefiner:
 
     def _keyframe_poses(self) -> tuple[Float64, Float64]:
         """Refined and given poses (K, 4, 4) of the keyframes in reach."""
-        keyframes = [] if self._map is None else self._map.keyframes
-        refined = np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4)
-        return refined, np.array([k.prior for k in keyframes]).reshape(-1, 4, 4)
+        refined = np.array([k.T_world_camera for k in self._map.keyframes]).reshape(-1, 4, 4)
+        return refined, np.array([k.prior for k in self._map.keyframes]).reshape(-1, 4, 4)
 
     def close(self) -> None:
         """Wait for a bundle that is under way."""
         self._collect(wait=True)
         if self._worker is not None:
             self._worker.shutdown()
-
-    def _start(self, frame: PosedFrame) -> tuple[CameraIntrinsics, KeyframeMap]:
-        camera = (frame.camera_id, frame.intrinsics)
-        if self._map is None:
-            k = frame.intrinsics
-            width = min(k.width, self._config.width)
-            self._camera = camera
-            self._map = KeyframeMap(scale_intrinsics(k, width, round(k.height * width / k.width)), self._config.window)
-        if camera != self._camera:
-            raise FrameError(
-                f"frame seq={frame.seq} of camera '{frame.camera_id}': poses are refined of one camera of one size; "
-                "use a PoseRefiner for each camera"
-            )
-        return self._map.intrinsics, self._map
 
     def _sigmas(self, frame: PosedFrame) -> tuple[float, float]:
         """Metres and radians; less than the config says where given poses have fitted the pictures."""
@@ -192,10 +169,8 @@ class PoseRefiner:
             fraction = float(np.clip(np.median(self._misfits) / _MISFIT_RAD, _LEAST_SIGMAS, 1.0))
         return frame.pose_sigma or fraction * self._config.sigma_m, fraction * np.radians(self._config.sigma_deg)
 
-    def _locate(
-        self, points: KeyframeMap, tracks: Tracks, guess: Float64, sigmas: tuple[float, float]
-    ) -> tuple[Float64, bool]:
-        found = points.locate(tracks, guess, _LEAST_POINTS)
+    def _locate(self, tracks: Tracks, guess: Float64, sigmas: tuple[float, float]) -> tuple[Float64, bool]:
+        found = self._map.locate(tracks, guess, _LEAST_POINTS)
         if found is None:
             return guess, False
         pose, wrong = found
@@ -207,52 +182,44 @@ class PoseRefiner:
 
     def _locate_late(self, frame: _Frame) -> None:
         """Find a frame's place among points that became known after it."""
-        if self._map is None or frame.tracks is None or frame.keyframe.tracks.ids is frame.tracks.ids:
-            return
         guess = frame.keyframe.T_world_camera @ frame.T_keyframe_camera
-        found = self._map.locate(frame.tracks, guess, _LEAST_POINTS)
+        found = None if frame.tracks is None else self._map.locate(frame.tracks, guess, _LEAST_POINTS)
         if found is not None:
             frame.T_keyframe_camera, frame.tracks = invert_pose(frame.keyframe.T_world_camera) @ found[0], None
 
-    def _adjust(self, points: KeyframeMap) -> None:
+    def _adjust(self) -> None:
         """Bundle now, or in the worker where that is free."""
-        if self._pending is not None:
-            return
-        problem = points.problem()
-        if problem is None:
+        bundle = None if self._pending is not None else self._map.bundle()
+        if bundle is None:
             return
         if self._worker is None:
-            self._apply(*problem, adjust_bundle(problem[0], _ITERATIONS))
+            self._apply(bundle, adjust_bundle(bundle.problem, _ITERATIONS))
         else:
-            self._pending = (*problem, self._worker.submit(adjust_bundle, problem[0], _ITERATIONS))
+            self._pending = bundle, self._worker.submit(adjust_bundle, bundle.problem, _ITERATIONS)
 
     def _collect(self, wait: bool) -> None:
-        if self._pending is not None and (wait or self._pending[3].done()):
-            problem, keyframes, ids, future = self._pending
-            self._pending = None
-            self._apply(problem, keyframes, ids, future.result())
+        if self._pending is not None and (wait or self._pending[1].done()):
+            (bundle, future), self._pending = self._pending, None
+            self._apply(bundle, future.result())
 
-    def _apply(self, problem: BundleProblem, keyframes: list[Keyframe], ids: list[int], found: BundleResult) -> None:
-        assert self._map is not None
+    def _apply(self, bundle: Bundle, found: BundleResult) -> None:
         last = self._map.keyframes[-1]
         before = invert_pose(last.T_world_camera)
-        self._map.apply(problem, keyframes, ids, found)
+        self._map.apply(bundle, found)
         self._refined = last.T_world_camera @ before @ self._refined
 
-    def _disagreement(
-        self, points: KeyframeMap, tracks: Tracks, given: Float64, refined: Float64
-    ) -> tuple[float, float]:
+    def _disagreement(self, tracks: Tracks, given: Float64, refined: Float64) -> tuple[float, float]:
         """Median errors of this frame by given and by refined poses, from points as the last keyframe saw them."""
-        mask, known = points.known(tracks)
+        mask, known = self._map.known(tracks)
         if mask.sum() < _LEAST_POINTS:
             return np.nan, np.nan
-        last = points.keyframes[-1]
-        factor = self._camera[1].width / points.intrinsics.width if self._camera else 1.0
+        last, small = self._map.keyframes[-1], self._map.intrinsics
         in_last = transform(invert_pose(last.T_world_camera), known)
         errors = [
-            reprojection_errors(transform(T, in_last), tracks.pixels[mask], points.intrinsics)
+            reprojection_errors(transform(T, in_last), tracks.pixels[mask], small)
             for T in (invert_pose(given) @ last.prior, invert_pose(refined) @ last.T_world_camera)
         ]
+        factor = self._intrinsics.width / small.width
         return factor * float(np.median(errors[0])), factor * float(np.median(errors[1]))
 
 

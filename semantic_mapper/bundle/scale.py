@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,14 +19,6 @@ _LEAST_POINTS = 20
 _MOST_BELOW, _MARGIN = 0.03, 0.1  # fraction of the points further below it than this part of the camera's height
 
 
-@dataclass(slots=True)
-class _Way:
-    """The same way in the map and in the reference."""
-
-    metres: float
-    units: float
-
-
 class ScaleEstimator:
     """Compares ways between the same moments in the map and in a reference (robot odometry, a board).
 
@@ -36,7 +27,7 @@ class ScaleEstimator:
     """
 
     def __init__(self) -> None:
-        self._ways: deque[_Way] = deque()
+        self._ways: deque[tuple[float, float]] = deque()  # the same way in metres and in units of the map
         self._start: tuple[Float64, Float64] | None = None  # positions in metres, and in the map
 
     def add(self, reference: Float64, position: Float64) -> None:
@@ -47,9 +38,9 @@ class ScaleEstimator:
         metres = float(np.linalg.norm(reference - self._start[0]))
         if metres < _STEP_M:
             return
-        self._ways.append(_Way(metres, float(np.linalg.norm(position - self._start[1]))))
+        self._ways.append((metres, float(np.linalg.norm(position - self._start[1]))))
         self._start = reference, position
-        while sum(w.metres for w in self._ways) > _WINDOW_M + _STEP_M:
+        while sum(metres for metres, _ in self._ways) > _WINDOW_M + _STEP_M:
             self._ways.popleft()
 
     def interrupt(self) -> None:
@@ -58,20 +49,20 @@ class ScaleEstimator:
 
     def rescaled(self, factor: float, T_before: Float64, T_after: Float64) -> None:
         """The map's unit has changed, as ``VisualOdometry.rescale`` does it."""
-        for way in self._ways:
-            way.units *= factor
+        self._ways = deque((metres, factor * units) for metres, units in self._ways)
         if self._start is not None:
             offset = T_before[:3, :3].T @ (self._start[1] - T_before[:3, 3])
             self._start = self._start[0], T_after[:3, 3] + T_after[:3, :3] @ (factor * offset)
 
     def scale(self) -> float | None:
         """Metres a unit; None before ``_FIRST_M`` of way."""
-        ways = [w for w in self._ways if w.units > 0]
-        if sum(w.metres for w in ways) < _FIRST_M:
+        ways = np.array([way for way in self._ways if way[1] > 0]).reshape(-1, 2)
+        metres, units = ways.T
+        if metres.sum() < _FIRST_M:
             return None
-        middle = float(np.median([w.metres / w.units for w in ways]))
-        kept = [w for w in ways if 1 / _MAX_RATIO < w.metres / w.units / middle < _MAX_RATIO]
-        return sum(w.metres for w in kept) / sum(w.units for w in kept)
+        ratio = metres / units
+        kept = np.abs(np.log(ratio / np.median(ratio))) < np.log(_MAX_RATIO)
+        return float(metres[kept].sum() / units[kept].sum())
 
 
 def floor_height(z: Float64, camera_z: float) -> float | None:

@@ -38,6 +38,11 @@ class Tracks:
         """Rows (M,) of tracks that are there."""
         return np.searchsorted(self.ids, ids).astype(np.int64)
 
+    def without(self, ids: Int64) -> Tracks:
+        """All but these."""
+        keep = ~np.isin(self.ids, ids)
+        return Tracks(self.ids[keep], self.pixels[keep])
+
 
 NO_TRACKS = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)))
 
@@ -116,8 +121,7 @@ class Tracker:
 
     def drop(self, ids: Int64) -> None:
         """Follow these corners no longer."""
-        keep = ~np.isin(self.tracks.ids, ids)
-        self.tracks = Tracks(self.tracks.ids[keep], self.tracks.pixels[keep])
+        self.tracks = self.tracks.without(ids)
 
     def replenish(self) -> Tracks:
         """Find new corners in the image of the last ``advance``, away from those that are followed."""

@@ -127,7 +127,8 @@ class FrameDepth:
         starts = self._lens_changed(frame)
         _, refiner = self._refiners.pop(frame.camera_id, (None, None))
         if refiner is None or starts:
-            refiner = PoseRefiner(self._config.poses, background=self._config.refine_in_background)
+            background = self._config.refine_in_background
+            refiner = PoseRefiner(frame.intrinsics, self._config.poses, background=background)
         self._refiners[frame.camera_id] = frame.intrinsics, refiner
         if len(self._refiners) > MAX_CAMERAS:
             self._refiners.popitem(last=False)

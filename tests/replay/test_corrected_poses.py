@@ -84,7 +84,7 @@ def test_files_that_are_no_trajectory_are_named(tmp_path: Path) -> None:
     frames = tiny_frames()
     with pytest.raises(ImportSourceError, match=r"gone\.txt: cannot be read"):
         read_corrections(tmp_path / "gone.txt")
-    with pytest.raises(ImportSourceError, match=r"a\.txt, line 4 .*1 lines"):
+    with pytest.raises(ImportSourceError, match=r"a\.txt, line 4: .*1 lines"):
         read_corrections(write(tmp_path / "a.txt", frames[:2], "1.0 2 3"))
 
 

@@ -22,7 +22,7 @@ import os, signal, sys
 from pathlib import Path
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.config import load_mapper_config
-from semantic_mapper.replay.jobs import ReplayRequest, replay_log
+from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.nodes.process import StopRequest, prepare_process
 prepare_process()
 load_open3d()
@@ -35,8 +35,7 @@ def killed_at(name):
             os.kill(os.getpid(), signal.SIGKILL)
         rename(source, target)
     os.replace = replace
-    request = ReplayRequest(log, out / name, weights, load_mapper_config(config), max_frames=2)
-    replay_log(request)
+    replay_log(log, out / name, weights, load_mapper_config(config), max_frames=2)
 
 for name in [n.name for n in names]:
     (out / name).mkdir(parents=True)

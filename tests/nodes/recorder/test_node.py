@@ -34,7 +34,7 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
-from semantic_mapper.replay.jobs import EvaluateRequest, ReplayRequest, evaluate_log, replay_log
+from semantic_mapper.replay.jobs import evaluate_log, replay_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
@@ -339,9 +339,8 @@ def test_parts_are_replayed_as_one_log(weights: Path, config: Path, tmp_path: Pa
     with_parts.close()
     first, second, *more = parts_on_disk(tmp_path / "a.mcap").values()
     settings = load_mapper_config(config)
-    request = ReplayRequest(second, tmp_path / "out", weights, settings, further_parts=(*more, first))
-    summary = replay_log(request).summary
+    summary = replay_log((second, *more, first), tmp_path / "out", weights, settings).summary
     assert summary["frames"]["fused"] == 6 == VoxelMap.load(tmp_path / "out" / "map.npz").frames
     assert is_log(tmp_path) and not is_log(tmp_path / "out")
-    scored = evaluate_log(EvaluateRequest(tmp_path, weights, settings, max_frames=5)).scores
+    scored = evaluate_log(tmp_path, weights, settings, max_frames=5).plain()
     assert scored["scored"] + scored["excluded"] + scored["refused"] == 5  # more than one part holds

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.importers.base import seconds_to_ns, split_row, unknown_keys
 from semantic_mapper.replay.importers.run import detect_format
-from semantic_mapper.replay.importers.transforms import _Transforms  # pyright: ignore[reportPrivateUsage]
+from semantic_mapper.replay.importers.tables import seconds_to_ns, split_row, unknown_notice
 from tests.replay import recordings as rec
 from tests.replay.recordings import DRIVE, H, W, imported
 
@@ -117,59 +116,44 @@ K = '{{"width": 32, "height": 24, "fx": {}, "fy": {}, "cx": {}, "cy": 12}}'
 STOPS: list[tuple[str, Edit, str]] = [
     ("folder", write("intrinsics.json", "{"), "intrinsics.json"),
     ("folder", write("intrinsics.json", '{"width": ' + "[" * 100_000), "intrinsics.json: "),
-    ("folder", write("intrinsics.json", " " * (1 << 20) + "{}"), "larger than the limit"),
     ("folder", write("intrinsics.json", K.format('"f"', 1, 1)), "intrinsics.json.*fx"),
-    ("folder", write("intrinsics.json", K.format(0, 1, 1)), "must be positive"),
     ("folder", write("intrinsics.json", K.format(31, 31, 1e19)), "intrinsics.json"),
     ("folder", keys("intrinsics.json", fx=0.8, fy=1.1, cx=0.5, cy=0.5), "intrinsics.json.*normalised"),
     ("folder", keys("intrinsics.json", depth_scale=0.001), "where it is metres per unit, write 1000"),
     ("folder", keys("intrinsics.json", distortion=[0.1], distortion_model="omni"), "'omni' is not undone"),
     ("folder", write("labels.json", '{"classes": {"one": "wall"}}'), "labels.json"),
     ("folder", write("labels.json", '{"classes": {"1": "wall", "2": "wall"}}'), "twice"),
-    ("folder", write("labels.json", f'{{"classes": {{"1": "{"x" * 5000}"}}}}'), "name of class 1 has 5,000 letters"),
     ("folder", write("poses.txt", ""), "holds no pose"),
     ("folder", write("timestamps.txt", "1\n2"), "a stamp for each of 6 frames"),
-    ("folder", write("timestamps.txt", "1\n2\n2\n3\n4\n5"), "row 3 is not later.*rising stamps"),
-    ("folder", write("timestamps.txt", "1\n2\n3\nsoon\nsoon\nsoon"), "soon"),
     ("folder", write("timestamps.txt", "1\n2\n3\n4\n5\n6"), "1 ns apart; whole numbers are nanoseconds"),
-    ("folder", write("timestamps.txt", "1\n2\n3\n" + 3 * "9223372036854775808\n"), "not a time from 0"),
     ("folder", lambda f: (f / "poses.txt").unlink() or os.mkfifo(f / "poses.txt"), "poses.txt: is no regular file"),
     ("tum", write("groundtruth.txt", "1305031102175304000 0 0 0 0 0 0 1\n"), "line 1: .*divide nanoseconds by 1e9"),
     ("tum", write("groundtruth.txt", "1305031102.1 0 0 0 0 0 0 2\n"), "its quaternion has length 2, not 1"),
-    ("tum", write("groundtruth.txt", "noon,0,0,0,0,0,0,1\n"), "is not a time in seconds"),
     ("scannet", remove("intrinsic/intrinsic_depth.txt"), "intrinsic_depth.txt"),
     ("scannet", write("intrinsic/intrinsic_color.txt", "0.8 0 0.5 0 0 1.1 0.5 0 0 0 1 0 0 0 0 1"), "color.*normalised"),
-    ("replica", text("traj_w_c.txt", "\n", " ", 2), r"traj_w_c\.txt: has 1 rows, images go up to rgb_2"),
     ("replica", write("../habitat/info_semantic.json", '{"classes": [{"id": "three"}]}'), r"info_semantic\.json.*int"),
     ("kitti360", write(POSES, "250 1 0 0 0 0 1 0 0 0 0 1 0\n"), "poses.txt, with 12, is another file"),
     ("kitti360", text("calibration/perspective.txt", "S_rect_00: 64", "S_rect_00: nan"), "perspective.txt"),
-    ("kitti360", write("calibration/perspective.txt", "P_rect_00: 1 2 3\n"), "needs 'P_rect_00:' with 12 numbers"),
     ("kitti360", lambda f: (f / "data_2d_raw/2013_05_28_drive_0002_sync").mkdir(), "holds 2 drives; name the folder"),
     ("transforms", keys("transforms.json", camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' is not undone"),
-    ("transforms", keys("transforms.json", k4=0.01), "no k4 that programs agree on"),
-    ("transforms", keys("transforms.json", is_fisheye=True, p1=0.01), "has no p1"),
-    ("transforms", keys("transforms.json", from_mitsuba=True), "'from_mitsuba' means poses in other axes"),
-    ("transforms", keys("transforms.json", coordinate_system="unity"), "'coordinate_system' is 'unity'"),
-    ("transforms", keys("transforms.json", ftheta_p1=0.1), "'ftheta_p1' is not read"),
+    ("transforms", keys("transforms.json", is_fisheye=True, p1=0.01), "no p1 that programs agree on"),
+    ("transforms", keys("transforms.json", from_mitsuba=True), "'from_mitsuba' is not read"),
+    ("transforms", keys("transforms.json", coordinate_system="unity"), "'coordinate_system' is not read"),
     ("transforms", keys("transforms.json", fl_x=None, fl_y=None), "no focal length"),
-    ("transforms", keys("transforms.json", units="furlong"), "unit 'furlong' is not known"),
-    ("transforms", keys("transforms.json", frames=[]), "no posed picture"),
+    ("transforms", keys("transforms.json", units="furlong"), "'units' is not read"),
     ("transforms", keys("transforms.json", frames=3), "frames"),
     ("transforms", keys("transforms.json", frames=[{"file_path": "../a.png"}]), "outside"),
     ("depth", images("depths", WIDE), "another form.*--topic depth=none"),
     ("colmap", text(SPARSE + "cameras.txt", "SIMPLE_RADIAL", "FOV"), "lens model 'FOV' is not read"),
     ("colmap", text(SPARSE + "cameras.txt", "\n1 ", "\n2 "), "camera 1, which is missing"),
-    ("colmap", remove("images"), "pictures of the model are missing"),
+    ("colmap", row(SPARSE + "images.txt", 1, "1 x 0 0 0 0 0 0 1 0.png"), "images.txt, line 2: expected IMAGE_ID"),
+    ("colmap", remove("images"), "pictures are missing"),
     ("colmap.bin", cut(SPARSE + "images.bin", 5), "cut off"),
     ("record3d", keys("metadata.json", poses=[]), "pose of none"),
-    ("record3d", keys("metadata.json", K=[1]), "K"),
     ("opensfm", model(lambda m: m.update(cameras={})), "camera 'v2 dji' is missing"),
-    ("opensfm", model(lambda m: m.update(shots={})), "no posed picture"),
     ("opensfm", model(lambda m: m["cameras"]["v2 dji"].update(projection_type="spherical")), "'spherical' is not read"),
-    ("opensfm", model(lambda m: m["cameras"]["v2 dji"].update(projection_type="brown", k4=0.1)), "with k4 is not read"),
     ("opensfm", model(lambda m: m["cameras"]["v2 dji"].update(projection_type="fisheye", p1=0.1)), "p1 and p2"),
     ("opensfm", cut("reconstruction.json", 100), "not valid JSON"),
-    ("opensfm", remove("images"), "pictures are missing"),
 ]
 COSTS: list[tuple[str, Edit, int, str]] = [
     ("folder", remove("depth/000003.png"), 6, ""),
@@ -177,47 +161,40 @@ COSTS: list[tuple[str, Edit, int, str]] = [
     ("folder", remove("labels.json"), 6, "labels.json, which names its classes, is missing"),
     ("folder", row("poses.txt", 3, ""), 5, "line 4: is empty or a comment"),
     ("folder", row("poses.txt", 3, "# lost"), 5, "line 4: is empty or a comment"),
-    ("folder", text("poses.txt", "\n", "\n\n"), 6, "passed over"),
-    ("folder", write("timestamps.txt", "1.0\n1.5\nnan\n2.5\n3.0\n3.5\n"), 5, "row 3 is no time"),
-    ("folder", write("timestamps.txt", "timestamp\n1.0\n1.5\n2\n2,5\n3e0\n3.5\n"), 6, "is a header"),
+    ("folder", text("poses.txt", "\n", "\n\n"), 6, ""),
+    ("folder", write("timestamps.txt", "1.0\n1.5\nnan\n2.5\n3.0\n3.5\n"), 5, "row 3: 'nan' is not a time"),
+    ("folder", write("timestamps.txt", "timestamp\n1.0\n1.5\n2\n2.5\n3e0\n3.5\n"), 6, ""),
+    ("folder", write("timestamps.txt", "1.0\n1.5\n0.5\n2.5\n3.0\n3.0\n"), 6, "go back; pictures are sorted"),
     ("folder", keys("intrinsics.json", width=None, height=None, distortion=None), 6, ""),
-    ("folder", keys("intrinsics.json", axes="x forward"), 6, "'axes' is not read"),
+    ("folder", keys("intrinsics.json", axes="x forward"), 6, "not read: 'axes'"),
     ("tum", remove("depth.txt"), 6, "no depth.txt"),
     ("tum", text("rgb.txt", " rgb/", " ../rgb/", 1), 5, "outside of it"),
     ("tum", lambda f: text("rgb.txt", "\n", "\r\n")(f), 6, ""),
     ("scannet", remove("color/60.jpg"), 5, "1 pose without a picture"),
     ("replica", remove("depth/depth_1.png"), 3, ""),
+    ("replica", row("traj_w_c.txt", 2, ""), 2, "row i belongs to image i"),
     ("replica", remove("../habitat/info_semantic.json"), 3, "info_semantic.json, which names its classes"),
     ("kitti360", remove(f"data_2d_raw/{DRIVE}/image_01/timestamps.txt"), 4, "stamps are made up at 10 frames"),
     ("transforms", remove("images/frame_00002.png"), 2, "cannot be read"),
     ("transforms", frame(transform_matrix=None), 2, "has no transform_matrix"),
-    ("transforms", frame(fl_x="wide"), 2, "1 frame of 3 left out"),
-    ("transforms", frame(file_path="images/frame_00001.png"), 2, "1 pictures are there twice"),
+    ("transforms", frame(fl_x="wide"), 2, "1 frame left out"),
+    ("transforms", frame(file_path="images/frame_00001.png"), 2, "1 picture left out, which are there twice"),
     ("transforms", frame(timestamp=3.0), 3, "2 of 3 pictures have no time: stamps are made up"),
-    ("transforms", keys("transforms.json", rolling_shutter=[0, 0, 0, 1.0]), 3, "'rolling_shutter' is not read"),
+    ("transforms", keys("transforms.json", camera={"k1": 0.1, "name": "front"}), 3, "not read: 'camera'"),
     ("transforms", text("transforms.json", "images/", "images\\\\"), 3, ""),
-    ("depth", remove("depths/1.png"), 3, "1 of 3 depth images are missing"),
-    ("colmap", row(SPARSE + "images.txt", 1, "1 x 0 0 0 0 0 0 1 0.png"), 2, "images.txt, line 2"),
-    ("colmap", row(SPARSE + "images.txt", 4, "x 20.5 1"), 3, "'1.png' is without its features"),
+    ("depth", remove("depths/1.png"), 3, "1 depth image left out, missing"),
     ("colmap", text(SPARSE + "images.txt", " 1.png", " ../1.png"), 2, "lies outside of it"),
-    ("colmap", text(SPARSE + "images.txt", " 1.png", " " + "a" * 300 + "1.png"), 2, "1 picture in"),
-    ("colmap", text(SPARSE + "cameras.txt", "1 SIMPLE", f"2 PINHOLE {W} ? 1 1\n1 SIMPLE"), 3, "cameras.txt, line 2"),
-    ("colmap", text(SPARSE + "points3D.txt", "\n2 2.5", "\n2 nan"), 3, "1 point without a finite position"),
-    ("colmap", cut(SPARSE + "points3D.txt", 9), 3, "points, but for the first 2"),
-    ("colmap.bin", cut(SPARSE + "points3D.bin", 9), 3, "points, but for the first 2"),
+    ("colmap", text(SPARSE + "images.txt", " 1.png", " " + "a" * 300 + "1.png"), 2, "without a pose in this model"),
+    ("colmap", text(SPARSE + "points3D.txt", "\n2 2.5", "\n2 nan"), 3, ""),
     ("polycam", remove("keyframes/corrected_images/5000000.jpg"), 2, "1 camera without a picture"),
-    ("record3d", keys("metadata.json", w=None, h=None), 3, ""),
-    ("record3d", keys("metadata.json", w=str(W), h=f"{H}.0"), 3, ""),
     ("record3d", keys("metadata.json", fps=0), 3, "made up at 60"),
     ("record3d", keys("metadata.json", perFrameIntrinsicCoeffs=[[50.0, "x", 32.0, 24.0], None, 3]), 3, ""),
     ("record3d", lambda f: (f / "rgb/1.jpg").rename(f / "rgb/7.jpg"), 2, "1 pose without a picture"),
-    ("opensfm", shot(rotation=[0, 0]), 3, "rotation"),
     ("opensfm", shot(translation=[0, 0, None]), 3, "translation"),
     ("opensfm", shot(camera="another"), 3, "camera 'another'"),
     ("opensfm", shot("../a.jpg"), 3, "outside"),
     ("opensfm", shot(capture_time="yesterday"), 4, "made up"),
-    ("opensfm", model(lambda m: m["points"].update({"3": {"coordinates": [1, "x", 2]}, "4": 3})), 4, ""),
-    ("opensfm", model(lambda m: {"shots": {}, "cameras": 3}), 4, "2 parts"),
+    ("opensfm", model(lambda m: {"shots": {}, "cameras": {}}), 4, "2 parts"),
 ]
 
 
@@ -237,15 +214,6 @@ def test_a_bad_value_costs_what_it_is_of(tmp_path: Path, kind: str, edit: Edit, 
     report, kept = imported(folder)
     said = " ".join((*report.notices, *(f"{skipped.file}: {skipped.reason}" for skipped in report.skipped)))
     assert len(kept) == frames and says in said, said
-
-
-@pytest.mark.parametrize(("number", "count"), [(11, 16), (99, 5)])
-def test_an_unused_camera_of_another_model_does_no_harm(tmp_path: Path, number: int, count: int) -> None:
-    file = MAKERS["colmap.bin"](tmp_path / "scan") / SPARSE / "cameras.bin"
-    other = struct.pack(f"<iiQQ{count}d", 2, number, W, H, *range(1, count + 1))
-    file.write_bytes(struct.pack("<Q", 2) + file.read_bytes()[8:] + other)
-    report, frames = imported(tmp_path / "scan")
-    assert len(frames) == 3 and ("camera 2 has model 99" in rec.said(report)) == (number == 99)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -275,7 +243,6 @@ def test_depth_as_numpy_writes_it_is_read(tmp_path: Path, suffix: str) -> None:
     report, frames = imported(folder)
     got = frames[1].depth_m
     assert report.with_depth == 6 and got is not None and (got[0] == 0).all() and np.allclose(got[1:], 1.25)
-    assert "NumPy's files is taken as metres" in rec.said(report)
 
 
 @pytest.mark.parametrize(
@@ -290,17 +257,17 @@ def test_seconds_in_any_form_are_exact(value: str, ns: int) -> None:
     assert seconds_to_ns(value) == ns
 
 
-@pytest.mark.parametrize("words", ["1.5 2 -3e-1", "1.5,2,-3e-1", "1,5;2;-3e-1", "1.5\t2\t-3e-1", "[1,5 2 -3e-1]"])
+@pytest.mark.parametrize("words", ["1.5 2 -3e-1", "1.5,2,-3e-1", "1.5; 2;-3e-1", "[1.5\t2\t-3e-1]"])
 def test_rows_are_parted_by_what_programs_use(words: str) -> None:
     assert [float(word) for word in split_row(words)] == [1.5, 2.0, -0.3]
 
 
-def test_keys_that_change_what_numbers_mean_are_named() -> None:
-    for key in ("dist_coeffs", "radial", "K", "sensor_width", "pose_type", "is_w2c", "readout_ms", "alpha"):
-        assert unknown_keys([{key: 0.5}], _Transforms) == [key]
+def test_keys_that_change_what_numbers_mean_are_named(tmp_path: Path) -> None:
+    telling = dict.fromkeys(("dist_coeffs", "radial", "K", "sensor_width", "pose_type", "is_w2c", "alpha"), 0.5)
     ordinary = {"ply_file_path": "x.ply", "sharpness": 30.0, "colmap_im_id": 3, "n_frames": 7, "aabb_scale": None}
-    neutral = {"unit": "metres", "pose_rotation": np.eye(3).tolist(), "lens": [0.0], "fisheye_crop_radius": 0}
-    assert unknown_keys([ordinary | neutral], _Transforms) == []
+    neutral = {"pose_rotation": np.eye(3).tolist(), "lens": [0.0], "fisheye_crop_radius": 0}
+    (notice,) = unknown_notice(tmp_path, [telling | ordinary | neutral], msgspec.defstruct("Read", []))
+    assert {key for key in telling | ordinary | neutral if f"'{key}'" in notice} == set(telling)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.geometry import invert_pose
 from semantic_mapper.replay.importers import ImportOptions, ImportReport, detect_format, import_recording
 from semantic_mapper.replay.importers.ros_transforms import Track
 from semantic_mapper.replay.log.format import LogReader
@@ -330,7 +328,7 @@ def test_of_two_cameras_one_has_to_be_named(tmp_path: Path) -> None:
         (without(COLOR, DEPTH), "no topic has images; there are /cam/aligned"),
         (
             without("/tf"),
-            f"tf has no frame map, world, odom above the camera: '{CAMERA}' on 'base_link'; .*--world base",
+            f"tf has no frame map, world, odom above the camera: '{CAMERA}' on 'base_link'; .*still: --world base",
         ),
     ],
 )
@@ -339,17 +337,6 @@ def test_what_a_bag_lacks_is_named(
 ) -> None:
     with pytest.raises(ImportSourceError, match=complaint):
         imported(make(tmp_path, "mcap", change))
-
-
-def test_a_world_may_be_named(tmp_path: Path) -> None:
-    src = make(tmp_path, "mcap")
-    _, frames = imported(src, world="/odom")
-    expected = invert_pose(bags.odom_in_map()) @ FRAMES[2].T_world_camera
-    assert np.abs(frames[2].T_world_camera - expected).max() < 1e-6
-    with pytest.raises(
-        ImportSourceError, match=r"no way from .* to earth: 'camera_color_optical_frame' on 'base_link'"
-    ):
-        imported(src, world="earth")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -409,24 +396,6 @@ def test_two_programs_that_publish_one_transform_are_refused(tmp_path: Path) -> 
     assert imported(src)[0].frames == 8  # it was started after the first had ended
 
 
-def test_of_two_robots_with_equal_frames_the_one_of_the_images_counts(tmp_path: Path) -> None:
-    def robots(camera: str) -> Change:
-        def change(m: Messages, events: list[Event]) -> list[Event]:
-            own: list[Event] = []
-            for topic, ns, message in events:
-                topic = f"/r1{topic}" if topic.startswith("/tf") else topic.replace("/cam/", f"{camera}/")
-                own.append((topic, ns, message))
-            return second_source("/r2/tf", 5.0)(m, own)
-
-        return change
-
-    report, frames = imported(make(tmp_path / "own", "mcap", robots("/r1/cam"), LONG))
-    assert notice(report, "transforms of /r2/tf are left out: /r1/cam/color/image_raw is not in its namespace")
-    assert np.abs(frames[3].T_world_camera - LONG[3].T_world_camera).max() < 1e-6
-    with pytest.raises(ImportSourceError, match=r"is published by /r1/tf and.* by /r2/tf: record the true one"):
-        imported(make(tmp_path / "none", "mcap", robots("/cam"), LONG))
-
-
 @pytest.mark.parametrize(
     ("topic", "complaint"),
     [
@@ -437,15 +406,15 @@ def test_of_two_robots_with_equal_frames_the_one_of_the_images_counts(tmp_path: 
 def test_two_places_of_the_camera_are_refused(tmp_path: Path, topic: str, complaint: str) -> None:
     def told(metres: float) -> Change:
         def change(m: Messages, events: list[Event]) -> list[Event]:
-            at = m.tf(bags.stamp_of(1), "base_link", CAMERA, aside(bags.camera_on_base(), metres))
-            return [*events, (topic, bags.stamp_of(1), at)]
+            T = aside(bags.camera_on_base(), metres)
+            times = [bags.stamp_of(n) for n in range(6)]
+            return [*events, *((topic, ns, m.tf(ns, "base_link", CAMERA, T)) for ns in times)]
 
         return change
 
     with pytest.raises(ImportSourceError, match=rf"'{CAMERA}' on 'base_link' .*{complaint}"):
         imported(make(tmp_path / "two", "ros1", told(0.5)))
-    within = imported(make(tmp_path / "one", "ros1", told(0.0005)), match_s=1.0)
-    assert within[0].frames == 6
+    assert imported(make(tmp_path / "one", "ros1", told(0.0005)))[0].frames == 6
 
 
 def track(stamps: np.ndarray, places: np.ndarray, yaw: np.ndarray) -> Track:
@@ -493,30 +462,6 @@ def test_one_source_is_never_taken_for_two() -> None:
         assert {name: track(*case).jump_m() for name, case in cases.items()} == dict.fromkeys(cases, 0.0), count
 
 
-@pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.15, 0.03, 0.001, -0.001, 0.0)])
-def test_each_image_has_the_calibration_of_its_time(tmp_path: Path, lens: tuple[float, ...]) -> None:
-    """An autofocus moves the centre by 0.08 px an image; what differs by less than 0.1 px is one calibration."""
-    true = [dataclasses.replace(FRAMES[0].intrinsics, cx=FRAMES[0].intrinsics.cx + 0.08 * n) for n in range(6)]
-
-    def change(m: Messages, events: list[Event]) -> list[Event]:
-        kept = [event for event in events if event[0] not in (INFO, bags.DEPTH_INFO)]
-        for n, k in enumerate(true):
-            ns = bags.stamp_of(n)
-            kept += [(topic, ns, m.info(ns, CAMERA, k, lens=lens)) for topic in (INFO, bags.DEPTH_INFO)]
-        return kept
-
-    report, frames = imported(make(tmp_path, "mcap", change))
-    assert notice(
-        report, "the calibration of /cam/color/image_raw changes a little: each image has the nearest in time"
-    )
-    for n, frame in enumerate(frames):
-        rectify = Rectifier(dataclasses.replace(true[n - n % 2], distortion=lens if any(lens) else ()))
-        assert frame.intrinsics == rectify.intrinsics
-        assert np.array_equal(frame.rgb, rectify(np.ascontiguousarray(FRAMES[n].rgb[..., ::-1])))
-        metres = (bags.millimetres(FRAMES[n]) / np.float32(1000)).astype(np.float32)
-        assert frame.depth_m is not None and np.array_equal(frame.depth_m, rectify.nearest(metres))
-
-
 def of(topic: str, events: list[Event]) -> list[Any]:
     return [message for name, _, message in events if name == topic]
 
@@ -526,12 +471,8 @@ def empty(message: Any) -> None:
     message.data = np.zeros(0, np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("unnamed", "whose"), [(slice(0, 1), "a later image"), (slice(None), INFO)], ids=["first", "all"]
-)
-def test_images_without_a_frame_get_that_of_a_later_one_or_of_their_calibration(
-    tmp_path: Path, unnamed: slice, whose: str
-) -> None:
+@pytest.mark.parametrize("unnamed", [slice(0, 1), slice(None)], ids=["first", "all"])
+def test_images_without_a_frame_get_that_of_a_later_one_or_of_their_calibration(tmp_path: Path, unnamed: slice) -> None:
     def change(_: Messages, events: list[Event]) -> list[Event]:
         for topic in (COLOR, DEPTH):
             for message in of(topic, events)[unnamed]:
@@ -539,7 +480,7 @@ def test_images_without_a_frame_get_that_of_a_later_one_or_of_their_calibration(
         return events
 
     report, frames = imported(make(tmp_path, "ros1", change))
-    assert report.with_depth == 6 and notice(report, f"names no frame; '{CAMERA}' of {whose} is taken")
+    assert report.with_depth == 6
     assert np.abs(frames[3].T_world_camera - FRAMES[3].T_world_camera).max() < 1e-6
 
 
@@ -570,7 +511,7 @@ def test_poses_without_stamps_have_the_time_of_their_receipt(tmp_path: Path, kin
 
     report, frames = imported(make(tmp_path, "ros1", change), body="" if kind != "pose" else "base_link")
     named = "tf of 'base_link'" if kind == "tf" else "/pose"
-    assert notice(report, f"{named}: 6 poses without a stamp; the time of receipt stands for it")
+    assert notice(report, f"{named}: 6 messages without a stamp; the time of receipt stands for it")
     T_world_odom = bags.odom_in_map() if kind == "tf" else np.eye(4)
     for frame, T in zip(frames, bags.bodies(FRAMES), strict=True):
         assert np.abs(frame.T_world_camera - T_world_odom @ T @ bags.camera_on_base()).max() < 1e-6
@@ -627,8 +568,6 @@ def without_profile(src: Path, dst: Path) -> Path:
         ("mcap", "merged.mcap", without_profile),
         ("sqlite3", "day.db3.zstd", packed),
         ("mcap", "day.zstd", packed),
-        ("ros1", "renamed.data", shutil.copy),
-        ("sqlite3", "renamed.db", shutil.copy),
     ],
 )
 def test_bags_are_known_by_their_content(
@@ -675,5 +614,7 @@ def test_clocks_that_differ_are_named_with_both_ranges(tmp_path: Path) -> None:
         kept = [event for event in events if event[0] != "/tf"]
         return [*kept, *(("/tf", bags.stamp_of(n), m.tf(10**9 * n, "odom", "base_link", np.eye(4))) for n in range(3))]
 
-    with pytest.raises(ImportSourceError, match=r"images of .* are from .*'odom' to 'base_link' from 0.000 to 2.000 s"):
+    with pytest.raises(
+        ImportSourceError, match=r"images of .* are from .*'odom' to 'base_link'. from 0.000 to 2.000 s"
+    ):
         imported(make(tmp_path, "mcap", change))

@@ -13,7 +13,7 @@ from research.scenes.sequence import room_views
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.evaluate.panoptic_truth import InstanceFolder, PanopticTruth
+from semantic_mapper.replay.evaluate.things import InstanceFolder, PanopticTruth
 from semantic_mapper.replay.log.sequence import open_log
 from tests.nodes.support import write_log
 from tests.small import INTRINSICS, tiny_config

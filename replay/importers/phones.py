@@ -1,0 +1,210 @@
+"""Exports of iPhones and iPads: Polycam's raw data, and Record3D's "EXR + RGB". Both have ARKit's world, where y is up,
+and OpenGL's camera axes.
+
+Polycam's developer mode writes, as https://github.com/PolyCam/polyform says ("Polycam's data format"), below
+``keyframes``: ``corrected_images`` and ``corrected_cameras`` (else ``images`` and ``cameras``, as ARKit gave them),
+``depth`` (16-bit PNG, millimetres, smaller than the pictures) and ``confidence`` (8 bits, 0 = low). Files are named by
+the time of capture in microseconds. ``t_ij`` is camera to world.
+
+Record3D writes ``rgb/N.jpg`` (or .png) and ``metadata.json`` with ``K`` (9 numbers, column by column) for pictures of
+``w`` x ``h``, ``fps``, and ``poses``, one for each picture: qx qy qz qw tx ty tz, camera to world in metres. Newer
+versions add ``perFrameIntrinsicCoeffs`` (fx fy cx cy of each picture, as the lens focuses and is stabilised) and
+``frameTimestamps`` (seconds), which come first. The depth of this export is OpenEXR, which is not read: frames come
+without depth.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from semantic_mapper.errors import FrameError, ImportSourceError
+from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.replay.importers.base import PICTURES, DepthScale, ImportOptions, first_size
+from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
+from semantic_mapper.replay.importers.tables import (
+    MAX_NORM_ERROR,
+    convert_known,
+    left_out_notice,
+    numbered_files,
+    read_plain_json,
+    refuse_keys,
+    unknown_notice,
+    without_picture,
+)
+from semantic_mapper.types import CameraIntrinsics, Float64
+
+POLYCAM_SCALE = DepthScale(1000.0, convention="Polycam's millimetres")
+RECORD3D_SCALE = DepthScale(1000.0, convention="no depth image is read")
+RECORD3D_FPS = 60.0  # where nothing tells it
+_POLYCAM_LENS = re.compile(r"[kp]_?\d|distort\w*|is_fisheye")
+_POLYCAM_KNOWN = ("timestamp", "center_depth")  # the time is that of the files' names
+_RECORD3D_KNOWN = ("dw", "dh", "initPose", "cameraType")  # of the depth images, and of what is known from the poses
+
+
+class _Camera(msgspec.Struct):
+    """Of Polycam."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    t_00: float
+    t_01: float
+    t_02: float
+    t_03: float
+    t_10: float
+    t_11: float
+    t_12: float
+    t_13: float
+    t_20: float
+    t_21: float
+    t_22: float
+    t_23: float
+    width: float | None = None  # not in corrected_cameras since 2025
+    height: float | None = None
+
+
+def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
+    """A capture of Polycam, opened.
+
+    Raises:
+        ImportSourceError: no pictures, or none with a camera that can be used.
+    """
+    keyframes = folder / "keyframes"
+    notices: list[str] = []
+    images = numbered_files(keyframes / "corrected_images", PICTURES, notices)
+    kind = "corrected_"
+    if not images or not (keyframes / "corrected_cameras").is_dir():
+        images, kind = numbered_files(keyframes / "images", PICTURES, notices), ""
+        notices.append("no corrected_images: poses are ARKit's own, and the lens distortion is not undone")
+    if not images:
+        raise ImportSourceError(f"{keyframes / 'images'}: no pictures; export 'raw data' (developer mode)")
+    cameras = numbered_files(keyframes / f"{kind}cameras", (".json",), notices)
+    notices += without_picture("camera", cameras, images, keyframes / f"{kind}images")
+    pictures: list[PosedPicture] = []
+    left_out: list[str] = []
+    tables: list[dict[str, Any]] = []
+    for time_us, image in images.items():
+        file = keyframes / f"{kind}cameras" / f"{image.stem}.json"
+        try:
+            tables.append(read_plain_json(file))
+            refuse_keys(tables[-1], _POLYCAM_LENS, file)
+            camera = convert_known(tables[-1], _Camera, file)
+            intrinsics = _polycam_intrinsics(camera, image)
+        except (ImportSourceError, FrameError) as error:
+            left_out.append(f"{image}: {error}")
+            continue
+        depth, confidence = (keyframes / name / f"{image.stem}.png" for name in ("depth", "confidence"))
+        T_world_gl = np.array([[getattr(camera, f"t_{i}{j}") for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]])
+        T = T_Z_UP_Y_UP @ T_world_gl @ GL_AXES
+        stamp_ns = 1000 * (time_us - min(images))
+        pictures.append(PosedPicture(image, intrinsics, T, stamp_ns, depth, confidence))
+    if not pictures:
+        raise ImportSourceError(f"{keyframes}: no picture has a camera that can be used: {left_out[0]}")
+    notices += left_out_notice("picture", left_out, "without a camera")
+    notices += unknown_notice(keyframes / f"{kind}cameras", tables, _Camera, _POLYCAM_KNOWN)
+    return PosedPictures(f"polycam {folder.resolve().name}", pictures, options, POLYCAM_SCALE, notices)
+
+
+def _polycam_intrinsics(camera: _Camera, image: Path) -> CameraIntrinsics:
+    size = (camera.width, camera.height) if camera.width and camera.height else first_size([image])
+    if size is None:
+        raise ImportSourceError("its camera has no width and height, and it cannot be read")
+    return CameraIntrinsics(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5, int(size[0]), int(size[1]))
+
+
+class _Metadata(msgspec.Struct, rename={"per_frame_k": "perFrameIntrinsicCoeffs", "frame_times": "frameTimestamps"}):
+    """Of Record3D. Values of frames are read one by one, so that a bad one costs no other."""
+
+    poses: list[Any]
+    w: float
+    h: float
+    K: list[float] = []
+    per_frame_k: list[Any] = []
+    frame_times: list[Any] = []
+    fps: float | None = None
+
+
+def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
+    """An export of Record3D, opened.
+
+    Raises:
+        ImportSourceError: metadata or pictures are missing or cannot be understood.
+    """
+    file = folder / "metadata.json"
+    plain = read_plain_json(file)
+    found = convert_known({key: value for key, value in plain.items() if value is not None}, _Metadata, file)
+    notices = unknown_notice(file, [plain], _Metadata, _RECORD3D_KNOWN)
+    images = numbered_files(folder / "rgb", PICTURES, notices)
+    if not images:
+        raise ImportSourceError(f"{folder / 'rgb'}: no pictures; export as 'EXR + RGB'")
+    notices += without_picture("pose", range(len(found.poses)), images, folder / "rgb")
+    if (folder / "depth").is_dir():
+        notices.append("the depth images (OpenEXR) are not read; frames come without depth")
+    pictures: list[PosedPicture] = []
+    left_out: list[str] = []
+    for (number, image), second in zip(images.items(), _seconds(found, list(images), file, notices), strict=True):
+        try:
+            k, pose = _record3d_intrinsics(found, number), _record3d_pose(found, number)
+        except ValueError as error:  # FrameError, too
+            left_out.append(f"{image}: {error}")
+            continue
+        pictures.append(PosedPicture(image, k, pose, round(second * 1e9)))
+    if not pictures:
+        raise ImportSourceError(f"{file}: tells the pose of none of the pictures: {left_out[0]}")
+    notices += left_out_notice("picture", left_out)
+    return PosedPictures(f"record3d {folder.resolve().name}", pictures, options, RECORD3D_SCALE, notices)
+
+
+def _numbers(rows: list[Any], number: int, count: int) -> Float64 | None:
+    """The first ``count`` numbers of a row; None where they are missing or not finite."""
+    try:
+        row = np.array(rows[number][:count], np.float64)
+    except (IndexError, TypeError, ValueError):
+        return None
+    return row if row.shape == (count,) and np.isfinite(row).all() else None
+
+
+def _record3d_pose(found: _Metadata, number: int) -> Float64:
+    row = _numbers(found.poses, number, 7)
+    if row is None or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
+        raise ValueError("its pose is missing, or no unit quaternion qx qy qz qw and position")
+    return T_Z_UP_Y_UP @ pose_matrix(row[4:], row[:4]) @ GL_AXES
+
+
+def _record3d_intrinsics(found: _Metadata, number: int) -> CameraIntrinsics:
+    k = _numbers(found.per_frame_k, number, 4)
+    if (k is None or (k <= 0).any()) and len(found.K) == 9:
+        k = np.array(found.K)[[0, 4, 6, 7]]
+    if k is None or (k <= 0).any():
+        raise ValueError("it has no intrinsics: neither K nor 4 numbers of perFrameIntrinsicCoeffs")
+    fx, fy, cx, cy = k.tolist()
+    return CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, int(found.w), int(found.h))
+
+
+def _seconds(found: _Metadata, numbers: list[int], file: Path, notices: list[str]) -> list[float]:
+    """Time of each picture, from 0. One that is missing lies between its neighbours, or at the usual rate beyond the
+    first and the last."""
+    rate = found.fps if found.fps and 0 < found.fps <= 1000 else RECORD3D_FPS
+    wanted = np.array(numbers, np.float64)
+    given = [(n, float(t)) for n, t in enumerate(found.frame_times) if isinstance(t, int | float) and math.isfinite(t)]
+    if not given:
+        if rate != found.fps:
+            notices.append(f"{file}: tells neither times nor fps: stamps are made up at {rate:g} frames a second")
+        return (wanted / rate).tolist()
+    known, times = np.array(given, np.float64).T
+    missing = [f"number {n}" for n in numbers if n not in known]
+    if missing:
+        notices.append(
+            f"{file}: {len(missing)} of frameTimestamps missing; their stamps lie between those of their neighbours, "
+            f"or follow at {rate:g} frames a second; the first: {missing[0]}"
+        )
+    beyond = np.maximum(wanted - known[-1], 0) - np.maximum(known[0] - wanted, 0)
+    seconds = np.interp(wanted, known, times) + beyond / rate
+    return (seconds - seconds.min()).tolist()

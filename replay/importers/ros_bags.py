@@ -1,0 +1,506 @@
+"""Files and messages of ROS bags: which files are bags, what their topics hold, and images as messages have them.
+
+Files are known by their content: bags that were merged, renamed or packed have other names and profiles. Depth follows
+REP 118: 16UC1 is millimetres with 0 for no measurement, 32FC1 is metres with NaN. ``compressedDepth`` is 12 bytes and a
+PNG; of 32FC1 it holds the inverse depth, quantised.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+from semantic_mapper.drivers.lens import lens_intrinsics
+from semantic_mapper.errors import (
+    CodecError,
+    ConfigError,
+    DependencyError,
+    FrameError,
+    ImportSourceError,
+    SemanticMapperError,
+)
+from semantic_mapper.files import open_regular
+from semantic_mapper.plain_text import visible
+from semantic_mapper.replay.importers.base import metres
+from semantic_mapper.transport.codec import EncodedImage
+from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+
+_PACKED = (".zstd", ".zst")
+_MCAP_MAGIC, _SQLITE_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0"
+_HEAD_BYTES = 1 << 15
+LISTED = 12  # topics that an error names
+LOOKED_AT = 100  # messages of a topic until one tells what it is
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+# What gives the pose of a frame that it names, and what gives one without saying whose.
+NAMED_POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped")
+POSES = (*NAMED_POSES, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_IMAGES = (("sensor_msgs/msg/Image", "encoding"), ("sensor_msgs/msg/CompressedImage", "format"))
+_REPAIR = (
+    "`ros2 bag reindex`, `mcap recover` or `rosbag reindex` repairs a bag whose recorder was killed; one that was "
+    "copied in part has to be copied again"
+)
+UNITS_PER_M = 1000.0  # of 16-bit depth
+# Encoding -> bytes a pixel, and what makes RGB of it; None = it is RGB.
+COLOR_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "8UC4": (4, cv2.COLOR_BGRA2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+}
+DEPTH_ENCODINGS = {"16UC1": np.dtype("<u2"), "mono16": np.dtype("<u2"), "32FC1": np.dtype("<f4")}
+_MAX_SIDE = 1 << 14  # pixels
+_COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")  # format, and A and B of the quantised inverse depth
+
+
+def is_bag(src: Path) -> bool:
+    """Whether a file is a bag, or a folder is one of ROS 2, complete or without its metadata."""
+    if not src.is_dir():
+        return _is_bag_file(src)
+    files = _storage_files(src)
+    return bool(files) and ((src / "metadata.yaml").exists() or all(map(_is_bag_file, files)))
+
+
+def _is_bag_file(file: Path) -> bool:
+    if file.suffix == ".mcap":
+        return _holds_ros2(file)
+    if file.suffix in _PACKED:
+        try:
+            with file.open("rb") as source, zstandard.ZstdDecompressor().stream_reader(source) as packed:
+                return packed.read(_HEAD_BYTES).startswith((_MCAP_MAGIC, _SQLITE_MAGIC))
+        except (OSError, zstandard.ZstdError):
+            return False
+    return file.suffix in (".bag", ".db3")  # one that is damaged is still a bag
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    """Files of a folder that may be parts of a bag of ROS 2."""
+    return sorted(f for f in folder.iterdir() if f.suffix in (".mcap", ".db3", *_PACKED)) if folder.is_dir() else []
+
+
+def _head(file: Path) -> bytes:
+    """The first bytes of a file; none where it cannot be read."""
+    try:
+        with open_regular(file) as opened:
+            return opened.read(_HEAD_BYTES)
+    except (OSError, ConfigError):
+        return b""
+
+
+def _profile(file: Path) -> bytes:
+    """That of an MCAP file: after magic, op code, and the lengths of the record and of it."""
+    head = _head(file)
+    return head[21 : 21 + int.from_bytes(head[17:21], "little")] if head.startswith(_MCAP_MAGIC) else b"ros2"
+
+
+def _holds_ros2(file: Path) -> bool:
+    """Whether an MCAP file is a bag of ROS 2: by its profile, or, where `mcap merge` left it empty, by its schemas."""
+    if _profile(file):
+        return _profile(file) == b"ros2" and _head(file).startswith(_MCAP_MAGIC)
+    try:
+        with file.open("rb") as source:
+            schema, _, _ = next(iter(make_reader(source).iter_messages()))
+            return schema is not None and schema.encoding in ("ros2msg", "ros2idl")
+    except (OSError, McapError, StopIteration, ValueError):
+        return False
+
+
+def _readable(src: Path) -> tuple[list[Path], tempfile.TemporaryDirectory[str] | None]:
+    """What rosbags is to open, and the folder of what had to be made for that.
+
+    Raises:
+        ImportSourceError: a packed file is damaged.
+    """
+    if src.is_dir() and (src / "metadata.yaml").exists():
+        return [src], None
+    files = [src] if src.is_file() else _storage_files(src)
+    if all(file.suffix not in _PACKED and _profile(file) for file in files):
+        return files, None
+    folder = tempfile.TemporaryDirectory(prefix="semantic-mapper-bag-")
+    made: list[Path] = []
+    for file in files:
+        unpacked = _unpacked(file, Path(folder.name)) if file.suffix in _PACKED else file
+        made.append(unpacked if _profile(unpacked) else _with_profile(unpacked, Path(folder.name)))
+    return made, folder
+
+
+def _unpacked(file: Path, folder: Path) -> Path:
+    path = folder / file.stem
+    try:
+        with file.open("rb") as packed, path.open("wb") as out:
+            zstandard.ZstdDecompressor().copy_stream(packed, out)
+    except (OSError, zstandard.ZstdError) as error:
+        raise ImportSourceError(f"{file}: cannot be unpacked: {error}; copy it again") from error
+    return path.rename(path.with_suffix(".mcap" if _head(path).startswith(_MCAP_MAGIC) else ".db3"))
+
+
+def _with_profile(file: Path, folder: Path) -> Path:
+    """The messages of a bag, written again with the profile that rosbags asks for."""
+    path = folder / f"{file.stem}-ros2.mcap"
+    channels: dict[int, int] = {}
+    try:
+        with file.open("rb") as source, path.open("wb") as out:
+            writer = Writer(out)
+            writer.start(profile="ros2")
+            for schema, channel, message in make_reader(source).iter_messages():
+                if channel.id not in channels and schema is not None:
+                    of = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    metadata = {"offered_qos_profiles": "", **channel.metadata}
+                    channels[channel.id] = writer.register_channel(
+                        channel.topic, channel.message_encoding, of, metadata
+                    )
+                if channel.id in channels:
+                    writer.add_message(
+                        channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+                    )
+            writer.finish()
+    except (OSError, McapError, ValueError) as error:
+        raise ImportSourceError(f"{file}: cannot be read: {error}; `mcap recover` repairs what was cut off") from error
+    return path
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of images.
+
+    Args:
+        name: Of the topic; ``encoding``: of its first message with data.
+        raw: ``sensor_msgs/Image``, not compressed.
+        frame: Of the first message that names one.
+    """
+
+    name: str
+    raw: bool
+    encoding: str
+    frame: str
+
+    @property
+    def rectified(self) -> bool:
+        """Whether its images have no lens distortion any more."""
+        return re.search(r"(^|_)rect(_|$)|rectified", self.base.rsplit("/", 1)[-1]) is not None
+
+    @property
+    def base(self) -> str:
+        """Name without the transport."""
+        return self.name if self.raw else re.sub("/compressed(Depth)?$", "", self.name)
+
+    def __str__(self) -> str:
+        return f"{self.name} ({visible(self.encoding)})"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """A ``sensor_msgs/CameraInfo``.
+
+    Args:
+        frame: Of the camera.
+        size: (width, height) of its images.
+        model: Of the lens.
+        K: (9,) of the raw image; P: (12,) of the rectified one.
+        D: Coefficients of the lens.
+        R: (3, 3) by which rectification turns the image.
+        whole: Without binning, and without a region of interest.
+    """
+
+    frame: str
+    size: tuple[int, int]
+    model: str
+    K: Float64
+    D: Float64
+    R: Float64
+    P: Float64
+    whole: bool
+
+    @property
+    def says_something(self) -> bool:
+        """Cameras send some before they know."""
+        return bool((self.K.any() or self.P.any()) and all(np.isfinite(m).all() for m in (self.K, self.D, self.P)))
+
+    def intrinsics(self, *, rectified: bool) -> CameraIntrinsics:
+        """Of the raw image, or of one whose lens distortion has been removed already.
+
+        Raises:
+            ImportSourceError: not calibrated, a lens model that is not OpenCV's, skew, binning or a region of interest.
+        """
+        where = "its camera_info"
+        if not self.whole:
+            raise ImportSourceError(f"{where} has binning or a region of interest, which is not read: record it whole")
+        rectified = rectified and bool(self.P.any() or self.D.any())  # a pinhole camera's driver may leave P empty
+        K = (self.P if rectified else self.K).reshape(3, -1)
+        if K[0, 1] or K[1, 0]:
+            raise ImportSourceError(f"{where} has skew, which is not undone: calibrate without it, and record again")
+        k = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        if not k[0] or not k[1]:
+            matrix = "P" if rectified else "K"
+            raise ImportSourceError(
+                f"{where} is not calibrated ({matrix} is zero): calibrate the camera, and record again"
+            )
+        try:
+            return (
+                CameraIntrinsics(*k, *self.size)
+                if rectified
+                else lens_intrinsics(self.model, self.D.tolist(), k, self.size)
+            )
+        except (ConfigError, FrameError) as error:
+            raise ImportSourceError(
+                f"{where} cannot be used: {error}; or rectify the images (image_proc), and name that topic"
+            ) from error
+
+
+class Bag:
+    """A bag that is open, by the names of its topics.
+
+    Raises:
+        ImportSourceError: it cannot be read.
+        DependencyError: the package is missing.
+    """
+
+    def __init__(self, src: Path) -> None:
+        self.src = src
+        try:
+            highlevel, typesys = (importlib.import_module(f"rosbags.{name}") for name in ("highlevel", "typesys"))
+        except ImportError as error:
+            raise DependencyError(
+                f"ROS bags cannot be read: {error}. Run `make setup`, or install it yourself: pip install "
+                "'rosbags>=0.11.9'"
+            ) from error
+        paths, self._unpacked = _readable(src)  # what was made for it is there as long as this is
+        with self._explained():
+            # Bags of ROS 2 before Iron hold no definitions of their messages; those read here have not changed since.
+            types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+            self._reader = highlevel.AnyReader(paths, default_typestore=types)
+            self._reader.open()
+        self._is_ros2: bool = self._reader.is2
+        self._streams: dict[str, tuple[int, Iterator[tuple[Any, int, bytes]]]] = {}  # next index, and its messages
+
+    def topics(self, *types: str) -> list[str]:
+        """Names of topics of these types that have messages."""
+        return sorted({c.topic for c in self._reader.connections if c.msgtype in types and c.msgcount})
+
+    def listing(self) -> str:
+        """All topics, for people."""
+        names = sorted({f"{c.topic} ({c.msgtype.replace('/msg/', '/')})" for c in self._reader.connections})
+        more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+        return visible(", ".join(names[:LISTED])) + more if names else "no topic at all"
+
+    def image_topics(self) -> list[Topic]:
+        """Topics of images that have messages, by the first of them that tell what they are."""
+        found: list[Topic] = []
+        for kind, field in _IMAGES:
+            for name in self.topics(kind):
+                encoding = frame = ""
+                for _, _, message, _ in islice(self.messages({name}), LOOKED_AT):
+                    encoding = encoding or (str(getattr(message, field)) if len(message.data) else "")
+                    frame = frame or frame_name(message.header.frame_id)
+                    if encoding and frame:
+                        break
+                found.append(Topic(name, kind == _IMAGES[0][0], encoding, frame))
+        return found
+
+    def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any, str]]:
+        """Topic, time of recording, message, and its node (ROS 1; else empty), in the order of recording."""
+        with self._explained():
+            for connection, received_ns, data in self._reader.messages(connections=self._connections(names)):
+                node = "" if self._is_ros2 else connection.ext.callerid or ""
+                yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype), node
+
+    def message(self, name: str, series: list[tuple[int, int]], index: int) -> Any:
+        """One message of a topic; quick where they are read in order.
+
+        Args:
+            name: Of the topic.
+            series: Stamp and time of recording of all its messages, in the order of recording.
+            index: In ``series``.
+
+        Raises:
+            CodecError: it cannot be read.
+        """
+        position, stream = self._streams.pop(name, (-1, iter(())))
+        try:
+            if not 0 <= position <= index:
+                received_ns = series[index][1]
+                position = next(i for i, (_, at_ns) in enumerate(series) if at_ns >= received_ns)
+                stream = iter(self._reader.messages(connections=self._connections({name}), start=received_ns))
+            with self._explained():
+                connection, _, data = next(islice(stream, index - position, None))
+                message = self._reader.deserialize(data, connection.msgtype)
+        except (ImportSourceError, StopIteration) as error:
+            raise CodecError(f"cannot be read: {error}") from error
+        self._streams[name] = (index + 1, stream)
+        return message
+
+    def calibration(self, info: Any) -> Calibration:
+        """A ``sensor_msgs/CameraInfo``, whose matrices are called differently in ROS 1 and 2."""
+        names = "kdrp" if self._is_ros2 else "KDRP"
+        K, D, R, P = (np.asarray(getattr(info, name), np.float64) for name in names)
+        roi, size = info.roi, (info.width, info.height)
+        cut = 0 < roi.width < info.width or 0 < roi.height < info.height or roi.x_offset or roi.y_offset
+        whole = not cut and info.binning_x <= 1 and info.binning_y <= 1
+        frame = frame_name(info.header.frame_id)
+        return Calibration(frame, size, info.distortion_model, K, D, R.reshape(3, 3), P, whole)
+
+    def pose(self, topic: str, message: Any) -> tuple[Any, Any]:
+        """Position and rotation of a message of a topic of poses."""
+        if self._connections({topic})[0].msgtype == "geometry_msgs/msg/TransformStamped":
+            return message.transform.translation, message.transform.rotation
+        pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
+        return pose.position, pose.orientation
+
+    def _connections(self, names: set[str]) -> list[Any]:
+        return [c for c in self._reader.connections if c.topic in names]
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Make of whatever a damaged bag leads to an error that says what to do."""
+        try:
+            yield
+        except (SemanticMapperError, StopIteration, MemoryError):
+            raise
+        except Exception as error:  # storage, compression and messages each raise their own
+            raise ImportSourceError(
+                f"{self.src}: this ROS bag cannot be read: {visible(str(error)) or type(error).__name__}; {_REPAIR}"
+            ) from error
+
+
+def frame_name(name: str) -> str:
+    """As ROS 2 writes it: ROS 1 begins some names with a slash."""
+    return name.lstrip("/")
+
+
+def is_depth(topic: str, encoding: str) -> bool:
+    """Whether images of this topic are depth.
+
+    Args:
+        topic: Its name, which decides where the encoding leaves it open.
+        encoding: Of an image, or the format of a compressed one.
+    """
+    pixels = re.split("[; ]", encoding.strip())[0]
+    named = "depth" in topic.lower()
+    return "compressedDepth" in encoding or pixels in ("16UC1", "32FC1") or (pixels == "mono16" and named)
+
+
+def is_grey(encoding: str) -> bool:
+    """Whether images of this encoding, or compressed format, have no colour."""
+    return re.split("[; ]", encoding.strip())[0] in ("mono8", "8UC1")
+
+
+def color_image(message: Any) -> UInt8:
+    """RGB (H, W, 3) of a ``sensor_msgs/Image``.
+
+    Raises:
+        CodecError: another encoding, or fewer bytes than its size needs.
+    """
+    if message.encoding not in COLOR_ENCODINGS:
+        raise CodecError(f"images of encoding '{message.encoding}' are not read, only {', '.join(COLOR_ENCODINGS)}")
+    bytes_a_pixel, code = COLOR_ENCODINGS[message.encoding]
+    rows = _rows(message, bytes_a_pixel)
+    pixels = rows.reshape(message.height, message.width, bytes_a_pixel)
+    if code is None:
+        return pixels
+    try:
+        return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+    except cv2.error as error:
+        raise CodecError(
+            f"{message.encoding} of {message.width}x{message.height} is no image: {error.err or error}"
+        ) from error
+
+
+def compressed_color_image(message: Any) -> tuple[UInt8, EncodedImage]:
+    """RGB (H, W, 3) of a ``sensor_msgs/CompressedImage``, and its file as it is.
+
+    Raises:
+        CodecError: neither JPEG nor PNG, or damaged.
+    """
+    data = message.data.tobytes()
+    rgb, encoding = decode_image_file(data)
+    return rgb, EncodedImage(encoding, data)
+
+
+def depth_image(message: Any) -> Float32:
+    """Depth (H, W) in metres of a ``sensor_msgs/Image``, 0 where nothing was measured.
+
+    Raises:
+        CodecError: another encoding, or fewer bytes than its size needs.
+    """
+    if message.encoding not in DEPTH_ENCODINGS:
+        known = ", ".join(DEPTH_ENCODINGS)
+        raise CodecError(f"depth images of encoding '{message.encoding}' are not read, only {known}")
+    kind = DEPTH_ENCODINGS[message.encoding]
+    values = _rows(message, kind.itemsize).view(kind.newbyteorder(">") if message.is_bigendian else kind)
+    return _metres(values)
+
+
+def compressed_depth_image(message: Any) -> Float32:
+    """Depth (H, W) in metres of a ``sensor_msgs/CompressedImage`` of transport compressedDepth, or a 16-bit PNG.
+
+    Raises:
+        CodecError: another compression than PNG, or damaged.
+    """
+    data = message.data.tobytes()
+    quantised = None
+    if "compressedDepth" in message.format:
+        if len(data) <= _COMPRESSED_DEPTH_HEAD.size:
+            raise CodecError(f"compressed depth of {len(data)} bytes holds no image")
+        if "rvl" in message.format.lower():
+            raise CodecError("depth compressed by RVL is not read: record it as PNG, or republish it raw")
+        _, a, b = _COMPRESSED_DEPTH_HEAD.unpack_from(data)
+        quantised = (a, b) if message.format.strip().startswith("32FC1") else None
+        data = data[_COMPRESSED_DEPTH_HEAD.size :]
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise CodecError(f"the depth image is damaged: {error}") from error
+    if image is None or image.dtype != np.uint16 or image.ndim != 2:
+        raise CodecError(f"the depth image of format '{message.format}' is damaged, or no PNG of 16 bits")
+    values = np.asarray(image, np.uint16)
+    if quantised is None:
+        return _metres(values)
+    a, b = quantised
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _metres(np.where(values > 0, a / (values.astype(np.float32) - b), 0).astype(np.float32))
+
+
+def _rows(message: Any, bytes_a_pixel: int) -> UInt8:
+    """The bytes of an image without padding, (H, W * bytes_a_pixel); raises CodecError."""
+    height, width, step = message.height, message.width, message.step
+    used = width * bytes_a_pixel
+    if not (0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE) or step < used or len(message.data) < height * step:
+        raise CodecError(
+            f"an image of {width}x{height} with {step} bytes a row does not fit into its {len(message.data)} bytes"
+        )
+    return np.ascontiguousarray(message.data[: height * step].reshape(height, step)[:, :used])
+
+
+def _metres(values: NDArray[np.generic]) -> Float32:
+    if values.dtype.kind == "u":
+        return depth_from_uint16(values.astype(np.uint16), UNITS_PER_M)
+    return metres(values)
