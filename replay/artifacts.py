@@ -36,9 +36,8 @@ from semantic_mapper.replay.page import (
     write_page,
 )
 from semantic_mapper.replay.run_folder import MAP_NAME
-from semantic_mapper.replay.session import MAX_LISTED, MapSession, Refusal
-from semantic_mapper.replay.stats import LatencyHistogram
-from semantic_mapper.replay.summary import SUMMARY_FILE, notes, summary_table
+from semantic_mapper.replay.session import MAX_LISTED, LatencyHistogram, MapSession, Refusal
+from semantic_mapper.replay.summary import SUMMARY_FILE, describe_depth, notes, summary_table
 from semantic_mapper.types import Float64
 
 _log = get_logger(__name__)
@@ -101,7 +100,7 @@ def finish_session(
     progress()
     graph = find_graph(voxel_map)
     progress()
-    _draw_overview(session, points, graph, out / OVERVIEW_NAME)
+    _draw_overview(session, points, graph, summary, out / OVERVIEW_NAME)
     progress()
     if session.rerun is not None:
         session.rerun.finish(points, graph)
@@ -117,21 +116,41 @@ def clear_results(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _draw_overview(session: MapSession, points: MapPoints, graph: SceneGraph | None, path: Path) -> None:
-    label_set = session.pipeline.label_set
+def _draw_overview(
+    session: MapSession, points: MapPoints, graph: SceneGraph | None, summary: Mapping[str, Any], path: Path
+) -> None:
     voxel_map = session.pipeline.voxel_map
     size = f"voxels of {voxel_size_text(voxel_map.config.voxel_size_m, voxel_map.scale_known)}"
     picture = draw_overview(
         view_strips(session, OVERVIEW_FRAMES),
         points,
-        label_set,
+        session.pipeline.label_set,
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
-        subtitle=_pose_line(session) + _empty_line(session, points) + _scores_line(session) + _depth_line(session),
+        subtitle=_subtitle(session, summary),
         up=map_up(session),
         unit=picture_unit(session),
         rooms=[(f"room {room.id}: {room.area_m2:.0f} m²", room.outline) for room in graph.rooms] if graph else (),
     )
     write_picture(path, picture)
+
+
+def _subtitle(session: MapSession, summary: Mapping[str, Any]) -> str:
+    """What is to be known of a picture of the map: what is wrong, its score, and where depth comes from."""
+    said: list[str] = []
+    if summary["pose_check"]["warning"]:
+        said.append("POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json)")
+    if summary["map"]["nearly_empty"]:
+        said.append("MAP NEARLY EMPTY (see summary.json)")
+    miou = summary["metrics"]["miou"]
+    if miou is not None:
+        said.append(f"mIoU {100 * miou:.1f} % over {session.scored} labelled frames that the weights have not seen")
+    else:
+        said.append(
+            "no score: its labels are pseudo labels" if session.pseudo_labelled else "no labels to score against"
+        )
+    if summary["depth"]["source"] != "sensor":
+        said.append(f"depth: {describe_depth(summary['depth'])}")
+    return "; ".join(said)
 
 
 def picture_unit(session: MapSession) -> str:
@@ -158,26 +177,6 @@ def view_strips(session: MapSession, count: int) -> list[ViewStrip]:
     return strips
 
 
-def _scores_line(session: MapSession) -> str:
-    miou = session.confusion.metrics().miou
-    if miou is None:
-        return "no score: its labels are pseudo labels" if session.pseudo_labelled else "no labels to score against"
-    return f"mIoU {100 * miou:.1f} % over {session.scored} labelled frames that the weights have not seen"
-
-
-def _pose_line(session: MapSession) -> str:
-    return "POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json); " if session.pipeline.pose_check.warning else ""
-
-
-def _depth_line(session: MapSession) -> str:
-    source = _depth_source(session)
-    if source["source"] == "sensor":
-        return ""
-    ways = {"computed_fraction": "computed from the pictures", "rendered_fraction": "rendered by the field"}
-    parts = [f"{how} for {100 * source[key]:.0f} % of the frames" for key, how in ways.items() if source[key]]
-    return f"; depth: {', '.join(parts)} (no sensor depth)"
-
-
 def nearly_empty(session: MapSession, points: int) -> str | None:
     """Why a map has hardly any surface for the space that its frames measured, and what to do; None where it has.
 
@@ -196,36 +195,18 @@ def nearly_empty(session: MapSession, points: int) -> str | None:
             "agree well enough from frame to frame to make a surface: record with a depth camera, or import depth "
             'images, too; or have it computed from the pictures (depth.source = "auto")'
         )
-    if 2 * session.computed_depth >= mapped and 2 * session.too_little_motion >= session.computed_depth:
-        return (
-            f"{found}; for {session.too_little_motion} of them the camera had not moved enough to compute depth from "
-            "the pictures: move it sideways, a few centimetres a frame, with views that overlap; turning alone or "
-            "standing still shows no depth"
-        )
-    if 2 * session.computed_depth >= mapped and 2 * session.fused <= session.computed_depth:
-        return (
-            f"{found}; depth computed from their pictures is too unsure in all but {session.fused} of them: the way of "
-            "the camera is too short, against the error of its poses, to tell lengths from it; move on sideways, by "
-            "half a metre or more"
-        )
     if 2 * session.computed_depth >= mapped:
         return (
-            f"{found}; depth computed from their pictures does not agree from frame to frame: it needs poses that are "
-            "exact (T_world_camera, metres, stamped with the time of capture), rectified, sharp images "
-            "and surfaces with texture; move sideways, with views that overlap"
+            f"{found}; depth computed from their pictures is missing ({session.too_little_motion} frames moved too "
+            "little), too unsure, or does not agree from frame to frame: move the camera sideways, a few centimetres a "
+            "frame and half a metre or more in all, with views that overlap; it needs poses that are exact "
+            "(T_world_camera, metres, stamped with the time of capture), rectified, sharp images and surfaces with "
+            "texture"
         )
     return (
         f"{found}; their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
         "(T_world_camera, metres, stamped with the time of capture)"
     )
-
-
-def _empty_line(session: MapSession, points: MapPoints) -> str:
-    if nearly_empty(session, len(points.xyz)) is None:
-        return ""
-    without = session.without_depth + session.too_little_motion
-    why = "no depth" if 2 * without >= session.fused else "depth disagrees"
-    return f"MAP NEARLY EMPTY ({why}; see summary.json); "
 
 
 def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:

@@ -7,31 +7,29 @@ What was rendered is marked in each frame (``PosedFrame.label_is_pseudo``, ``dep
 from __future__ import annotations
 
 import hashlib
+import shutil
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, LabelError, LogError, WeightsError
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.scene.panoptic import Panoptic
-from semantic_mapper.imaging import working_intrinsics
+from semantic_mapper.files import write_bytes, write_json
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, AutolabelNote
-from semantic_mapper.replay.instance_images import InstanceImages
+from semantic_mapper.replay.evaluate.things import thing_image
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.format import LogWriter, atomic_log
 from semantic_mapper.replay.log.reader import LogReader
@@ -45,14 +43,13 @@ from semantic_mapper.replay.log.sequence import (
     parts_on_disk,
     read_part,
 )
-from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.transport.codec import Envelope, decode_as, encode, with_computed_depth, with_label
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float32, MapUpdate, PosedFrame, UInt8
 
-RENDERED_SPREAD = 0.05  # one sigma of depth that a field of the scene renders, as a fraction of depth; assumed
 SCENE_RAYS = 36_000  # rendered at least for a frame by a field of the scene, or all: small images have no sharper views
 DEPTH_STEPS_PER_M = 1000.0  # computed depth and its spread are rounded to millimetres, which pack to a fifth
+INSTANCES_FILE = "instances.json"
 
 _log = get_logger(__name__)
 
@@ -66,7 +63,7 @@ class AutolabelRequest:
         out: New log; of several parts, the name of the first.
         weights: None = those that ship with the package.
         config: Of the mapper that renders.
-        depth: Also give frames without depth what was computed or rendered.
+        depth: Also give frames without depth what was computed from the pictures.
         min_confidence: Pixels that are less sure are unknown.
         overwrite_labels: Replace labels that are there, too.
         max_frames: 0 = all.
@@ -106,11 +103,10 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
 
     Source views of a frame are those that ``replay`` and ``eval`` choose: the frame itself and earlier keyframes, the
     frames that the weights were finetuned on among them. A label that is there stays, unless it is a pseudo label or
-    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Weights that know no classes leave
-    all labels as they are, and give depth.
+    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none.
 
     Raises:
-        ConfigError: the new log would be the old one.
+        ConfigError: the new log would lie among the parts of the old one.
         LabelError: labels stay whose classes are not those of the weights.
         LogError: the log cannot be read, the new one is there already or cannot be written, or no frame could be
             rendered. Nothing is left of the new one.
@@ -120,13 +116,15 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
     monitor = monitor or JobMonitor()
     with open_log(request.logs) as log, ExitStack() as stack:
         readers = log.logs if isinstance(log, LogSequence) else [log]
-        _check_place(request, readers)
+        if any(path.is_dir() and path.resolve() == request.out.parent.resolve() for path in request.logs):
+            raise ConfigError(
+                f"{request.out}: lies in the folder of the log's parts, and would be read as one; choose another folder"
+            )
+        for number, there in parts_on_disk(request.out).items():
+            if number < len(readers):
+                raise LogError(f"{there}: exists already; remove it or choose another name")
         bundle = _load(request, log)
-        label_set = log.info.label_set
-        if bundle.checkpoint.model.knows_classes:
-            label_set = _label_set(log, bundle.label_set, request)
-        else:
-            _check_depth_is_missing(log, request)
+        label_set = _label_set(log, bundle.label_set, request)
         bundle.voxel_map.note_scale(log.info.scale_known)
         labeller = _Labeller(bundle, label_set, request)
         if labeller.instances is not None:
@@ -162,29 +160,6 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
     return AutolabelReport(files, note, tuple(labeller.unlabelled), damage)
 
 
-def _check_place(request: AutolabelRequest, readers: list[LogReader]) -> None:
-    """Refuse a new log in place of a file that exists.
-
-    Raises:
-        ConfigError: it is the old one, or would be taken for a part of it.
-        LogError: it is there already.
-    """
-    out = request.out
-    if out.is_dir():
-        raise ConfigError(f"{out}: is a folder; give the name of a file")
-    if out.resolve() in {reader.path.resolve() for reader in readers}:
-        raise ConfigError(f"{out}: is the log itself; choose another name for the new one")
-    if any(path.is_dir() and path.resolve() == out.parent.resolve() for path in request.logs):
-        raise ConfigError(
-            f"{out}: lies in the folder of the log's parts, and would be read as one; choose another folder"
-        )
-    there = [out] if out.exists() else []
-    if len(readers) > 1:
-        there += parts_on_disk(out).values()
-    if there:
-        raise LogError(f"{there[0]}: exists already; remove it or choose another name")
-
-
 def _load(request: AutolabelRequest, log: Log) -> Mapper:
     """Weights and the pipeline that renders them, of a field of the scene at least ``SCENE_RAYS`` of a frame.
 
@@ -193,16 +168,10 @@ def _load(request: AutolabelRequest, log: Log) -> Mapper:
     """
     bundle = Mapper.load(request.weights, request.config)
     model = bundle.checkpoint.model
-    if model.knows_classes and len(bundle.label_set) < 2:
+    if not model.knows_classes or len(bundle.label_set) < 2:
         raise WeightsError(
-            f"{bundle.weights_path}: knows one class only ({bundle.label_set.names[0]}), so that there is nothing to "
-            "label; give weights that were trained on labels"
-        )
-    if not model.knows_classes and (request.overwrite_labels or not request.depth):
-        raise WeightsError(
-            f"{bundle.weights_path}: a field of kind '{model.kind}' knows no classes, so that it can label nothing; "
-            "with --depth, and without --overwrite-labels, it gives frames the depth that it renders. For labels give "
-            "weights that were trained on some"
+            f"{bundle.weights_path}: a field of kind '{model.kind}' knows no classes, or one only, so that it can "
+            "label nothing; give weights that were trained on labels"
         )
     if request.instances is not None and not isinstance(model, Panoptic):
         raise WeightsError(
@@ -211,14 +180,10 @@ def _load(request: AutolabelRequest, log: Log) -> Mapper:
         )
     if not model.holds_scene:
         return bundle
-    config = request.config
-    if request.depth and config.depth.source == "auto":
-        depth = msgspec.structs.replace(config.depth, source="sensor")  # else the field renders
-        config = msgspec.structs.replace(config, depth=depth)
     pixels = min((k.width * k.height for k in log.info.cameras.values()), default=SCENE_RAYS)
-    scale = max(config.render.scale, min(1.0, (SCENE_RAYS / pixels) ** 0.5))
-    render = msgspec.structs.replace(config.render, scale=scale)
-    return Mapper.load(request.weights, msgspec.structs.replace(config, render=render))
+    scale = max(request.config.render.scale, min(1.0, (SCENE_RAYS / pixels) ** 0.5))
+    render = msgspec.structs.replace(request.config.render, scale=scale)
+    return Mapper.load(request.weights, msgspec.structs.replace(request.config, render=render))
 
 
 def _label_set(log: Log, weights: LabelSet, request: AutolabelRequest) -> LabelSet:
@@ -241,22 +206,11 @@ def _label_set(log: Log, weights: LabelSet, request: AutolabelRequest) -> LabelS
     return there
 
 
-def _check_depth_is_missing(log: Log, request: AutolabelRequest) -> None:
-    """Weights without classes have something to do only where a frame lacks depth.
-
-    Raises:
-        LogError: none does.
-    """
-    frames = islice(log.frame_parts(), request.max_frames or None)
-    if all(envelope.has_depth for envelope, _ in frames):
-        raise LogError(f"{log.path}: no frame lacks depth, and these weights know no classes: nothing was rendered")
-
-
 def _settings(request: AutolabelRequest) -> str:
     return f"{request.min_confidence} {request.overwrite_labels} {request.depth} {request.max_frames}"
 
 
-def _writer(reader: LogReader, path: Path, label_set: LabelSet | None, name: str) -> AbstractContextManager[LogWriter]:
+def _writer(reader: LogReader, path: Path, label_set: LabelSet, name: str) -> AbstractContextManager[LogWriter]:
     """A new log, or part of one, with what the old one keeps next to its messages."""
     kept = [a for a in reader.attachments().values() if a.name not in (PART_ATTACHMENT, AUTOLABEL_ATTACHMENT)]
     if (part := read_part(reader)) is not None:
@@ -264,11 +218,11 @@ def _writer(reader: LogReader, path: Path, label_set: LabelSet | None, name: str
     return atomic_log(path, _labelled_info(reader.info, label_set), attachments=kept)
 
 
-def _labelled_info(info: StreamInfo, label_set: LabelSet | None) -> StreamInfo:
+def _labelled_info(info: StreamInfo, label_set: LabelSet) -> StreamInfo:
     return msgspec.structs.replace(info, label_set=label_set)
 
 
-def _messages(reader: LogReader, label_set: LabelSet | None) -> Iterator[tuple[Envelope, list[bytes]]]:
+def _messages(reader: LogReader, label_set: LabelSet) -> Iterator[tuple[Envelope, list[bytes]]]:
     """Messages of a log but for the first stream information, which the writer has written; others name the classes."""
     first = True
     for envelope, parts in reader.messages():
@@ -298,43 +252,31 @@ class _Message:
     waits: bool = False
     number: int = -1
 
-    @property
-    def key(self) -> tuple[str, int, int]:
-        """Of a frame."""
-        return self.envelope.source, self.envelope.stamp_ns, self.envelope.seq
-
 
 class _Labeller:
     """Renders frames and writes messages in the order in which they came; frames may wait for later ones.
 
     Args:
         bundle: What renders.
-        label_set: Of the labels to write; None = no labels are written.
+        label_set: Of the labels to write.
         request: What is requested.
     """
 
-    def __init__(self, bundle: Mapper, label_set: LabelSet | None, request: AutolabelRequest) -> None:
+    def __init__(self, bundle: Mapper, label_set: LabelSet, request: AutolabelRequest) -> None:
         self._bundle = bundle
-        self._pipeline: MappingPipeline = bundle.pipeline
+        self._pipeline = bundle.pipeline
         self._request = request
-        label_set = label_set or bundle.label_set
-        self._labels = bundle.checkpoint.model.knows_classes
-        if self._labels:
-            self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))
-        self._ignore_id = label_set.ignore_id
-        self._no_class = np.uint8(bundle.label_set.ignore_id)
+        self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))
+        self._ignore_id = np.uint8(label_set.ignore_id)
         self._queue: deque[_Message] = deque()
-        self._waiting: dict[tuple[str, int, int], deque[_Message]] = {}
+        self._waiting: dict[tuple[str, int, int], list[_Message]] = {}
         self._pixels, self._all_pixels, self._confidence = 0, 0, 0.0
         self.frames = self.rendered = self.labelled = self.kept = self.replaced = self.depth_written = 0
         self.without = 0
         self.unlabelled: list[str] = []
-        model = bundle.checkpoint.model
-        self.instances = (
-            None
-            if request.instances is None or not isinstance(model, Panoptic)
-            else InstanceImages(request.instances, model)
-        )
+        model, self.instances = bundle.checkpoint.model, None
+        if request.instances is not None and isinstance(model, Panoptic):
+            self.instances = InstanceImages(request.instances, model)
 
     def push(self, message: _Message) -> None:
         """Take a message.
@@ -368,7 +310,7 @@ class _Labeller:
             weights=self._bundle.weights_path.name,
             digest=digest,
             kind=checkpoint.model.kind,
-            classes=checkpoint.label_set.names if self._labels else (),
+            classes=checkpoint.label_set.names,
             min_confidence=request.min_confidence,
             overwrite_labels=request.overwrite_labels,
             depth=request.depth,
@@ -387,71 +329,46 @@ class _Labeller:
     def _push_frame(self, message: _Message) -> None:
         try:
             frame = decode_as(PosedFrame, message.parts)
-            message.waits = True
-            self._waiting.setdefault(message.key, deque()).append(message)
             ready = self._pipeline.prepare(replace(frame, label=None, label_is_pseudo=False))
         except (CodecError, FrameError) as error:
-            if message.waits:
-                self._taken(message.key, last=True)
             self._refuse(message, error)
             return
+        message.waits = True
+        self._waiting.setdefault((frame.camera_id, frame.stamp_ns, frame.seq), []).append(message)
         for item in ready:
             self._render(item)
 
     def _render(self, frame: PosedFrame) -> None:
-        message = self._taken((frame.camera_id, frame.stamp_ns, frame.seq))
-        if not self._labels:
-            self._add_only_depth(message, frame)
-            return
+        message = self._waiting[frame.camera_id, frame.stamp_ns, frame.seq].pop(0)
+        message.waits = False
         try:
             update = self._pipeline.step(frame)
         except FrameError as error:
             self._refuse(message, error)
             return
         self.rendered += 1
-        self._label(message, self._ids[update.label], update.confidence)
+        self._label(message, update)
         if self.instances is not None:
-            self.instances.add(message.number, frame, np.where(self._sure(update), update.label, self._no_class))
-        if self._request.depth and not message.envelope.has_depth:
-            self._add_depth(message, frame, update.depth_m)
-
-    def _add_only_depth(self, message: _Message, frame: PosedFrame) -> None:
-        """What a field without classes gives."""
-        self.rendered += 1
-        self.kept += message.envelope.has_label
-        self.without += not message.envelope.has_label
-        if not message.envelope.has_depth:
-            checkpoint = self._bundle.checkpoint
-            self._add_depth(message, frame, rendered_depth(checkpoint.model, frame, checkpoint.width))
-
-    def _taken(self, key: tuple[str, int, int], *, last: bool = False) -> _Message:
-        """The message of a frame, which waits no more."""
-        waiting = self._waiting[key]
-        message = waiting.pop() if last else waiting.popleft()
-        if not waiting:
-            del self._waiting[key]
-        message.waits = False
-        return message
+            unknown = np.uint8(self._bundle.label_set.ignore_id)
+            sure = update.confidence >= self._request.min_confidence
+            self.instances.add(message.number, frame, np.where(sure, update.label, unknown))
+        if self._request.depth and not message.envelope.has_depth and frame.depth_sigma_m is not None:
+            self._add_depth(message, frame)
 
     def _keeps(self, envelope: Envelope) -> bool:
         """Whether a frame has a label that stays."""
-        if not self._labels:
-            return envelope.has_label
         return envelope.has_label and not envelope.has_pseudo_label and not self._request.overwrite_labels
 
-    def _label(self, message: _Message, label: UInt8, confidence: Float32) -> None:
+    def _label(self, message: _Message, update: MapUpdate) -> None:
         if self._keeps(message.envelope):
             self.kept += 1
             return
-        sure = (label != self._ignore_id) & (confidence >= self._request.min_confidence)
-        found = np.where(sure, label, np.uint8(self._ignore_id))
-        self._set_label(message, found if sure.any() else None)
+        label = self._ids[update.label]
+        sure = (label != self._ignore_id) & (update.confidence >= self._request.min_confidence)
+        self._set_label(message, np.where(sure, label, self._ignore_id) if sure.any() else None)
         self._pixels += int(sure.sum())
         self._all_pixels += sure.size
-        self._confidence += float(confidence[sure].sum(dtype=np.float64))
-
-    def _sure(self, update: MapUpdate) -> NDArray[np.bool_]:
-        return update.confidence >= self._request.min_confidence
+        self._confidence += float(update.confidence[sure].sum(dtype=np.float64))
 
     def _set_label(self, message: _Message, label: UInt8 | None) -> None:
         envelope = message.envelope
@@ -469,18 +386,15 @@ class _Labeller:
         else:
             self._set_label(message, None)
 
-    def _add_depth(self, message: _Message, frame: PosedFrame, rendered_m: Float32) -> None:
-        if frame.depth_sigma_m is not None and frame.depth_m is not None:
-            depth_m, sigma_m = frame.depth_m, frame.depth_sigma_m
-        elif self._bundle.checkpoint.model.holds_scene:
-            depth_m, sigma_m = rendered_m, np.float32(RENDERED_SPREAD) * rendered_m
-        else:
-            return
+    def _add_depth(self, message: _Message, frame: PosedFrame) -> None:
+        """Computed depth and its spread."""
+        assert frame.depth_m is not None and frame.depth_sigma_m is not None
+        depth_m, sigma_m = frame.depth_m, frame.depth_sigma_m
         if self._pipeline.voxel_map.scale_known:
             depth_m, sigma_m = _rounded(depth_m, np.rint), _rounded(sigma_m, np.ceil)
-        sigma_m = np.where(depth_m > 0, sigma_m, 0).astype(np.float32)
         if depth_m.any():
             self.depth_written += 1
+            sigma_m = np.where(depth_m > 0, sigma_m, 0).astype(np.float32)
             message.parts = with_computed_depth(message.parts, depth_m, sigma_m)
 
     def _write_ready(self) -> None:
@@ -496,26 +410,65 @@ def _rounded(metres: Float32, how: Callable[[Float32], Float32]) -> Float32:
     return held.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
 
 
-# torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false
+class InstanceImages:
+    """Writes images of things, ``CAMERA/NNNNNN.png``: uint16 ids of boxes, 0 = none; none is there before ``finish``.
 
-
-OPAQUE = 0.5  # opacity from which on a ray has met a surface
-
-
-def rendered_depth(field: LearnedField, frame: PosedFrame, width: int) -> Float32:
-    """z (H, W) in metres at the size of the frame, 0 where a ray meets nothing.
+    ``instances.json`` has each thing's id, class, box, and pixels by frame ("CAMERA/NNNNNN").
 
     Args:
-        field: Holds the scene.
-        frame: Pose and camera.
-        width: Of the rendering, in pixels; each pixel of the frame has the nearest one.
+        folder: New, or of an earlier run, whose images of the same frames are replaced.
+        field: Whose boxes they are of.
+
+    Raises:
+        LogError: the folder cannot be made.
     """
-    k = working_intrinsics(frame.intrinsics, width)
-    sources = field.encode(stack_sources([view_from_frame(frame, field.label_set, k.width)]))
-    nothing = np.zeros((k.height, k.width), np.float32)
-    scene = (field, sources, k, frame.T_world_camera, nothing, field.sampling, 0)
-    found = render_image(*scene, stamp_ns=frame.stamp_ns)
-    depth = (found.depth_m * (found.opacity > OPAQUE)).view(k.height, k.width).numpy()
-    size = (frame.intrinsics.width, frame.intrinsics.height)
-    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+
+    def __init__(self, folder: Path, field: Panoptic) -> None:
+        self._folder, self._field = folder, field
+        self._pixels: dict[int, dict[str, int]] = {b.id: {} for b in field.shape.boxes if b.thing}
+        self._new = not folder.exists()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
+        except OSError as error:
+            raise LogError(f"{folder}: cannot be made: {error.strerror or error}") from error
+
+    def add(self, number: int, frame: PosedFrame, label: UInt8) -> None:
+        """Write the things of a frame, by its number in the log; ``label`` (H, W) says where their classes are.
+
+        Raises:
+            LogError: it cannot be written.
+        """
+        ids = thing_image(self._field, frame, label)
+        name = f"{frame.camera_id}/{number:06d}"
+        path = self._unfinished / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, cv2.imencode(".png", ids)[1].tobytes(), raises=LogError)
+        for thing, count in zip(*np.unique(ids[ids > 0], return_counts=True), strict=True):
+            self._pixels[int(thing)][name] = int(count)
+
+    def finish(self) -> None:
+        """Put all images in place, then the list of things.
+
+        Raises:
+            LogError: they cannot be written.
+        """
+        things: list[dict[str, Any]] = [
+            {"id": b.id, "class": b.class_name, "box": msgspec.to_builtins(b), "pixels": self._pixels[b.id]}
+            for b in self._field.shape.boxes
+            if b.thing
+        ]
+        try:
+            for image in sorted(self._unfinished.rglob("*.png")):
+                place = self._folder / image.relative_to(self._unfinished)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                image.replace(place)
+            write_json(self._folder / INSTANCES_FILE, {"instances": things})
+        except OSError as error:
+            raise LogError(f"{self._folder}: cannot be written: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Remove what was not finished, and the folder if it is new and empty."""
+        shutil.rmtree(self._unfinished, ignore_errors=True)
+        if self._new and not any(self._folder.iterdir()):
+            self._folder.rmdir()

@@ -26,8 +26,8 @@ class AutolabelNote(msgspec.Struct, frozen=True):
         unlabelled: With no label: refused, or nothing of it is sure.
         depth_written: Frames that got computed or rendered depth.
         mean_confidence: Of the pixels with a pseudo label; None without one.
-        labelled_pixels: Fraction of the pixels of frames without a label of their own that have got one; None in logs
-            of older versions, and without such frames.
+        labelled_pixels: Fraction of the pixels of frames without a label of their own that have got one; None without
+            such frames.
         train_stamps_ns: Frames whose labels the weights have learned from: what learns from these labels has, too.
     """
 
@@ -46,8 +46,8 @@ class AutolabelNote(msgspec.Struct, frozen=True):
     unlabelled: int
     depth_written: int
     mean_confidence: float | None
-    train_stamps_ns: tuple[int, ...] = ()
-    labelled_pixels: float | None = None
+    train_stamps_ns: tuple[int, ...]
+    labelled_pixels: float | None
 
     def attachment(self) -> LogAttachment:
         """As it stands in the log."""

@@ -18,14 +18,12 @@ from semantic_mapper.imaging import resize_depth, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import (
-    DIM_TEXT,
+    PANEL,
     SMALL_PT,
-    TEXT,
     Color,
     LegendRow,
-    cut,
+    hex_color,
     new_figure,
-    place,
     put_legend,
     put_picture,
     put_text,
@@ -33,6 +31,7 @@ from semantic_mapper.plots import (
     rendered,
 )
 from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.replay.overview import draw_points, fitted, from_above, put_scale_bar
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 
 if TYPE_CHECKING:
@@ -45,10 +44,8 @@ NEAR_M = 0.05  # edges are cut off nearer than this
 MARGIN, GAP, HEADER, CAPTION = 24, 14, 84, 26
 TILE_WIDTH, PLAN_HEIGHT, LEGEND_WIDTH = 512, 760, 200
 SIDE_M = 25.0  # the view from above ends this far from the camera's path
-ID_PX = (24.0, 13.0)  # around the middle of an id, without another
 POINTS_WIDTH = 160  # of the depth images that the view from above is made of
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]  # of ``Primitive.corners``
-_FOOTPRINT_FILL = 0.15
 
 
 class _Place(NamedTuple):
@@ -74,35 +71,21 @@ def draw_boxes(log: Log, boxes: Sequence[Primitive], title: str) -> tuple[UInt8,
     Raises:
         LogError: it has no frames.
     """
-    places = _places(log)
+    places = [
+        _Place(number, e.stamp_ns, log.info.cameras[e.source], np.array(e.T_world_camera, np.float64).reshape(4, 4))
+        for number, (e, _) in enumerate(log.frame_parts())
+        if e.source in log.info.cameras
+    ]
     if not places:
         raise LogError(f"{log.path}: has no frames to draw boxes over")
     seen = np.array([_in_view(boxes, at) for at in places]).reshape(len(places), len(boxes))
-    chosen = [
-        part[int(seen[part].sum(axis=1).argmax())]
-        for part in np.array_split(np.arange(len(places)), SHOWN)
-        if len(part)
-    ]
-    shown = [(places[i], log.frame(places[i].number)) for i in chosen]
-    step = max(1, len(places) // DEPTH_FRAMES)
-    surface = [log.frame(at.number) for at in places[::step]]
+    thirds = [part for part in np.array_split(np.arange(len(places)), SHOWN) if len(part)]
+    chosen = [places[part[int(seen[part].sum(axis=1).argmax())]] for part in thirds]
+    shown = [(at, log.frame(at.number)) for at in chosen]
+    surface = [log.frame(at.number) for at in places[:: max(1, len(places) // DEPTH_FRAMES)]]
     colors = _class_colors([box.class_name for box in boxes], log.info.label_set)
-    return _draw(shown, surface, [at.T_world_camera for at in places], boxes, colors, title), int(
-        seen.any(axis=0).sum()
-    )
-
-
-def _places(log: Log) -> list[_Place]:
-    return [
-        _Place(
-            number,
-            envelope.stamp_ns,
-            log.info.cameras[envelope.source],
-            np.array(envelope.T_world_camera, np.float64).reshape(4, 4),
-        )
-        for number, (envelope, _) in enumerate(log.frame_parts())
-        if envelope.source in log.info.cameras
-    ]
+    poses = np.stack([at.T_world_camera for at in places])
+    return _draw(shown, surface, poses, boxes, colors, title), int(seen.any(axis=0).sum())
 
 
 def _in_view(boxes: Sequence[Primitive], at: _Place) -> NDArray[np.bool_]:
@@ -117,7 +100,7 @@ def _in_view(boxes: Sequence[Primitive], at: _Place) -> NDArray[np.bool_]:
 def _draw(
     shown: Sequence[tuple[_Place, PosedFrame]],
     surface: Sequence[PosedFrame],
-    poses: Sequence[Float64],
+    poses: Float64,
     boxes: Sequence[Primitive],
     colors: dict[str, Color],
     title: str,
@@ -126,34 +109,30 @@ def _draw(
     width = SHOWN * (TILE_WIDTH + GAP) - GAP
     top = HEADER + CAPTION + max(heights) + GAP + CAPTION
     figure = new_figure(width + 2 * MARGIN, top + PLAN_HEIGHT + MARGIN)
-    put_title(figure, title, f"{counted(len(boxes), 'box', 'boxes')}; ids where there is room for them")
+    put_title(figure, title, counted(len(boxes), "box", "boxes"))
     for column, ((at, frame), height) in enumerate(zip(shown, heights, strict=True)):
         box = (MARGIN + column * (TILE_WIDTH + GAP), HEADER + CAPTION, TILE_WIDTH, height)
         axes = put_picture(figure, box, frame.rgb, f"frame {at.number}, {frame.stamp_ns} ns", smooth=True)
-        there = [replace(b, T_world_box=T) for b in boxes if (T := b.pose_at(at.stamp_ns)) is not None]
-        away = [float(np.linalg.norm(b.T_world_box[:3, 3] - at.T_world_camera[:3, 3])) for b in there]
-        taken: list[tuple[float, float]] = []
-        for n in np.argsort(away, kind="stable"):  # nearest first: ids further away give way
-            _put_edges(axes, there[n], at, colors[there[n].class_name], taken)
+        for b in boxes:
+            if (pose := b.pose_at(at.stamp_ns)) is not None:
+                _put_edges(axes, replace(b, T_world_box=pose), at, colors[b.class_name])
     plan_width = width - LEGEND_WIDTH - GAP
-    _put_plan(figure, (MARGIN, top, plan_width, PLAN_HEIGHT), surface, np.stack(poses), boxes, colors)
+    _put_plan(figure, (MARGIN, top, plan_width, PLAN_HEIGHT), surface, poses, boxes, colors)
     counts = {name: sum(box.class_name == name for box in boxes) for name in colors}
     rows: list[LegendRow] = [(f"{name}, {counts[name]}", color, None) for name, color in colors.items()]
     put_legend(figure, (MARGIN + plan_width + GAP, top, LEGEND_WIDTH, PLAN_HEIGHT), rows)
     return figure
 
 
-def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color, taken: list[tuple[float, float]]) -> None:
-    """The edges of a box in the tile of a frame, and its id where its middle is in view and no other id is."""
-    T_camera_world, k = invert_pose(at.T_world_camera), at.intrinsics
+def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
+    """The edges of a box in the tile of a frame, and its id where its middle is in view."""
+    k = at.intrinsics
     scale = TILE_WIDTH / k.width
     for ends in edges_in_view(box, at.T_world_camera, k):
-        x, y = ((ends + 0.5) * scale).T
-        axes.plot(x, y, color=_rgb(color), linewidth=1.4, linestyle="-")
-    middle = transform(T_camera_world, box.T_world_box[:3, 3][None])
+        axes.plot(*((ends + 0.5) * scale).T, color=hex_color(color), linewidth=1.4, linestyle="-")
+    middle = transform(invert_pose(at.T_world_camera), box.T_world_box[:3, 3][None])
     if nearest_pixels(middle, k)[0][0]:
-        x, y = (project(middle, k)[0] + 0.5) * scale
-        _put_id(axes, float(x), float(y), box.id, taken)
+        _put_id(axes, (project(middle, k)[0] + 0.5) * scale, box.id)
 
 
 def edges_in_view(box: Primitive, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> list[Float64]:
@@ -176,7 +155,7 @@ def _in_front(a: Float64, b: Float64) -> Float64 | None:
 
 def _put_plan(
     figure: Figure,
-    place_at: tuple[float, float, float, float],
+    where: tuple[int, int, int, int],
     surface: Sequence[PosedFrame],
     poses: Float64,
     boxes: Sequence[Primitive],
@@ -186,51 +165,41 @@ def _put_plan(
     xyz, rgb = _surface(surface)
     R = plan_rotation(xyz, camera_up(poses))
     level = xyz @ R.T
-    roof = ceiling_height(level) if len(level) else None
-    kept = np.ones(len(level), np.bool_) if roof is None else level[:, 2] < roof
-    order = np.argsort(level[kept][:, 2], kind="stable")  # what is higher hides what is below
-    level, rgb = level[kept][order], rgb[kept][order]
-
-    path = poses[:, :3, 3] @ R.T
+    roof = ceiling_height(level)
+    inside = np.ones(len(level), np.bool_) if roof is None else level[:, 2] < roof
+    points, path = from_above(level[inside]), from_above(poses[:, :3, 3] @ R.T)
     moments = [(box, pose) for box in boxes for pose in _poses(box)]
-    prints = [_footprint(replace(box, T_world_box=pose).corners() @ R.T) for box, pose in moments]
-    every = np.concatenate([level[:, :2], path[:, :2], *prints])
-    low = np.maximum(every.min(axis=0), path[:, :2].min(axis=0) - SIDE_M)
-    high = np.minimum(every.max(axis=0), path[:, :2].max(axis=0) + SIDE_M)
-    _, _, w, h = place_at
-    scale = 0.94 * min(w / max(high[0] - low[0], 1e-3), h / max(high[1] - low[1], 1e-3))
+    prints = [from_above(replace(box, T_world_box=pose).corners() @ R.T) for box, pose in moments]
+
+    every = np.concatenate([points, path, *prints])
+    every = np.clip(every, path.min(axis=0) - SIDE_M, path.max(axis=0) + SIDE_M)
+    size = where[2:]
+    centre, scale = fitted(np.stack((every.min(axis=0), every.max(axis=0))), size)
+    picture, _ = draw_points(points, rgb[inside], size, PANEL, camera=(centre, scale))
+    axes = put_picture(figure, where, picture, "from above: surface, the camera's path, and boxes")
 
     def pixels(at: Float64) -> Float64:
-        return (at[:, :2] - (low + high) / 2) * (scale, -scale) + (w / 2, h / 2)
+        return (at[:, :2] - centre) * scale + np.array(size) / 2
 
-    axes = place(figure, place_at)
-    put_text(axes, (0, -11), cut("from above: surface, the camera's path, and boxes", w, 11), color=DIM_TEXT)
-    x, y = pixels(level).T
-    axes.scatter(x, y, c=rgb / 255, s=1.2, linewidths=0, rasterized=True, clip_on=True)
-    x, y = pixels(path).T
-    axes.plot(x, y, color="white", linewidth=1, linestyle=":")
-    taken: list[tuple[float, float]] = []
-    for (box, _), outline in zip(moments, prints, strict=True):
-        x, y = pixels(outline).T
-        color = _rgb(colors[box.class_name])
-        axes.fill(x, y, facecolor=(*color, _FOOTPRINT_FILL), edgecolor=color, linestyle="-")
-        if 0 < x.mean() < w and 0 < y.mean() < h:
-            _put_id(axes, float(x.mean()), float(y.mean()), box.id, taken)
-    bar = 10.0 ** np.floor(np.log10(w / 3 / scale))
-    axes.plot((16, 16 + bar * scale), (h - 18, h - 18), color="white", linewidth=3, solid_capstyle="butt")
-    put_text(axes, (16, h - 34), f"{bar:g} m")
+    axes.plot(*pixels(path).T, color="white", linewidth=1, linestyle=":")
+    for (box, _), corners in zip(moments, prints, strict=True):
+        outline = cv2.convexHull(pixels(corners).astype(np.float32)).reshape(-1, 2).astype(np.float64)
+        color = hex_color(colors[box.class_name])
+        axes.fill(*outline.T, facecolor=f"{color}26", edgecolor=color, linestyle="-")
+        if ((outline.mean(axis=0) > 0) & (outline.mean(axis=0) < size)).all():
+            _put_id(axes, outline.mean(axis=0), box.id)
+    put_scale_bar(axes, scale, "m")
 
 
 def _surface(frames: Sequence[PosedFrame]) -> tuple[Float64, UInt8]:
     """Points (N, 3) in the world and colours (N, 3) that the depth of frames shows."""
     xyz, rgb = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     for frame in frames:
-        if frame.depth_m is None:
-            continue
-        k = working_intrinsics(frame.intrinsics, POINTS_WIDTH)
-        depth = resize_depth(frame, k)
-        xyz.append(transform(frame.T_world_camera, unproject(depth, k)[depth > 0]))
-        rgb.append(resize_rgb(frame, k)[depth > 0])
+        if frame.depth_m is not None:
+            k = working_intrinsics(frame.intrinsics, POINTS_WIDTH)
+            depth = resize_depth(frame, k)
+            xyz.append(transform(frame.T_world_camera, unproject(depth, k)[depth > 0]))
+            rgb.append(resize_rgb(frame, k)[depth > 0])
     return np.concatenate(xyz), np.concatenate(rgb)
 
 
@@ -239,23 +208,9 @@ def _poses(box: Primitive) -> list[Float64]:
     return [box.T_world_box] if known is None else [pose for _, pose in known]
 
 
-def _footprint(corners: Float64) -> Float64:
-    """Outline (N, 2) of a box from above."""
-    return cv2.convexHull(corners[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
-
-
-def _put_id(axes: Axes, x: float, y: float, box_id: int, taken: list[tuple[float, float]]) -> None:
-    """An id, unless it would cover one that is there."""
-    if any(abs(x - a) < ID_PX[0] and abs(y - b) < ID_PX[1] for a, b in taken):
-        return
-    taken.append((x, y))
+def _put_id(axes: Axes, at: Float64, box_id: int) -> None:
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1}
-    put_text(axes, (x, y), str(box_id), ha="center", fontsize=SMALL_PT, color=TEXT, bbox=behind, clip_on=True)
-
-
-def _rgb(color: Color) -> tuple[float, float, float]:
-    r, g, b = color
-    return r / 255, g / 255, b / 255
+    put_text(axes, (float(at[0]), float(at[1])), str(box_id), ha="center", fontsize=SMALL_PT, bbox=behind, clip_on=True)
 
 
 def _class_colors(names: Sequence[str], label_set: LabelSet | None) -> dict[str, Color]:

@@ -7,10 +7,12 @@ of a folder, of weights, or the log's own images.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from semantic_mapper.config import DepthConfig, PanopticConfig
@@ -21,22 +23,22 @@ from semantic_mapper.fields.checkpoint import (
     default_checkpoint_path,
     load_checkpoint,
     save_checkpoint,
-    shipped_checkpoint,
 )
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
+from semantic_mapper.imaging import resize_depth, resize_spread, working_intrinsics
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.frame_depth import FrameDepth
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_classes, with_times
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
-from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.replay.run_folder import prepare_file
 from semantic_mapper.training.boxes import boxes_in_view
 from semantic_mapper.training.config import FinetuneConfig
@@ -45,8 +47,9 @@ from semantic_mapper.training.fitters import FITTERS, fitter_of
 from semantic_mapper.training.frame_rays import usable_frames
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
+FrameKey = tuple[str, int]  # camera and stamp
 LEAST_KEYFRAMES = 2
 MAX_SCENE_FRAMES = 300  # that a field of one scene is fitted to
 OWN = "the log's own label images"
@@ -63,8 +66,7 @@ class FinetuneRequest:
         keyframes: How many labelled frames to use; 0 for a kind that learns no classes, and for all frames that the
             folder ``labels`` has labels of.
         config: Of the training.
-        weights: To start from; None = those in the package.
-        from_scratch: Start from random weights.
+        weights, from_scratch: Weights to start from, None = those in the package; or random ones.
         depth: Where the frames' depth comes from.
         kind: Of a field that is fitted to one scene, from nothing; None = that of the weights.
         labels: Folder of label images in place of the log's.
@@ -92,14 +94,8 @@ class FinetuneRequest:
     strokes: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FinetuneResult:
-    """What was learned.
-
-    Args:
-        checkpoint: The weights, as written; ``recipe`` holds the figures.
-        chosen: Numbers in the log of the labelled frames that they were fitted to.
-    """
+class FinetuneResult(NamedTuple):
+    """The weights, as written (``recipe`` holds the figures), and the numbers in the log of the labelled frames."""
 
     checkpoint: Checkpoint
     chosen: list[int]
@@ -212,10 +208,9 @@ def _fit(
             note += f" accuracy {progress.held_out_accuracy * 100:.1f} %"
         monitor.set(int(progress.fraction * 100), note)
 
-    def stopped() -> bool:
-        return monitor.stopped_by != ""
-
-    checkpoint = fitter_of(kind)(frames, label_set, start, request.config, on_progress, stopped, seen)
+    checkpoint = fitter_of(kind)(
+        frames, label_set, start, request.config, on_progress, lambda: monitor.stopped_by != "", seen
+    )
     learned = "grid_steps" if kind == Panoptic.kind else "steps"  # boxes need no more than geometry
     if monitor.stopped_by and not checkpoint.recipe[learned]:
         raise KeyboardInterrupt
@@ -235,7 +230,7 @@ def _check_options(request: FinetuneRequest, kind: str) -> None:
         raise ConfigError(f"--variant (irt.variant): goes with weights of kind 'irt', not with '{kind}'; leave it out")
 
 
-def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[tuple[str, int], ComputedFrame]:
+def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[FrameKey, ComputedFrame]:
     """What ``config`` asks to compute; nothing of a log whose first frame has depth, unless it says "computed".
 
     Raises:
@@ -247,6 +242,61 @@ def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mappi
         return {}
     monitor.start(len(log))
     return compute_depths(log, config, lambda done: _go_on(monitor, done, "computing depth from pictures"))
+
+
+class ComputedFrame(NamedTuple):
+    """What was computed of a frame, at the size that depth is computed at: depth (h, w), 0 = none, its one-sigma spread
+    (h, w), and the pose (4, 4) that goes with it."""
+
+    depth_m: Float32
+    depth_sigma_m: Float32
+    T_world_camera: Float64
+
+    def on(self, frame: PosedFrame) -> PosedFrame:
+        """The frame with this depth, enlarged to its size, at this pose."""
+        size = frame.intrinsics.width, frame.intrinsics.height
+        depth, sigma = (
+            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+            for image in (self.depth_m, self.depth_sigma_m)
+        )
+        return replace(frame, depth_m=depth, depth_sigma_m=sigma, T_world_camera=self.T_world_camera)
+
+
+def compute_depths(
+    frames: Iterable[PosedFrame], config: DepthConfig, on_frame: Callable[[int], None]
+) -> dict[FrameKey, ComputedFrame]:
+    """What was computed of each frame without a sensor's depth, by its camera and stamp.
+
+    Frames whose pictures nothing can be computed from (dark, blurred, standing still) are left out, with a line in the
+    log. No map gives hints, so depth is a little less exact than in ``replay``.
+
+    Args:
+        frames: In order.
+        config: Its ``source`` is "auto" or "computed".
+        on_frame: Called with the number of frames that are read.
+    """
+    computer, found = FrameDepth(config, _no_hint), dict[FrameKey, ComputedFrame]()
+
+    def keep(ready: Iterable[PosedFrame]) -> None:
+        for frame in ready:
+            small = working_intrinsics(frame.intrinsics, config.from_motion.width)
+            if frame.depth_m is not None and (sigma_m := resize_spread(frame, small)) is not None:
+                computed = ComputedFrame(resize_depth(frame, small), sigma_m, frame.T_world_camera)
+                found[frame.camera_id, frame.stamp_ns] = computed
+
+    for number, frame in enumerate(frames):
+        try:
+            keep(computer.push(frame))
+        except FrameError as error:
+            _log.warning("no_depth_computed", seq=frame.seq, reason=str(error))
+        on_frame(number + 1)
+    keep(computer.finish())
+    return found
+
+
+def _no_hint(frame: PosedFrame, intrinsics: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
+    empty = np.zeros((intrinsics.height, intrinsics.width), np.float32)
+    return empty, empty > 0
 
 
 def _go_on(monitor: JobMonitor, done: int, note: str) -> None:
@@ -267,7 +317,7 @@ class FrameSource:
     log: Log
     folder: LabelFolder | None
     request: FinetuneRequest
-    computed: Mapping[tuple[str, int], ComputedFrame]
+    computed: Mapping[FrameKey, ComputedFrame]
 
     def named(self) -> dict[int, PosedFrame]:
         """The labelled frames that the request names, by number in the log.
@@ -308,8 +358,10 @@ class FrameSource:
                     continue
                 check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
                 label_set.to_channels(frame.label, f"frame seq={frame.seq}")
-                size = size or (frame.intrinsics.width, frame.intrinsics.height)
-                _check_size(frame, size)
+                k = frame.intrinsics
+                size = size or (k.width, k.height)
+                if (k.width, k.height) != size:  # one finetuning takes views of one size
+                    raise FrameError(f"{k.width}x{k.height}, but the first one is {size[0]}x{size[1]}")
             except (LogError, FrameError, LabelError) as error:
                 _log.warning("frame_left_out", frame=number, reason=str(error))
                 continue
@@ -408,17 +460,6 @@ class FrameSource:
         return frame if frame.depth_m is not None or found is None else found.on(frame)
 
 
-def _check_size(frame: PosedFrame, size: tuple[int, int]) -> None:
-    """One finetuning takes views of one size.
-
-    Raises:
-        FrameError: another size.
-    """
-    k = frame.intrinsics
-    if (k.width, k.height) != size:
-        raise FrameError(f"frame seq={frame.seq}: {k.width}x{k.height}, but the first one is {size[0]}x{size[1]}")
-
-
 @dataclass(frozen=True, slots=True)
 class PseudoLabels:
     """Where label images come from.
@@ -448,15 +489,9 @@ def open_pseudo_labels(log: Log, pseudo: str | None) -> PseudoLabels:
         pseudo: Folder of label images, or weights; None = the log's own label images, else the shipped weights.
 
     Raises:
-        ConfigError: ``pseudo`` names both a folder and weights in the package.
         LabelError, LogError, WeightsError: they cannot be read.
     """
     if pseudo is not None and Path(pseudo).is_dir():
-        if "/" not in pseudo and shipped_checkpoint(Path(pseudo)) is not None:
-            raise ConfigError(
-                f"--pseudo {pseudo}: is a folder here, and weights in the package have this name. Give ./{pseudo} for "
-                "the label images in the folder; for the weights run the command elsewhere, or rename the folder"
-            )
         folder = open_label_folder(Path(pseudo), log)
         source, numbers = f"the folder {pseudo}", frozenset(folder.numbers())
         return PseudoLabels(folder.label_set, lambda f, n: _of_folder(folder, f, n), source, numbers)
@@ -487,12 +522,14 @@ def match_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> tuple[BoxFi
     Raises:
         ConfigError: a class that these lack, with where they come from and what may be done; or no box.
     """
-    needed = {p.class_name for p in boxes.primitives}.union(*([name, *others] for name, others in boxes.merge.items()))
     try:
         boxes, label_set = with_classes(boxes, labels.label_set, path)
     except ConfigError as error:
         end = "" if str(error).endswith("?") else "."
-        raise ConfigError(f"{error}{end} {_where_classes_come_from(labels, needed)}") from error
+        raise ConfigError(
+            f"{error}{end} Pseudo labels are {labels.source}: correct the classes of the boxes, say in `merge` of the "
+            "file which class of the labels stands for it, or give other labels or weights (--pseudo)"
+        ) from error
     if not boxes.primitives:
         raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
     return boxes, label_set
@@ -513,17 +550,6 @@ def boxed_field(
         uncovered="empty" if uncovered == "empty" else "stuff",
     )
     return Panoptic(config, label_set), int((~seen).sum())
-
-
-def _where_classes_come_from(labels: PseudoLabels, needed: set[str]) -> str:
-    said = f"Pseudo labels are {labels.source}"
-    path = default_checkpoint_path()
-    if labels.source == OWN and needed <= set(load_checkpoint(path).label_set.names):
-        return f"{said}; weights '{path.stem}' have all classes of the boxes: --pseudo {path.stem} takes their labels"
-    return (
-        f"{said}: correct the classes of the boxes, say in `merge` of the file which class of the "
-        "labels stands for it, or give other labels (--pseudo)"
-    )
 
 
 def _evenly(numbers: Sequence[int], count: int) -> list[int]:

@@ -190,7 +190,7 @@ def _put_map(
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
     axes = put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}")
-    _put_scale_bar(axes, scale, unit)
+    put_scale_bar(axes, scale, unit)
     for name, outline in rooms:
         corners = (from_above(outline @ R_plan_world.T)[:, :2] - camera[0]) * scale + np.array(size) / 2
         _put_room(axes, name, corners)
@@ -238,14 +238,14 @@ def _put_room(axes: Axes, name: str, corners: Float64) -> None:
     put_text(axes, (float(at[0]), float(at[1])), name, bbox=behind, clip_on=True)
 
 
-def _put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
+def put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
     """A bar of 1 m (or of the power of ten that fits) in the lower left corner; ``scale`` is in pixels a metre."""
     metres = 1.0
     while metres * scale > axes.get_xlim()[1] / 3:
         metres /= 10
     while metres * scale < 24:
         metres *= 10
-    y = MAP_HEIGHT - 18
+    y = axes.get_ylim()[0] - 18
     axes.plot((16, 16 + metres * scale), (y, y), color="white", linewidth=3, solid_capstyle="butt")
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 2}  # points may lie here
     put_text(axes, (16, y - 15), f"{metres:g} {unit}", bbox=behind)

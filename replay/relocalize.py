@@ -7,8 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
-from semantic_mapper.localization.relocalizer import NotFound, Relocalizer
+from semantic_mapper.localization.relocalizer import NotFound, Relocalizer, Sighting, agreed, find_consensus, sighting
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.types import PosedFrame
@@ -38,7 +37,7 @@ def relocalize_frames(
             row |= {"reason": found.reason, "detail": found.detail}
         else:
             row["T_map_camera"] = found.T_map_camera.tolist()
-            of_world.append(sighting(found.T_map_camera, frame.T_world_camera, found.inliers))
+            of_world.append(sighting(found.T_map_camera, frame.T_world_camera))
         rows.append(row)
         on_frame(len(rows) + len(unreadable))
     return {

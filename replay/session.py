@@ -6,11 +6,12 @@ a log, so that both write the same map and the same summary.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.odometry_sessions import OdometrySessions, Taken
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.replay.stats import BoundedLog, LatencyHistogram
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 if TYPE_CHECKING:
@@ -34,6 +34,11 @@ _log = get_logger(__name__)
 MOSTLY = 0.5  # of a frame that weights of its scene know; of the frames that they do not, for a warning
 MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are reported in the summary
 SNAPSHOTS = 8  # frames kept for the overview picture
+BIN_GROWTH = 1.005  # each bin of a histogram of times is so much longer than the one before
+SHORTEST_MS, LONGEST_MS = 1e-3, 1e7  # times beyond count as these
+_BINS = math.ceil(math.log(LONGEST_MS / SHORTEST_MS) / math.log(BIN_GROWTH))
+
+ItemT = TypeVar("ItemT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +49,57 @@ class Refusal:
     stamp_ns: int
     reason: str
     camera_id: str = ""
+
+
+class BoundedLog(Generic[ItemT]):
+    """Counts all items, and keeps the first ones, at most ``most``, and the last one (``last``, if there was one)."""
+
+    def __init__(self, most: int) -> None:
+        self.first: list[ItemT] = []
+        self.last: ItemT | None = None
+        self._most = most
+        self._count = 0
+
+    def __len__(self) -> int:
+        """How many there were, kept or not."""
+        return self._count
+
+    def append(self, item: ItemT) -> None:
+        """Count one more."""
+        self._count += 1
+        self.last = item
+        if len(self.first) < self._most:
+            self.first.append(item)
+
+    def skip(self, count: int) -> None:
+        """Count this many more, of which nothing is known."""
+        self._count += count
+
+
+class LatencyHistogram:
+    """Milliseconds of steps: the first one, and percentiles of the others, right to a quarter of a percent."""
+
+    def __init__(self) -> None:
+        self.first: float | None = None  # stands by itself: it may compile kernels, once on a machine
+        self._counts = np.zeros(_BINS, np.int64)
+        self._least, self._most = math.inf, -math.inf
+
+    def add(self, ms: float) -> None:
+        """Count one more step."""
+        if self.first is None:
+            self.first = ms
+            return
+        at = math.log(max(ms, SHORTEST_MS) / SHORTEST_MS) / math.log(BIN_GROWTH)
+        self._counts[min(int(at), _BINS - 1)] += 1
+        self._least, self._most = min(self._least, ms), max(self._most, ms)
+
+    def percentile(self, percent: float) -> float | None:
+        """Of all steps but the first; of the first where it is the only one, None without any."""
+        count = int(self._counts.sum())
+        if not count:
+            return self.first
+        at = int(np.searchsorted(np.cumsum(self._counts), round(percent / 100 * (count - 1)), side="right"))
+        return min(max(SHORTEST_MS * BIN_GROWTH ** (at + 0.5), self._least), self._most)
 
 
 class MapSession:
@@ -242,14 +298,10 @@ class MapSession:
 
     def more_summary(self) -> dict[str, Any]:
         """What only some summaries say: of weights of one scene, of odometry sessions found in the map."""
-        return {**self._scene_summary(), **self._world_summary()}
-
-    def _world_summary(self) -> dict[str, Any]:
-        """Of odometry sessions that had to be found in the map."""
-        sessions = self.odometry_sessions
-        if not (sessions.found or sessions.refused):
-            return {}
-        return {"relocalization": {"sessions_found": sessions.found, "looks_refused": dict(sessions.refused)}}
+        sessions, found = self.odometry_sessions, self._scene_summary()
+        if sessions.found or sessions.refused:
+            found["relocalization"] = {"sessions_found": sessions.found, "looks_refused": dict(sessions.refused)}
+        return found
 
     def _score(self, frame: PosedFrame, update: MapUpdate) -> PosedFrame:
         """Score a frame against its label; returns it without a label that is no truth, or cannot be read."""

@@ -169,7 +169,8 @@ def _pose_figure(check: Mapping[str, Any], key: str) -> str:
     return "not checked" if value is None else percent(value)
 
 
-def _depth_source(depth: Mapping[str, Any]) -> str:
+def describe_depth(depth: Mapping[str, Any]) -> str:
+    """Where depth comes from."""
     if depth["source"] != "mixed":
         return _DEPTH_SOURCES[depth["source"]]
     fractions = {"computed from the pictures": "computed_fraction", "rendered by the field": "rendered_fraction"}
@@ -192,7 +193,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("frames left out of the log", "frames", lambda f: str(f.get("left_out") or "-")),
     ("scale", "scale", str),
     ("frames scored", "frames.scored", str),
-    ("depth", "depth", _depth_source),
+    ("depth", "depth", describe_depth),
     ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),
     ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
     ("latency p50", "latency_ms.p50", _ms),

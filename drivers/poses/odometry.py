@@ -2,11 +2,10 @@
 
 Each view is aligned to keyframes, not to the view before, so that errors add up from keyframe to keyframe only. Where
 the camera comes back to old ones, a pose graph takes the errors back (``loop_closure``). The first guess continues
-the last motion; where that leads nowhere, corners that view and keyframe share give another. Where these fail too, or
-lead off the last motion, the shift of the picture since the last view gives more, and the best fit counts. Directions
-of which the points show nothing (along a wall that fills the picture) follow the motion and the corners, and the
-uncertainty grows. A view that lies on no keyframe is lost: no pose, until its corners are found in a keyframe again. A
-camera that stays lost begins a new world, in which no loops are closed: the map is of the first one.
+the last motion; where that leads nowhere, or the result off it, corners that view and keyframe or the last image share
+give others. Directions of which the points show nothing (along a wall that fills the picture) follow the motion and the
+corners, and the uncertainty grows. A view that lies on no keyframe is lost: no pose, until its corners are found in a
+keyframe again. A camera that stays lost begins a new world, in which no loops are closed: the map is of the first one.
 
 Same images, same poses and corrections, bit for bit.
 """
@@ -59,7 +58,7 @@ DEPTH_MAX_M = 4.0
 NEIGHBOURS = 3  # keyframes that a frame is aligned to
 KEYFRAME_M = 0.35  # a new one when moved this far from the nearest, or ...
 KEYFRAME_DEG = 20.0  # ... turned this far, or ...
-KEYFRAME_OVERLAP = 0.55  # ... seeing less than this in common with it
+KEYFRAME_OVERLAP = 0.55  # ... seeing less than this in common with it, or off its way by another one than before
 MAX_STEP_M, MAX_STEP_DEG = 0.25, 15.0  # a result further from its first guess is wrong
 FEATURES = 500  # ORB corners an image, for first guesses and for finding back
 RELOCALISE_KEYFRAMES = 20  # tried for each image while lost, in turn
@@ -77,7 +76,6 @@ _UNSURE_M = 0.15  # an image that may be further off by such steps has no pose
 _AWAY_NS = 2_000_000_000  # a camera that gave no image for so long may be anywhere
 _LOST_NS = 5_000_000_000  # lost for so long, it begins a new world ...
 _YOUNG = 5  # ... and at once in a world of fewer images: the first views may have shown too little
-_LEAST_RESPONSE = 0.05  # of the peak, 1 = the same picture; those that overlap well give 0.1 to 0.7
 _PAUSE_NS = 2_000_000_000  # between two corrections: each is work for the map
 
 _log = get_logger(__name__)
@@ -148,6 +146,7 @@ class OdometryPoseSource(PoseSource):
         self._past: list[StampedPose] = []  # the last two poses
         self._before: _View | None = None  # the image of the last pose
         self._images = 0  # with a pose in this world
+        self._nearest = -1  # keyframe that the last image was aligned to first
         self._next_try = 0  # keyframe that is tried next while lost
         self._noise_m = 0.0  # mean of the last fits
         self._unsure_m = 0.0  # how far the last pose may be off along what no point shows
@@ -190,7 +189,7 @@ class OdometryPoseSource(PoseSource):
         """The best fit among what was found and what the image before says; None where it is a bad one.
 
         The motion has changed at once, or the view lies on nothing. Sliding along a surface shows in a fit that is
-        worse than those before; a pattern that repeats itself, in a motion that neither corners nor picture show.
+        worse than those before; a pattern that repeats itself, in a motion that corners do not show.
 
         Args:
             view: The image.
@@ -199,19 +198,12 @@ class OdometryPoseSource(PoseSource):
         """
         results = [] if found is None else [found]
         last = self._past[-1]
-        if self._before is not None and view.stamp_ns - last.stamp_ns < _RECENT_NS:
-            corners, turn = self._corner_motion(view), find_turn(view.rgb, self._before.rgb, view.intrinsics)
-            guesses = [last.T @ motion for motion in (corners, turn) if motion is not None]
-            tried = [self._try(view, guess) for guess in (*guesses, last.T)]
-            results += [result for result in tried if result is not None]
+        if view.stamp_ns - last.stamp_ns < _RECENT_NS:
+            corners = self._corner_motion(view)
             expected = expected if corners is None else [last.T @ corners]
-            turned = [] if turn is None else [last.T @ turn]
-            results = [
-                r
-                for r in results
-                if any(_is_close(pose, r.T_world_camera) for pose in expected)
-                or any(_is_close(pose, r.T_world_camera, 2 * _JUMP_M) for pose in turned)
-            ]
+            tried = [self._try(view, guess) for guess in ([last.T] if corners is None else [*expected, last.T])]
+            results += [result for result in tried if result is not None]
+            results = [r for r in results if any(_is_close(pose, r.T_world_camera) for pose in expected)]
         best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
         noise_m = max(self._noise_m or NOISE_M, _LEAST_NOISE_M)
         return None if best is None or best.fits[0].noise_m > _WORSE * noise_m else best
@@ -371,6 +363,8 @@ class OdometryPoseSource(PoseSource):
 
     def _accept(self, view: _View, found: _Found) -> PoseEstimate:
         pose, nearest, fits = found.T_world_camera, found.nearest, found.fits
+        left_m = 0.0 if self._lost else apart(self._expected(view.stamp_ns), pose)[0]
+        jumped, self._nearest = left_m > _JUMP_M and nearest.number != self._nearest, nearest.number
         if self._lost:
             self._counters["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
@@ -380,7 +374,7 @@ class OdometryPoseSource(PoseSource):
         way, turn = self._graph.distances(pose)
         reach = np.maximum(way / KEYFRAME_M, np.rad2deg(turn) / KEYFRAME_DEG)
         way_m = float(min(k.way_m + d for k, d in zip(self._graph.frames.values(), way, strict=True)))
-        if reach.min() > 1 or fits[0].overlap < KEYFRAME_OVERLAP:
+        if reach.min() > 1 or fits[0].overlap < KEYFRAME_OVERLAP or jumped:
             self._add_keyframe(view, pose, way_m, nearest.number)
         elif self._closer is not None:
             self._trail.add(view.stamp_ns, nearest, pose)
@@ -426,35 +420,9 @@ class OdometryPoseSource(PoseSource):
         return self._begin(view)
 
 
-def find_turn(rgb: UInt8, before: UInt8, intrinsics: CameraIntrinsics) -> Float64 | None:
-    """How far a camera has turned between two images: T_before_camera (4, 4), about its x and y axes.
-
-    Phase correlation: brightness and contrast do not count. A first guess only: what lies near shifts by more where the
-    camera moves, too.
-
-    Args:
-        rgb: (H, W, 3) of this image.
-        before: (H, W, 3) of the earlier one.
-        intrinsics: Of both.
-
-    Returns:
-        None where the pictures share too little.
-    """
-    earlier, now = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (before, rgb))
-    window = cv2.createHanningWindow((intrinsics.width, intrinsics.height), cv2.CV_32F)
-    (right, down), response = cv2.phaseCorrelate(earlier, now, window)
-    if response < _LEAST_RESPONSE:
-        return None
-    ahead = np.array((-right / intrinsics.fx, -down / intrinsics.fy, 1.0))  # its view, in the earlier axes
-    ahead /= np.linalg.norm(ahead)
-    axis = np.cross((0.0, 0.0, 1.0), ahead)
-    sine = float(np.linalg.norm(axis))
-    return make_pose(axis / max(sine, 1e-12) * np.arctan2(sine, ahead[2]), np.zeros(3))
-
-
-def _is_close(T_a: Float64, T_b: Float64, within_m: float = _JUMP_M) -> bool:
+def _is_close(T_a: Float64, T_b: Float64) -> bool:
     moved_m, turned_deg = apart(T_a, T_b)
-    return moved_m < within_m and turned_deg < _JUMP_DEG
+    return moved_m < _JUMP_M and turned_deg < _JUMP_DEG
 
 
 def _sigma(fits: list[Fit], drift_m: float) -> float:

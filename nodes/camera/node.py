@@ -80,7 +80,7 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
                 with frame_progress("played", total) as bar:
                     playback = Playback(context, options.rate)
 
-                    def on_frame(envelope: Envelope, ack: object) -> None:
+                    def on_frame(envelope: Envelope) -> None:
                         bar.advance()
                         playback.note_frame(envelope.stamp_ns)
 

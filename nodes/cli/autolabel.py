@@ -22,7 +22,7 @@ def autolabel(
     *,
     weights: Path,  # weights file of any kind, or a name of weights in the package (`rooms`)
     out: Path,  # new log to write (.mcap)
-    depth: bool = False,  # also give frames without depth what was computed from the pictures or rendered
+    depth: bool = False,  # also give frames without depth what was computed from the pictures
     min_confidence: Fraction = 0.0,  # pixels that are less sure are unknown
     overwrite_labels: bool = False,  # replace labels that are there, too; without it they stay
     # weights with boxes (`finetune --kind panoptic`): also write CAMERA/NNNNNN.png, ids of boxes in 16 bits, and
@@ -35,8 +35,7 @@ def autolabel(
     A frame is rendered as `replay` and `eval` render it. All else of the log stays: images, poses, stamps, other
     topics, files that it holds, parts. Such pseudo labels, and such depth, are marked: `finetune` learns from them,
     `eval` and `replay` never score on them, and computed depth counts as in `replay`. Labels that are there stay; those
-    of an earlier autolabel are replaced. Weights that know no classes (`finetune --kind grid`) give depth only. Ctrl-C
-    leaves nothing (exit code 130).
+    of an earlier autolabel are replaced. Ctrl-C leaves nothing (exit code 130).
 
     Example: semantic-mapper autolabel kitchen.mcap --weights kitchen.safetensors --out labelled.mcap
     """
@@ -58,7 +57,7 @@ def autolabel(
         output.print(f"  {name}: {text}")
     output.lines([f"  without a rendering: {line}" for line in report.unlabelled])
     output.lines([f"  damaged, left out: {line}" for line in report.damage])
-    if note.classes and note.kept == note.frames:
+    if note.kept == note.frames:
         output.print("  note: every frame has a label of its own, which stays; --overwrite-labels replaces them")
     reasons = list(report.unlabelled[:LISTED])
     output.json({"files": files, **note.plain(), "reasons": reasons, "damage": list(report.damage)})

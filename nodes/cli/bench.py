@@ -8,7 +8,7 @@ from typing import Literal
 
 from semantic_mapper.config import AtLeastOne
 from semantic_mapper.nodes.cli.verb import JsonOutput, MapperSettings, WeightsOption, must_be_there, verb
-from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.log import demo_log
 
 
 @verb

@@ -15,8 +15,16 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.verb import UpOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.exporters import LogExportRequest, export_log, log_format_of
-from semantic_mapper.replay.exporters.map_files import ExportRequest, export_map, format_of, parse_transform, parse_up
+from semantic_mapper.replay.exporters import export_log, log_format_of
+from semantic_mapper.replay.exporters.map_files import (
+    ExportRequest,
+    Format,
+    export_map,
+    format_of,
+    parse_transform,
+    parse_up,
+)
+from semantic_mapper.replay.exporters.run import LogFormat
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import is_log, map_path, prepare_file, prepare_folder, refuse_overwriting
 
@@ -31,11 +39,7 @@ def export(
     *,
     out: Path,  # file to write; its ending says the format
     # where the ending does not say it: ply and npz are points, ply-mesh, obj and glb meshes
-    format_: Annotated[
-        Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd", "foxglove", "trajectory", "tum", "folder"]
-        | None,
-        typer.Option("--format"),
-    ] = None,
+    format_: Literal[Format, LogFormat] | None = None,
     color: Literal["rgb", "class", "confidence"] | None = None,  # of points and meshes; rgb without it
     min_weight: float = SURFACE_WEIGHT,  # leave out voxels that fewer measurements have seen; 1: and computed depth
     min_confidence: Fraction = 0.0,  # leave surface with a less sure label out
@@ -66,7 +70,7 @@ def export(
     if is_log(source):
         if map_options != (None, None, None, None, None, "auto", SURFACE_WEIGHT, 0.0):
             raise ConfigError(f"{source}: is a log; only --format, --camera and --max-frames are for logs")
-        export_recording(output, source, out, LogExportRequest(log_format_of(out, format_), camera, max_frames))
+        export_recording(output, source, out, log_format_of(out, format_), camera, max_frames)
         return
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
@@ -82,17 +86,17 @@ def export(
         output.print(f"  {line}")
 
 
-def export_recording(output: Output, source: Path, out: Path, request: LogExportRequest) -> None:
+def export_recording(output: Output, source: Path, out: Path, name: LogFormat, camera: str, max_frames: int) -> None:
     """Write a log in the format of another program, and say what was left out.
 
     Raises:
         LogError: the log cannot be read, or the result not be written.
     """
     prepare_folder(out.parent)
-    with open_log(source) as log, frame_progress("export", min(len(log), request.max_frames or len(log))) as bar:
-        report = export_log(log, out, request, bar.advance)
+    with open_log(source) as log, frame_progress("export", min(len(log), max_frames or len(log))) as bar:
+        report = export_log(log, out, name, camera=camera, max_frames=max_frames, on_frame=bar.advance)
         damage, notices = [str(e) for e in log.errors], list(log.notices)
-    output.print(f"{out}: {counted(report.frames, 'frame')} ({request.format})")
+    output.print(f"{out}: {counted(report.frames, 'frame')} ({name})")
     for notice in (*notices, *report.notices):
         output.print(f"  note: {notice}")
     output.lines([f"  left out: {line}" for line in (*damage, *report.left_out)])

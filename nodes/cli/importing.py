@@ -20,6 +20,7 @@ from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import new_figure, rendered
 from semantic_mapper.replay.importers import ImportOptions, ImportReport, RenameConfig, import_recording, is_recording
+from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.page import Section, picture, table_of, write_page
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
@@ -137,7 +138,7 @@ def import_(
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
     Example: semantic-mapper import cut-off.mcap clean.mcap
     """
-    if format_ is None and source.suffix == LOG_SUFFIX:
+    if format_ is None and source.suffix == LOG_SUFFIX and not is_bag(source):
         _recover(output, source, log)
         return
     renames = load_config(rename, RenameConfig).classes if rename is not None else None

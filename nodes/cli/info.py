@@ -153,8 +153,6 @@ def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
         note: As ``AutolabelNote.plain`` gives it.
     """
     by, frames = f"{note['weights']} ({note['kind']}, SHA-256 {note['digest'][:16]})", counted(note["frames"], "frame")
-    if not note["classes"]:
-        return [("depth by", by), ("depth", f"{note['depth_written']} of {frames} got what was rendered")]
     counts = [f"{note['labelled']} of {frames} labelled"]
     for key, text in (("labelled_pixels", "of the pixels"), ("mean_confidence", "mean confidence")):
         counts += [f"{text} {note[key] * 100:.1f} %"] if note[key] is not None else []
@@ -162,7 +160,7 @@ def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
         ("kept", "labels kept"),
         ("replaced", "labels replaced"),
         ("unlabelled", "left without a label"),
-        ("depth_written", "depth images computed or rendered"),
+        ("depth_written", "depth images computed"),
     ):
         counts += [f"{note[key]} {text}"] if note[key] else []
     return [("pseudo labels by", by), ("pseudo labels", "; ".join(counts))]

@@ -21,7 +21,7 @@ from semantic_mapper.nodes.cli.verb import (
 )
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, is_log, prepare_folder
 from semantic_mapper.replay.summary import dig, notes, result_lines, summary_table
 

@@ -23,9 +23,8 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.evaluate.things import SEEN, PanopticTruth
+from semantic_mapper.replay.evaluate.things import SEEN, PanopticTruth, thing_image
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.replay.instance_images import thing_image
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import Float32, PosedFrame, UInt8

@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
+from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.imaging import resize_label, working_intrinsics
 from semantic_mapper.labels import LabelSet
@@ -24,11 +26,13 @@ from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.surface import class_surface
+from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.replay.evaluate.truth import TRUTH_WIDTH
 from semantic_mapper.replay.importers.base import BadFrameError, read_plane
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 
+RAYS = 4096  # rendered at once
 AT_SURFACE = 2.0  # voxels that a pixel of the map's surface is from a surface voxel at most
 SEEN = "map seen from frames"  # the method whose figures are those of the finished map, cast into its frames
 MAX_FRAMES = 100  # that are kept; beyond that every second one goes
@@ -232,3 +236,22 @@ def _figures(counts: PanopticCounts) -> dict[str, Any]:
     figures = asdict(counts.metrics())
     figures["pq_per_class"] = figures.pop("per_class")
     return figures
+
+
+def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> NDArray[np.uint16]:
+    """Ids (H, W) of the boxes of things that a frame sees, where its ``label`` (H, W) has their class."""
+    channel = field.label_set.to_channels(label, f"frame seq={frame.seq}").ravel()
+    names = field.label_set.names
+    boxed = [names.index(b.class_name) for b in field.shape.boxes if b.thing]
+    requested = torch.from_numpy(np.flatnonzero(np.isin(channel, boxed)))
+    k, found = frame.intrinsics, np.zeros(label.size, np.uint16)
+    depth = np.zeros(label.size, np.float32) if frame.depth_m is None else frame.depth_m.ravel()
+    pose = torch.from_numpy(frame.T_world_camera).float()
+    pixels, near_m = pixel_grid(k.width, k.height), field.sampling.near_m
+    with torch.no_grad():
+        for part in requested.split(RAYS):
+            prior = torch.from_numpy(depth[part.numpy()])
+            at = {"near_m": near_m, "far_m": field.sampling.far_m, "stamp_ns": frame.stamp_ns}
+            rays = pixel_rays(pixels[part], k, pose, **at, prior_depth_m=prior)
+            found[part.numpy()] = field.instances(rays, torch.from_numpy(channel[part.numpy()])).numpy()
+    return found.reshape(label.shape)

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from semantic_mapper.replay.exporters.run import FORMATS, LogExportReport, LogExportRequest, export_log, log_format_of
+from semantic_mapper.replay.exporters.run import FORMATS, LogExportReport, export_log, log_format_of
 
-__all__ = ["FORMATS", "LogExportReport", "LogExportRequest", "export_log", "log_format_of"]
+__all__ = ["FORMATS", "LogExportReport", "export_log", "log_format_of"]

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from semantic_mapper.replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
+from semantic_mapper.replay.exporters.base import ExportFrame, LeftOut, quaternion
 from semantic_mapper.replay.importers.folder import COMPUTED_DEPTH, DEPTH_SIGMA, PSEUDO_LABEL
 from semantic_mapper.replay.importers.tum import DEPTH_SCALE
 from semantic_mapper.replay.label_folder import plain_labels
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
-from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
 TUM_UNITS_PER_M = DEPTH_SCALE.units_per_m
 _SUFFIX = {"jpeg": "jpg", "png": "png", "raw": "png"}
@@ -38,9 +40,9 @@ class FolderExporter:
         self._poses: list[str] = []
         self._stamps: list[int] = []
         self._depth = _DepthFiles(None)
+        self._measured: set[str] = set()
         self._pseudo_labels = self._computed_depths = 0
-        self._intrinsics = _OneCamera(info.scale_known)
-        (folder / "color").mkdir()
+        self._camera = _OneCamera(info.scale_known)
 
     def add(self, item: ExportFrame) -> None:
         """Write one frame.
@@ -51,30 +53,28 @@ class FolderExporter:
         frame = item.frame
         if self._stamps and frame.stamp_ns <= self._stamps[-1]:
             raise LeftOut("it is not later than the frame before it, which the layout needs")
-        self._intrinsics.check(frame)
-        number = len(self._poses)
-        color = self._folder / "color" / f"{number:06d}.{_SUFFIX[item.rgb.encoding]}"
-        color.write_bytes(item.rgb.data)
-        name = f"{number:06d}.png"
-        if frame.depth_sigma_m is None:
-            self._depth.write(self._folder / "depth" / name, item)
-        else:
-            self._depth.write_computed(self._folder / COMPUTED_DEPTH / name, self._folder / DEPTH_SIGMA / name, item)
+        self._camera.check(frame)
+        number = f"{len(self._poses):06d}"
+        _write(self._folder / "color" / f"{number}.{_SUFFIX[item.rgb.encoding]}", item.rgb.data)
+        name = f"{number}.png"
+        if frame.depth_m is not None and frame.depth_sigma_m is not None:
+            self._depth.write(self._folder / COMPUTED_DEPTH / name, frame.depth_m, item)
+            self._depth.write(self._folder / DEPTH_SIGMA / name, frame.depth_sigma_m, item)
             self._computed_depths += 1
+        elif frame.depth_m is not None:
+            self._depth.write(self._folder / "depth" / name, frame.depth_m, item)
+            self._measured.add(name)
         if frame.label is not None and self._labels is not None:
-            folder = self._folder / (PSEUDO_LABEL if frame.label_is_pseudo else "label")
-            folder.mkdir(exist_ok=True)
-            write_png(folder / name, frame.label)
+            _write_png(self._folder / (PSEUDO_LABEL if frame.label_is_pseudo else "label") / name, frame.label)
             self._pseudo_labels += frame.label_is_pseudo
         self._poses.append(" ".join(map(repr, frame.T_world_camera.ravel().tolist())))
         self._stamps.append(frame.stamp_ns)
 
     def finish(self) -> None:
-        """Write what describes the images."""
-        self._depth.fill_in(self._folder / "depth", len(self._poses), self._intrinsics.value)
+        """Write what describes the images, and empty depth images where others have some: each has one or none."""
         (self._folder / "poses.txt").write_text("\n".join(self._poses) + "\n", encoding="ascii")
         (self._folder / "timestamps.txt").write_text("\n".join(map(str, self._stamps)) + "\n", encoding="ascii")
-        self._intrinsics.write(self._folder / "intrinsics.json", self._depth.scale)
+        self._camera.write(self._folder / "intrinsics.json", self._depth.scale)
         if self._labels is not None:
             text = json.dumps(plain_labels(self._labels), indent=1, ensure_ascii=False)
             (self._folder / "labels.json").write_text(text, encoding="utf-8")
@@ -88,7 +88,16 @@ class FolderExporter:
                 f"depth of {self._computed_depths} frames is computed, not a sensor's: it is in {COMPUTED_DEPTH}/, "
                 f"with its spread in {DEPTH_SIGMA}/, not in depth/"
             )
-        self.notices += self._depth.notices + self._intrinsics.notices
+        self.notices += self._depth.notices
+        k = self._camera.value
+        missing = {f"{number:06d}.png" for number in range(len(self._poses))} - self._measured
+        if self._measured and missing and k is not None:
+            for name in missing:
+                _write_png(self._folder / "depth" / name, np.zeros((k.height, k.width), np.uint16))
+            self.notices.append(
+                f"{len(missing)} frames have no depth; their depth images are empty (0 = no measurement)"
+            )
+        self.notices += self._camera.notices
 
 
 class TumExporter:
@@ -104,12 +113,11 @@ class TumExporter:
     def __init__(self, folder: Path) -> None:
         self.notices: list[str] = []
         self._folder = folder
-        self._names: dict[str, list[str]] = {"rgb": [], "depth": []}
-        self._trajectory = Trajectory()
+        self._names: dict[str, dict[int, str]] = {"rgb": {}, "depth": {}}  # by stamp
+        self._trajectory = TrajectoryExporter(folder / "groundtruth.txt")
         self._depth = _DepthFiles(TUM_UNITS_PER_M)
         self._computed_depths = 0
-        self._intrinsics = _OneCamera()
-        (folder / "rgb").mkdir()
+        self._camera = _OneCamera()
 
     def add(self, item: ExportFrame) -> None:
         """Write one frame.
@@ -118,31 +126,32 @@ class TumExporter:
             LeftOut: there is a frame of that time already, or its camera has changed.
         """
         frame = item.frame
-        self._intrinsics.check(frame)
+        self._camera.check(frame)
         self._trajectory.add(item)
-        stamp = seconds(frame.stamp_ns)
+        stamp = _seconds(frame.stamp_ns)
         color = f"rgb/{stamp}.{_SUFFIX[item.rgb.encoding]}"
-        (self._folder / color).write_bytes(item.rgb.data)
-        self._names["rgb"].append(f"{stamp} {color}")
+        _write(self._folder / color, item.rgb.data)
+        self._names["rgb"][frame.stamp_ns] = f"{stamp} {color}"
         if frame.depth_sigma_m is not None:
             self._computed_depths += 1
-        elif self._depth.write(self._folder / "depth" / f"{stamp}.png", item):
-            self._names["depth"].append(f"{stamp} depth/{stamp}.png")
+        elif frame.depth_m is not None:
+            self._depth.write(self._folder / "depth" / f"{stamp}.png", frame.depth_m, item)
+            self._names["depth"][frame.stamp_ns] = f"{stamp} depth/{stamp}.png"
 
     def finish(self) -> None:
         """Write the lists."""
         titles = {"rgb": "# color images", "depth": "# depth maps, 5000 units a metre"}
         for name, lines in self._names.items():
-            text = "\n".join((titles[name], "# timestamp filename", *sorted(lines, key=_by_stamp)))
+            text = "\n".join((titles[name], "# timestamp filename", *(lines[stamp] for stamp in sorted(lines))))
             (self._folder / f"{name}.txt").write_text(text + "\n", encoding="ascii")
-        self._trajectory.write(self._folder / "groundtruth.txt")
-        self._intrinsics.write(self._folder / "intrinsics.json", TUM_UNITS_PER_M)
+        self._trajectory.finish()
+        self._camera.write(self._folder / "intrinsics.json", TUM_UNITS_PER_M)
         if self._computed_depths:
             self.notices.append(f"depth of {self._computed_depths} frames is computed, not a sensor's, and is left out")
         missing = len(self._names["rgb"]) - len(self._names["depth"])
         if missing:
             self.notices.append(f"{missing} frames have no depth; programs that pair the lists will leave them out")
-        self.notices += self._depth.notices + self._intrinsics.notices
+        self.notices += self._depth.notices + self._camera.notices
 
 
 class TrajectoryExporter:
@@ -153,28 +162,9 @@ class TrajectoryExporter:
         scale_known: Whether poses are in metres; a comment says where not.
     """
 
-    def __init__(self, path: Path, scale_known: bool) -> None:
+    def __init__(self, path: Path, scale_known: bool = True) -> None:
         self.notices: list[str] = []
         self._path = path
-        self._trajectory = Trajectory(scale_known)
-
-    def add(self, item: ExportFrame) -> None:
-        """Take one frame.
-
-        Raises:
-            LeftOut: there is a frame of that time already.
-        """
-        self._trajectory.add(item)
-
-    def finish(self) -> None:
-        """Write the file."""
-        self._trajectory.write(self._path)
-
-
-class Trajectory:
-    """Poses by time."""
-
-    def __init__(self, scale_known: bool = True) -> None:
         self._lines: dict[int, str] = {}
         self._about = () if scale_known else (f"# {SCALE_KEY}: {SCALE_UNKNOWN}",)
 
@@ -182,22 +172,19 @@ class Trajectory:
         """Take the pose of one frame.
 
         Raises:
-            LeftOut: there is one of that time already.
+            LeftOut: there is a frame of that time already.
         """
         frame = item.frame
         if frame.stamp_ns in self._lines:
             raise LeftOut("there is a frame of the same time already")
         numbers = (*frame.T_world_camera[:3, 3].tolist(), *quaternion(frame.T_world_camera).tolist())
-        self._lines[frame.stamp_ns] = " ".join((seconds(frame.stamp_ns), *map(repr, numbers)))
+        self._lines[frame.stamp_ns] = " ".join((_seconds(frame.stamp_ns), *map(repr, numbers)))
 
-    def write(self, file: Path) -> None:
-        """Write them in order of time."""
-        lines = (
-            *self._about,
-            "# timestamp tx ty tz qx qy qz qw",
-            *(self._lines[stamp] for stamp in sorted(self._lines)),
-        )
-        file.write_text("\n".join(lines) + "\n", encoding="ascii")
+    def finish(self) -> None:
+        """Write the file, in order of time."""
+        rows = (self._lines[stamp] for stamp in sorted(self._lines))
+        lines = (*self._about, "# timestamp tx ty tz qx qy qz qw", *rows)
+        self._path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 class _DepthFiles:
@@ -205,10 +192,8 @@ class _DepthFiles:
 
     def __init__(self, scale: float | None) -> None:
         self._scale = scale
-        self._written: set[str] = set()
         self._inexact = 0
         self._largest_error = 0.0
-        self._made_up = 0
 
     @property
     def scale(self) -> float:
@@ -218,51 +203,23 @@ class _DepthFiles:
     @property
     def notices(self) -> list[str]:
         """For people."""
-        notes: list[str] = []
-        if self._inexact:
-            notes.append(
-                f"depth of {self._inexact} frames is not exact in steps of 1/{self.scale:g} m: off by up to "
-                f"{self._largest_error * 1e3:.3g} mm"
-            )
-        if self._made_up:
-            notes.append(f"{self._made_up} frames have no depth; their depth images are empty (0 = no measurement)")
-        return notes
+        if not self._inexact:
+            return []
+        return [
+            f"depth of {self._inexact} frames is not exact in steps of 1/{self.scale:g} m: off by up to "
+            f"{self._largest_error * 1e3:.3g} mm"
+        ]
 
-    def write(self, file: Path, item: ExportFrame) -> bool:
-        """False where the frame has no depth."""
-        depth = item.frame.depth_m
-        if depth is None:
-            return False
+    def write(self, file: Path, depth_m: Float32, item: ExportFrame) -> None:
+        """Write it as uint16, in the units of the log where none are given; what is too far away becomes 0."""
         self._scale = self._scale or item.depth_scale or None
-        units, error = depth_units(depth, self.scale)
-        if error > _EXACT_M:
-            self._inexact += 1
-            self._largest_error = max(self._largest_error, error)
-        file.parent.mkdir(exist_ok=True)
-        write_png(file, units)
-        self._written.add(file.name)
-        return True
-
-    def write_computed(self, file: Path, sigma_file: Path, item: ExportFrame) -> None:
-        """Write computed depth and its spread, in the same units."""
-        frame = item.frame
-        assert frame.depth_m is not None and frame.depth_sigma_m is not None
-        self._scale = self._scale or item.depth_scale or None
-        for image, metres in ((file, frame.depth_m), (sigma_file, frame.depth_sigma_m)):
-            units, error = depth_units(metres, self.scale)
-            self._inexact += error > _EXACT_M
-            self._largest_error = max(self._largest_error, error)
-            image.parent.mkdir(exist_ok=True)
-            write_png(image, units)
-
-    def fill_in(self, folder: Path, count: int, intrinsics: CameraIntrinsics | None) -> None:
-        """Empty images for frames without depth, where others have some: the layout has one for each or none."""
-        if not self._written or intrinsics is None:
-            return
-        empty = np.zeros((intrinsics.height, intrinsics.width), np.uint16)
-        for name in {f"{number:06d}.png" for number in range(count)} - self._written:
-            write_png(folder / name, empty)
-            self._made_up += 1
+        metres = np.nan_to_num(depth_m, posinf=0.0, neginf=0.0)
+        units = np.rint(metres * np.float32(self.scale))
+        held = np.where((units >= 0) & (units <= 65535), units, 0).astype(np.uint16)
+        error = float(np.abs(held.astype(np.float32) / np.float32(self.scale) - metres).max(initial=0.0))
+        self._inexact += error > _EXACT_M
+        self._largest_error = max(self._largest_error, error)
+        _write_png(file, held)
 
 
 class _OneCamera:
@@ -291,13 +248,21 @@ class _OneCamera:
     def write(self, file: Path, depth_scale: float) -> None:
         """Write them as ``import`` reads them."""
         if self.value is not None:
-            k = self.value
-            plain = {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
-            file.write_text(
-                json.dumps({**plain, "depth_scale": depth_scale, **self._about}, indent=1), encoding="ascii"
-            )
+            plain = {name: getattr(self.value, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+            text = json.dumps({**plain, "depth_scale": depth_scale, **self._about}, indent=1)
+            file.write_text(text, encoding="ascii")
 
 
-def _by_stamp(line: str) -> tuple[int, str]:
-    whole, _, rest = line.partition(".")
-    return int(whole), rest
+def _write(file: Path, data: bytes) -> None:
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(data)
+
+
+def _write_png(file: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """One channel, 8 or 16 bits; level 1, a third of the time for some more bytes."""
+    _write(file, cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+
+
+def _seconds(stamp_ns: int) -> str:
+    """Nanoseconds as seconds with nine places, exactly."""
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"

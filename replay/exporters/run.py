@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -31,21 +32,6 @@ _SUFFIXES: dict[str, LogFormat] = {
 }
 _FOLDERS = ("tum", "folder")
 _ONE_CAMERA = ("trajectory", "tum", "folder")
-
-
-@dataclass(frozen=True, slots=True)
-class LogExportRequest:
-    """What to write.
-
-    Args:
-        format: Of the file or folder.
-        camera: Only the frames of this one; empty = all, which trajectory, tum and folder can hold of one camera only.
-        max_frames: Stop after this many; 0 = all.
-    """
-
-    format: LogFormat
-    camera: str = ""
-    max_frames: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +68,23 @@ def log_format_of(path: Path, given: str | None) -> LogFormat:
     return _SUFFIXES[path.suffix.lower()]
 
 
-def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callable[[], None]) -> LogExportReport:
+def export_log(
+    log: Log,
+    out: Path,
+    name: LogFormat,
+    *,
+    camera: str = "",
+    max_frames: int = 0,
+    on_frame: Callable[[], None] = lambda: None,
+) -> LogExportReport:
     """Write the frames of a log; ``out`` is there only once it is whole.
 
     Args:
         log: To read; damaged frames are passed over and stand in its ``errors``.
         out: File or folder to make; a file is replaced, a folder never.
-        request: What to write.
+        name: The format.
+        camera: Only the frames of this one; empty = all, which trajectory, tum and folder can hold of one camera only.
+        max_frames: Stop after this many; 0 = all.
         on_frame: Called for each frame that was looked at.
 
     Raises:
@@ -96,9 +92,9 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
         MapError: the format states metres, and the log has none.
         LogError: ``out`` is there already, or cannot be written; or no frame could be.
     """
-    if request.format == "tum":
+    if name == "tum":
         require_metres(log.info.scale_known, f"{out}: depth and poses of a TUM sequence are in metres")
-    is_folder = request.format in _FOLDERS
+    is_folder = name in _FOLDERS
     if is_folder and out.exists():
         raise LogError(f"{out}: exists already; name a folder that is to be made")
     if out.is_dir():
@@ -107,15 +103,16 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
         raise LogError(f"{out}: exists already, and may be a log of its own; give another name")
     if out.resolve() == log.path.resolve():
         raise ConfigError(f"{out}: is the log itself; choose another name for the result")
-    camera = _choose_camera(log, request)
+    camera = _choose_camera(log, camera, name)
     left_out: list[str] = []
     frames = 0
     with (atomic_folder if is_folder else atomic_path)(out, raises=LogError) as place:
-        exporter = _exporter(place, log.info, request.format)
+        exporter = _exporter(place, log.info, name)
         note = log.attachments().get(AUTOLABEL_ATTACHMENT)
-        if request.format == "folder" and note is not None:
+        if name == "folder" and note is not None:
             write_bytes(place / AUTOLABEL_ATTACHMENT, note.data, raises=LogError)
-        for envelope, parts in _frames(log, camera, request.max_frames):
+        frames_of_it = ((e, parts) for e, parts in log.frame_parts() if not camera or e.source == camera)
+        for envelope, parts in islice(frames_of_it, max_frames or None):
             on_frame()
             try:
                 exporter.add(_unpacked(envelope, parts))
@@ -143,31 +140,20 @@ def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
     return TumExporter(place) if name == "tum" else FolderExporter(place, info)
 
 
-def _choose_camera(log: Log, request: LogExportRequest) -> str:
+def _choose_camera(log: Log, camera: str, name: LogFormat) -> str:
     """The camera to write, empty = all.
 
     Raises:
         ConfigError: it is not in the log, or has to be named.
     """
-    if not request.camera and request.format not in _ONE_CAMERA:
+    if not camera and name not in _ONE_CAMERA:
         return ""
     there = sorted({envelope.source for envelope, _ in log.frame_parts()})
-    if request.camera and request.camera not in there:
-        raise ConfigError(f"--camera {request.camera}: the log has frames of {', '.join(there) or 'none'}")
-    if request.format in _ONE_CAMERA and not request.camera and len(there) > 1:
-        raise ConfigError(f"{request.format} holds one camera; name one of {', '.join(there)} with --camera")
-    return request.camera
-
-
-def _frames(log: Log, camera: str, max_frames: int) -> Iterator[tuple[Envelope, list[bytes]]]:
-    count = 0
-    for envelope, parts in log.frame_parts():
-        if camera and envelope.source != camera:
-            continue
-        if max_frames and count >= max_frames:
-            return
-        count += 1
-        yield envelope, parts
+    if camera and camera not in there:
+        raise ConfigError(f"--camera {camera}: the log has frames of {', '.join(there) or 'none'}")
+    if name in _ONE_CAMERA and not camera and len(there) > 1:
+        raise ConfigError(f"{name} holds one camera; name one of {', '.join(there)} with --camera")
+    return camera
 
 
 def _unpacked(envelope: Envelope, parts: list[bytes]) -> ExportFrame:

@@ -22,7 +22,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float32, Float64, UInt8
+from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 PICTURES = (".jpg", ".jpeg", ".png")
 DEPTHS = (".png", ".npy", ".npz")
@@ -106,33 +106,42 @@ class DepthScale:
         return f"{self.units_per_m:g} units per metre, assumed: {self.convention}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ImportReport:
     """What an import did.
 
     Args:
+        format: Of the recording.
+        depth_scale: How its depth images were read.
+        info: What stands in the log's head.
         frames: In the log.
-        labelled: Of these, with a label image.
-        with_depth: Of these, with a depth image.
-        depth_scale: How their depth images were read.
+        labelled: Of these, with a label image that no weights have rendered.
+        with_depth: Of these, with a depth image of a sensor.
         median_depth_m: Of the measurements in the first of them, to judge the scale by; 0 without any.
         skipped: Frames and label images that were left out.
         notices: Sentences on what had to be assumed of the whole recording.
-        format: Of the recording.
-        info: What stands in the log's head.
         bytes: Size of the log.
     """
 
-    frames: int
-    labelled: int
-    with_depth: int
-    depth_scale: DepthScale
-    median_depth_m: float
-    skipped: tuple[Skipped, ...]
-    notices: tuple[str, ...]
     format: str
+    depth_scale: DepthScale
     info: StreamInfo
-    bytes: int
+    frames: int = 0
+    labelled: int = 0
+    with_depth: int = 0
+    median_depth_m: float = 0.0
+    skipped: list[Skipped] = field(default_factory=list[Skipped])
+    notices: list[str] = field(default_factory=list[str])
+    bytes: int = 0
+
+    def count(self, frame: PosedFrame) -> None:
+        """Count a frame that is in the log."""
+        self.frames += 1
+        self.labelled += frame.label is not None and not frame.label_is_pseudo
+        if frame.depth_m is not None and frame.depth_sigma_m is None:
+            self.with_depth += 1
+            if not self.median_depth_m and (frame.depth_m > 0).any():
+                self.median_depth_m = float(np.median(frame.depth_m[frame.depth_m > 0]))
 
 
 class BadFrameError(ImportSourceError):

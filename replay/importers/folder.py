@@ -40,6 +40,7 @@ from semantic_mapper.replay.importers.tables import (
     read_plain_json,
     read_pose_rows,
     read_rows,
+    refuse_keys,
     seconds_to_ns,
     unknown_notice,
     without_picture,
@@ -53,6 +54,9 @@ DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
 DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs into intrinsics.json as depth_scale")
 
 
+_OTHER_LENS = re.compile(r"dist\w+|coeffs|D|(distortion_|lens_)?model")  # keys of other programs
+
+
 class _Intrinsics(msgspec.Struct):
     fx: float
     fy: float
@@ -60,16 +64,9 @@ class _Intrinsics(msgspec.Struct):
     cy: float
     width: Annotated[float, Meta(ge=1, le=1 << 14)] | None = None  # None = that of the first image
     height: Annotated[float, Meta(ge=1, le=1 << 14)] | None = None
-    distortion: tuple[float, ...] | None = None  # OpenCV's coefficients, by the names that programs give them
-    dist_coeffs: tuple[float, ...] | None = None
-    distortion_coefficients: tuple[float, ...] | None = None
-    coeffs: tuple[float, ...] | None = None
-    D: tuple[float, ...] | None = None
+    distortion: tuple[float, ...] | None = None  # OpenCV's coefficients
     fisheye: bool = False  # of its fisheye model
-    camera_model: str | None = None  # the lens, by its name, however the key is called
-    distortion_model: str | None = None
-    lens_model: str | None = None
-    model: str | None = None
+    camera_model: str = "opencv"  # the lens, by a name that ROS, COLMAP or Kalibr give it
     depth_scale: Annotated[float, Meta(gt=0, le=1e6)] | None = None  # units per metre; None = the format's convention
     scale: str = ""  # "unknown" where poses are not in metres
 
@@ -230,6 +227,7 @@ def read_intrinsics(
     """
     plain = read_plain_json(file)
     i = convert_known(plain, _Intrinsics, file)
+    refuse_keys({key: value for key, value in plain.items() if key != "distortion"}, _OTHER_LENS, file)
     notices += unknown_notice(file, [plain], _Intrinsics)
     if i.depth_scale is not None and i.depth_scale < 1:
         raise ImportSourceError(
@@ -237,16 +235,12 @@ def read_intrinsics(
             f"write {1 / i.depth_scale:g}"
         )
     scale = DepthScale(i.depth_scale, file) if i.depth_scale is not None else None
-    lenses = (i.distortion, i.dist_coeffs, i.distortion_coefficients, i.coeffs, i.D)
-    coefficients = next((lens for lens in lenses if lens), ())
     size = (i.width, i.height) if i.width and i.height else first_size(pictures)
     if size is None:
         raise ImportSourceError(f"{file}: has no width and height, and no image that tells them")
-    named = i.camera_model or i.distortion_model or i.lens_model or i.model or "opencv"
+    model, k = "fisheye" if i.fisheye else i.camera_model, (i.fx, i.fy, i.cx, i.cy)
     try:
-        lens = lens_intrinsics(
-            "fisheye" if i.fisheye else named, coefficients, (i.fx, i.fy, i.cx, i.cy), (int(size[0]), int(size[1]))
-        )
+        lens = lens_intrinsics(model, i.distortion or (), k, (int(size[0]), int(size[1])))
     except (ConfigError, FrameError) as error:
         raise ImportSourceError(f"{file}: {error}") from error
     return lens, scale, i.scale != SCALE_UNKNOWN

@@ -17,15 +17,15 @@ https://github.com/autonomousvision/kitti360Scripts, but for its category "void"
 
 from __future__ import annotations
 
-import re
-from datetime import UTC, datetime
+from contextlib import suppress
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import FrameError, ImportSourceError
-from semantic_mapper.geometry import check_pose, invert_pose, transform
+from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
@@ -90,15 +90,13 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
         raise ImportSourceError(
             f"{raw / CAMERAS[0] / 'data_rect'}: no rectified images; download 'Perspective Images' of this drive"
         )
-    calibration = _read_calibration(root / "calibration" / "perspective.txt")
-    rectified = {
-        name: _rectified_camera(calibration, name[-2:], root / "calibration" / "perspective.txt") for name in cameras
-    }
+    calibration = root / "calibration" / "perspective.txt"
+    rectified = {name: _rectified_camera(calibration, name[-2:]) for name in cameras}
     scans_folder = root / "data_3d_raw" / drive / "velodyne_points" / "data"
     scans = numbered_files(scans_folder, (".bin",), notices)
     if not scans:
         notices.append(f"no laser scans of {scans_folder}: frames come without depth")
-    T_cam0_scanner = _scanner_pose(root / "calibration", calibration) if scans else np.eye(4)
+    T_cam0_scanner = _scanner_pose(calibration) if scans else np.eye(4)
     poses_file = root / "data_poses" / drive / "cam0_to_world.txt"
     poses = _read_poses(poses_file, notices)
     labels = {name: numbered_files(semantics / name / "semantic", (".png",), notices) for name in cameras}
@@ -200,32 +198,50 @@ def find_drive(folder: Path) -> tuple[Path, str]:
     )
 
 
-def _rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> tuple[CameraIntrinsics, Float64]:
-    """Intrinsics of a rectified camera, and ``T_cam0_camera`` (4, 4): where it stands next to the left one.
-
-    Args:
-        values: Lines of ``perspective.txt`` by name.
-        which: "00" or "01".
-        file: Named in errors.
+def _calibrated(file: Path, name: str, count: int) -> Float64:
+    """Numbers of the line of a calibration file that begins with a name, or of the only line, without one.
 
     Raises:
-        ImportSourceError: lines are missing, or of another length.
+        ImportSourceError: it is missing, or has another count of finite numbers.
     """
-    P, size = values.get(f"P_rect_{which}", []), values.get(f"S_rect_{which}", [])
-    if len(P) != 12 or len(size) != 2:
-        raise ImportSourceError(f"{file}: needs 'P_rect_{which}:' with 12 numbers and 'S_rect_{which}:' with 2")
-    matrix = np.array(P, np.float64).reshape(3, 4)
-    K = matrix[:, :3]
-    if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]):
-        raise ImportSourceError(f"{file}: P_rect_{which} has skew, which is not undone; use the file of the data set")
-    try:
-        intrinsics = CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(size[0]), int(size[1]))
-        offset = np.linalg.solve(K, matrix[:, 3])
-    except (FrameError, ValueError, OverflowError, np.linalg.LinAlgError) as error:  # int() of NaN or infinity, too
-        raise ImportSourceError(f"{file}: P_rect_{which} and S_rect_{which}: {error}") from error
+    for _, text in read_lines(file):
+        label, colon, numbers = text.rpartition(":")
+        if label.strip() == name and (colon or not name):
+            with suppress(ValueError):
+                values = np.array(read_numbers(numbers), np.float64)
+                if len(values) == count and np.isfinite(values).all():
+                    return values
+    wanted = f"'{name}:' with {count} numbers" if name else f"{count} numbers"
+    raise ImportSourceError(f"{file}: needs {wanted}; download it again")
+
+
+def _rectified_camera(file: Path, which: str) -> tuple[CameraIntrinsics, Float64]:
+    """Intrinsics of the rectified camera "00" or "01", and ``T_cam0_camera`` (4, 4): where it stands next to the left.
+
+    Raises:
+        ImportSourceError: the file lacks it.
+    """
+    P = _calibrated(file, f"P_rect_{which}", 12).reshape(3, 4)
+    width, height = _calibrated(file, f"S_rect_{which}", 2)
     T_cam0_camera = np.eye(4)
-    T_cam0_camera[:3, 3] = -offset  # P = K [I | t] takes points of the left camera
+    try:
+        intrinsics = CameraIntrinsics(P[0, 0], P[1, 1], P[0, 2], P[1, 2], int(width), int(height))
+        T_cam0_camera[:3, 3] = -np.linalg.solve(P[:, :3], P[:, 3])  # P = K [I | t] takes points of the left camera
+    except (FrameError, np.linalg.LinAlgError) as error:
+        raise ImportSourceError(f"{file}: P_rect_{which} and S_rect_{which}: {error}") from error
     return intrinsics, T_cam0_camera
+
+
+def _scanner_pose(file: Path) -> Float64:
+    """T_cam0_scanner (4, 4): the scanner in the rectified left camera.
+
+    Raises:
+        ImportSourceError: files or lines are missing, or of another form.
+    """
+    T_scanner_camera, T_cam0_raw = np.eye(4), np.eye(4)
+    T_scanner_camera[:3] = _calibrated(file.with_name("calib_cam_to_velo.txt"), "", 12).reshape(3, 4)
+    T_cam0_raw[:3, :3] = _calibrated(file, "R_rect_00", 9).reshape(3, 3)
+    return T_cam0_raw @ invert_pose(T_scanner_camera)
 
 
 def _read_semantics(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt8:
@@ -269,54 +285,17 @@ def depth_of_scan(points: Float64, T_camera_scanner: Float64, intrinsics: Camera
     half_u, half_v = (int(np.ceil((f * step - 1) / 2)) for f, step in zip((k.fx, k.fy), BEAM_STEP_RAD, strict=True))
     margin = np.array((half_u, half_v))
     inside = ((uv >= -margin) & (uv < np.array((k.width, k.height)) + margin)).all(axis=1)
-    (u, v), z = (uv[inside] + margin).astype(np.int64).T, p[inside, 2].astype(np.float32)
-    depth = np.full((k.height + 4 * half_v, k.width + 4 * half_u), np.inf, np.float32)
-    for dv in range(2 * half_v + 1):
-        for du in range(2 * half_u + 1):
-            np.minimum.at(depth, (v + dv, u + du), z)
-    depth = depth[2 * half_v : 2 * half_v + k.height, 2 * half_u : 2 * half_u + k.width]
+    u, v = (uv[inside] + margin).astype(np.int64).T
+    depth = np.full((k.height + 2 * half_v, k.width + 2 * half_u), np.inf, np.float32)
+    np.minimum.at(depth, (v, u), p[inside, 2].astype(np.float32))
+    depth = np.asarray(cv2.erode(depth, np.ones((2 * half_v + 1, 2 * half_u + 1), np.uint8)))
+    depth = depth[half_v : half_v + k.height, half_u : half_u + k.width]
     return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-
-
-def _scanner_pose(calibration: Path, values: dict[str, list[float]]) -> Float64:
-    """T_cam0_scanner (4, 4): the scanner in the rectified left camera.
-
-    Raises:
-        ImportSourceError: files or lines are missing, or of another form.
-    """
-    file = calibration / "calib_cam_to_velo.txt"
-    words = [word for _, text in read_lines(file) for word in text.split()]
-    rectification = values.get("R_rect_00", [])
-    if len(rectification) != 9:
-        raise ImportSourceError(f"{calibration / 'perspective.txt'}: needs 'R_rect_00:' with 9 numbers to use scans")
-    try:
-        T_scanner_camera = np.vstack((np.array([float(w) for w in words]).reshape(3, 4), (0, 0, 0, 1)))
-        check_pose(T_scanner_camera, "calib_cam_to_velo.txt")
-    except (ValueError, FrameError) as error:
-        raise ImportSourceError(f"{file}: expected the 12 numbers of a rigid 3x4 matrix ({error})") from error
-    T_cam0_raw = np.eye(4)
-    T_cam0_raw[:3, :3] = np.array(rectification).reshape(3, 3)
-    return T_cam0_raw @ invert_pose(T_scanner_camera)
-
-
-def _read_calibration(file: Path) -> dict[str, list[float]]:
-    values: dict[str, list[float]] = {}
-    for line, text in read_lines(file):
-        name, _, numbers = text.partition(":")
-        if not re.fullmatch(r"[PRS]_rect_0[01]", name.strip()):
-            continue
-        try:
-            values[name.strip()] = read_numbers(numbers)
-        except ValueError as error:
-            raise ImportSourceError(f"{file}, line {line}: {error}") from error
-    return values
 
 
 def _time_ns(text: str, file: Path, line: int) -> int | BadFrameError:
     """``2013-05-28 08:46:02.904547200`` -> nanoseconds since 1970."""
-    seconds, _, fraction = text.strip().replace("T", " ").partition(".")
     try:
-        whole = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-        return int(whole.timestamp()) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
+        return int(np.datetime64(text.strip().replace(" ", "T") or "none", "ns").astype(np.int64))
     except ValueError as error:
         return BadFrameError(file, f"line {line}: expected a date and a time: {error}")

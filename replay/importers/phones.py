@@ -25,6 +25,7 @@ import numpy as np
 
 from semantic_mapper.errors import FrameError, ImportSourceError
 from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import PICTURES, DepthScale, ImportOptions, first_size
 from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import (
@@ -189,22 +190,16 @@ def _record3d_intrinsics(found: _Metadata, number: int) -> CameraIntrinsics:
 
 
 def _seconds(found: _Metadata, numbers: list[int], file: Path, notices: list[str]) -> list[float]:
-    """Time of each picture, from 0. One that is missing lies between its neighbours, or at the usual rate beyond the
-    first and the last."""
-    rate = found.fps if found.fps and 0 < found.fps <= 1000 else RECORD3D_FPS
-    wanted = np.array(numbers, np.float64)
-    given = [(n, float(t)) for n, t in enumerate(found.frame_times) if isinstance(t, int | float) and math.isfinite(t)]
-    if not given:
-        if rate != found.fps:
-            notices.append(f"{file}: tells neither times nor fps: stamps are made up at {rate:g} frames a second")
-        return (wanted / rate).tolist()
-    known, times = np.array(given, np.float64).T
-    missing = [f"number {n}" for n in numbers if n not in known]
-    if missing:
+    """Time of each picture, from 0: its own where each has one, else by the rate."""
+    times = [found.frame_times[n] if n < len(found.frame_times) else None for n in numbers]
+    known = [float(time) for time in times if isinstance(time, int | float) and math.isfinite(time)]
+    if len(known) == len(numbers):
+        return [time - min(known) for time in known]
+    given = found.fps is not None and 0 < found.fps <= 1000
+    rate = found.fps if found.fps is not None and given else RECORD3D_FPS
+    if known or not given:
         notices.append(
-            f"{file}: {len(missing)} of frameTimestamps missing; their stamps lie between those of their neighbours, "
-            f"or follow at {rate:g} frames a second; the first: {missing[0]}"
+            f"{file}: {len(numbers) - len(known)} of {counted(len(numbers), 'picture')} have no time: stamps are made "
+            f"up at {rate:g} frames a second{'' if given else ', which is assumed'}"
         )
-    beyond = np.maximum(wanted - known[-1], 0) - np.maximum(known[0] - wanted, 0)
-    seconds = np.interp(wanted, known, times) + beyond / rate
-    return (seconds - seconds.min()).tolist()
+    return [(number - min(numbers)) / rate for number in numbers]

@@ -148,7 +148,6 @@ class PosedPictures:
             source=source,
             cameras=dict(sorted(cameras.items())),
             label_set=labels,
-            frame_count=len(self._pictures),
             frame_hz=hz,
             metadata={} if metric else {SCALE_KEY: SCALE_UNKNOWN},
         )

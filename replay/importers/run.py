@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
@@ -25,7 +23,7 @@ from semantic_mapper.replay.importers.folder import open_folder
 from semantic_mapper.replay.importers.kitti360 import open_kitti360
 from semantic_mapper.replay.importers.models import find_opensfm, open_colmap, open_opensfm
 from semantic_mapper.replay.importers.phones import open_polycam, open_record3d
-from semantic_mapper.replay.importers.posed import LoadedFrame, PosedPictures
+from semantic_mapper.replay.importers.posed import PosedPictures
 from semantic_mapper.replay.importers.rooms import open_replica, open_scannet
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.rosbag import open_rosbag
@@ -176,12 +174,12 @@ def import_recording(
     *,
     options: ImportOptions = _DEFAULTS,
     renames: Mapping[str, str] | None = None,
-    codec: CodecOptions | None = None,
     overwrite: bool = False,
 ) -> ImportReport:
     """Write the recording ``src`` (folder or ROS bag) to the log ``dst``, which is there once the import is complete.
 
-    A frame that cannot be used is left out and reported; a bad label image costs the frame its label only.
+    Images that are JPEG or PNG files stay what they are, and depth loses nothing. A frame that cannot be used is left
+    out and reported; a bad label image costs the frame its label only.
 
     Args:
         src: Folder of the recording, or its file.
@@ -190,7 +188,6 @@ def import_recording(
         on_progress: Called with (frames looked at, frames in all).
         options: How to read.
         renames: New names of classes by their present ones; classes of one name become one class.
-        codec: How to pack; lossless by default, images that are JPEG or PNG files stay what they are.
         overwrite: Whether a log that is there may be replaced.
 
     Raises:
@@ -206,74 +203,42 @@ def import_recording(
     if options.scale is not None and name not in SCALED:
         raise ImportSourceError(f"{src}: poses of format '{name}' are in metres; --scale is for {', '.join(SCALED)}")
     if not src.is_dir() and not (name == "rosbag" and src.is_file()):
-        raise ImportSourceError(f"{src}: no such {'file or folder' if name == 'rosbag' else 'folder'}")
+        raise ImportSourceError(f"{src}: no such folder")
     recording = FORMATS[name](src, options)
     numbers = range(0, len(recording), options.every)[: options.max_frames]
     info, changed = _changes(src, recording.info, options, renames or {})
-    packing = codec or CodecOptions(depth_scale=recording.depth_scale.units_per_m)
-
-    result = _Result()
+    report = ImportReport(name, recording.depth_scale, info, notices=recording.notices)
+    pseudo_labelled = computed = 0
+    packing = CodecOptions(depth_scale=recording.depth_scale.units_per_m)
     with atomic_log(dst, info, options=packing, overwrite=overwrite) as writer:
         if name == "folder" and (src / AUTOLABEL_ATTACHMENT).is_file():
             _attach_note(src / AUTOLABEL_ATTACHMENT, writer)
-        keep_files = codec is None and options.quarters % 4 == 0
         for done, number in enumerate(numbers, 1):
             try:
                 loaded = recording.load(number)
-                writer.write_frame(changed(loaded.frame), encoded_rgb=loaded.encoded_rgb if keep_files else None)
+                frame = changed(loaded.frame)
+                writer.write_frame(frame, encoded_rgb=None if options.quarters % 4 else loaded.encoded_rgb)
             except BadFrameError as error:
-                result.skipped.append(Skipped(error.file, error.reason, number))
+                report.skipped.append(Skipped(error.file, error.reason, number))
             except (FrameError, CodecError) as error:
-                result.skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
+                report.skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
             else:
-                result.count(loaded, number)
+                report.count(frame)
+                pseudo_labelled += frame.label_is_pseudo
+                computed += frame.depth_sigma_m is not None
+                if (bad := loaded.label_error) is not None:
+                    report.skipped.append(Skipped(bad.file, bad.reason, number, label_only=True))
             if on_progress is not None:
                 on_progress(done, len(numbers))
-        frames = writer.frames
-        if frames == 0:
-            different = {s.reason: s for s in reversed(result.skipped)}  # the first of each reason
-            reasons = "; ".join(f"{s.file}: {s.reason}" for s in list(different.values())[::-1][:3])
+        if not report.frames:
+            first_of_each = {s.reason: f"{s.file}: {s.reason}" for s in reversed(report.skipped)}
+            reasons = "; ".join(list(first_of_each.values())[::-1][:3])
             raise ImportSourceError(f"{src}: none of its {len(numbers)} frames can be used: {reasons}")
-    made = ((result.pseudo_labelled, "pseudo labels, which weights have rendered"), (result.computed, "computed depth"))
-    return ImportReport(
-        frames=frames,
-        labelled=result.labelled,
-        with_depth=result.with_depth,
-        depth_scale=recording.depth_scale,
-        median_depth_m=result.median_depth_m,
-        skipped=tuple(result.skipped),
-        notices=(
-            *recording.notices,
-            *(f"{counted(count, 'frame')} with {what}; marked in the log" for count, what in made if count),
-        ),
-        format=name,
-        info=info,
-        bytes=dst.stat().st_size,
-    )
-
-
-@dataclass(slots=True)
-class _Result:
-    """What is counted while frames are written."""
-
-    labelled: int = 0
-    pseudo_labelled: int = 0
-    computed: int = 0
-    with_depth: int = 0
-    median_depth_m: float = 0.0
-    skipped: list[Skipped] = dataclasses.field(default_factory=list[Skipped])
-
-    def count(self, loaded: LoadedFrame, number: int) -> None:
-        frame = loaded.frame
-        self.labelled += frame.label is not None and not frame.label_is_pseudo
-        self.pseudo_labelled += frame.label is not None and frame.label_is_pseudo
-        self.computed += frame.depth_sigma_m is not None
-        if loaded.label_error is not None:
-            self.skipped.append(Skipped(loaded.label_error.file, loaded.label_error.reason, number, label_only=True))
-        if frame.depth_m is not None and frame.depth_sigma_m is None:
-            self.with_depth += 1
-            if not self.median_depth_m and (frame.depth_m > 0).any():
-                self.median_depth_m = float(np.median(frame.depth_m[frame.depth_m > 0]))
+    for count, what in ((pseudo_labelled, "pseudo labels, which weights have rendered"), (computed, "computed depth")):
+        if count:
+            report.notices.append(f"{counted(count, 'frame')} with {what}; marked in the log")
+    report.bytes = dst.stat().st_size
+    return report
 
 
 def _attach_note(file: Path, writer: LogWriter) -> None:
@@ -293,8 +258,7 @@ def _changes(
 ) -> tuple[StreamInfo, Callable[[PosedFrame], PosedFrame]]:
     """What the log says of its frames, and what makes its frames of those of the recording."""
     cameras = {camera: rotate_intrinsics(k, options.quarters) for camera, k in info.cameras.items()}
-    # What the log holds counts, not what the folder did.
-    info = msgspec.structs.replace(info, cameras=cameras, frame_count=None)
+    info = msgspec.structs.replace(info, cameras=cameras)
     if not renames:
         return info, lambda frame: rotate_frame(frame, options.quarters)
     if info.label_set is None:

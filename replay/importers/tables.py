@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
@@ -288,16 +287,12 @@ def refuse_keys(table: Mapping[str, Any], names: re.Pattern[str], where: object)
 
 def _is_neutral(key: str, value: Any) -> bool:
     """Whether a value says that nothing is changed."""
-    if value is None or value is False:
-        return True
     if isinstance(value, str):
         return value.strip().lower() in _NEUTRAL_WORDS and not _AXES.search(key)
     if isinstance(value, Mapping):
         return all(_is_neutral(key, item) for item in cast("Mapping[str, Any]", value).values())
     if isinstance(value, list):
-        rows = cast("list[Any]", value)
-        return rows in (np.eye(2).tolist(), np.eye(3).tolist(), np.eye(4).tolist()) or all(
-            _is_neutral(key, item) for item in rows
-        )
+        identity = value in (np.eye(3).tolist(), np.eye(4).tolist())
+        return identity or all(_is_neutral(key, item) for item in cast("list[Any]", value))
     is_factor = re.search("scale|aspect|unit", key, re.IGNORECASE) is not None
-    return value == (1 if is_factor else 0) or (isinstance(value, float) and math.isnan(value))
+    return value is None or value == (1 if is_factor else 0)

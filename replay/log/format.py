@@ -13,10 +13,9 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, cast
+from typing import IO, NamedTuple, cast
 
 import msgspec
 from mcap.data_stream import RecordBuilder
@@ -36,35 +35,26 @@ from semantic_mapper.types import PosedFrame
 class AtomicFile:
     """A new file, open for writing. ``write`` collects in memory, ``commit`` brings all of it to the file or nothing.
 
-    Args:
-        path: Of the file.
-        overwrite: Whether an existing one may be replaced.
-
-    Attributes:
-        size: Of what was committed, bytes.
-
     Raises:
-        OSError: it exists, or cannot be made.
+        OSError: it exists and may not be replaced, or cannot be made.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         if overwrite and path.is_symlink():
             path.unlink()  # replaced, never written through
         self._fd = open_unlinked(path, os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL))
-        self._pending: list[bytes] = []
-        self._pending_bytes = 0
-        self.size = 0
+        self._pending = bytearray()
+        self.size = 0  # of what was committed, bytes
         self.closed = False
 
     def write(self, data: bytes) -> int:
         """Collect; never fails."""
-        self._pending.append(bytes(data))
-        self._pending_bytes += len(data)
+        self._pending += data
         return len(data)
 
     def tell(self) -> int:
         """Where the next byte will be once all is committed."""
-        return self.size + self._pending_bytes
+        return self.size + len(self._pending)
 
     def flush(self) -> None:
         """Do nothing: ``commit`` decides what is in the file."""
@@ -75,8 +65,7 @@ class AtomicFile:
         Raises:
             OSError: not all of it could be written; the file is as it was, and what was collected is dropped.
         """
-        data = memoryview(b"".join(self._pending))
-        self.drop()
+        data, self._pending = memoryview(self._pending), bytearray()
         written = 0
         try:
             while written < len(data):
@@ -87,11 +76,6 @@ class AtomicFile:
                 os.lseek(self._fd, self.size, os.SEEK_SET)
             raise
         self.size += written
-
-    def drop(self) -> None:
-        """Forget what was collected since the last commit."""
-        self._pending.clear()
-        self._pending_bytes = 0
 
     def sync(self) -> None:
         """Wait until the disk has it.
@@ -156,7 +140,6 @@ class LogWriter:
             self._writer.add_attachment(0, 0, INFO_ATTACHMENT, "application/msgpack", pack_parts(parts))
             for attachment in attachments:
                 self.attach(attachment)
-            self._writer.add_metadata("semantic-mapper", _for_people(info))
             self.write_parts(parts)
         except LogError as error:
             self._file.close()
@@ -236,7 +219,11 @@ class LogWriter:
         if self._file.closed:
             return
         try:
-            if not (self._failed or self._end_with_index()):
+            try:
+                if not self._failed:
+                    self._writer.finish()
+                    self._file.commit()
+            except OSError:  # no room for the index
                 self._failed = True
             if self._failed:
                 self._file.write(_short_end())
@@ -254,14 +241,6 @@ class LogWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    def _end_with_index(self) -> bool:
-        self._writer.finish()
-        try:
-            self._file.commit()
-        except OSError:
-            return False
-        return True
 
     def _channel(self, topic: str, source: str) -> int:
         name = f"{topic}/{source}"
@@ -303,13 +282,6 @@ def _schema(kind: type[msgspec.Struct]) -> bytes:
         "follows this schema; each of its 'encoding' fields says how the buffer is packed."
     )
     return json.dumps(described).encode()
-
-
-def _for_people(info: StreamInfo) -> dict[str, str]:
-    """What `mcap info` and the like show; nothing reads it back."""
-    cameras = ", ".join(f"{name} {i.width}x{i.height}" for name, i in info.cameras.items())
-    labels = "none" if info.label_set is None else f"{info.label_set.name} ({len(info.label_set)} classes)"
-    return {"source": info.source, "cameras": cameras, "labels": labels, **info.metadata}
 
 
 @contextmanager
@@ -354,15 +326,9 @@ def _nothing_left(path: Path, error: OSError) -> LogError:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class RecoverReport:
-    """What `recover_log` saved and what it could not.
-
-    Args:
-        frames, messages: In the new log.
-        lost: Why each of the others could not be saved.
-        finished: Whether the old log had been closed by its writer.
-    """
+class RecoverReport(NamedTuple):
+    """Frames and messages of the new log; why each of the others could not be saved; and whether the old log had been
+    closed by its writer."""
 
     frames: int
     messages: int

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,12 +14,11 @@ from semantic_mapper.errors import CodecError, LogError, NodeError, TransportErr
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.transport.codec import Envelope, decode_as, encode
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Parts
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 Mode = Literal["lockstep", "realtime", "fast"]
-Ack = MapUpdate | FrameRefused
 
 ACK_TOPICS = ("map", "refused")  # what a lockstep subscriber has to subscribe to
 END_TIMEOUT_S = 60.0  # a lossless mapper behind a full queue needs the time of one frame to make room for the end
@@ -61,57 +60,13 @@ class PlayReport:
 
     Args:
         published: Frames sent.
-        fused: Of these, fused by the mapper (lockstep only).
-        refused: Frames that the mapper could not use, and why (lockstep only).
         errors: Frames of the log that could not be read.
         stopped: Whether a person ended it before the log did.
     """
 
     published: int
-    fused: int
-    refused: tuple[FrameRefused, ...]
     errors: tuple[LogError, ...]
     stopped: bool
-
-
-class Lockstep:
-    """Sends one frame at a time and waits until the mapper has answered it, so that nothing is ever dropped.
-
-    Args:
-        publisher: Of the frames.
-        acks: Subscribed to ``ACK_TOPICS`` of the mapper.
-        timeout_s: How long the mapper may take for one frame.
-    """
-
-    def __init__(self, publisher: Publisher, acks: LosslessSubscriber, timeout_s: float) -> None:
-        self._publisher = publisher
-        self._acks = acks
-        self._timeout_s = timeout_s
-
-    def send(self, parts: Parts, envelope: Envelope, stop: threading.Event | None = None) -> Ack | None:
-        """Publish one frame and wait for its answer; None where ``stop`` came first.
-
-        Raises:
-            NodeError: the mapper has gone, or has not answered in time.
-            TransportError: it does not even take the frame.
-        """
-        self._publisher.publish(parts, self._timeout_s)
-        deadline = time.monotonic() + self._timeout_s
-        while stop is None or not stop.is_set():
-            message = self._acks.receive(_SLICE_S)
-            if isinstance(message, MapUpdate | FrameRefused) and _answers(message, envelope):
-                return message
-            if message is not None:
-                continue
-            where = f"frame seq={envelope.seq} of camera '{envelope.source}'"
-            if self._acks.connections() == 0 or self._publisher.subscribers("frame", envelope.source) == 0:
-                raise NodeError(f"the mapper has gone while it worked on {where}; its log says why")
-            if time.monotonic() > deadline:
-                raise NodeError(
-                    f"the mapper has not answered {where} within {self._timeout_s:g} s; is it busy with something "
-                    "else, or does it publish its answers at another endpoint?"
-                )
-        return None
 
 
 def play(
@@ -121,7 +76,7 @@ def play(
     options: PlayOptions | None = None,
     *,
     stop: threading.Event | None = None,
-    on_frame: Callable[[Envelope, Ack | None], None] | None = None,
+    on_frame: Callable[[Envelope], None] = lambda envelope: None,
 ) -> PlayReport:
     """Publish a log: its ``StreamInfo``, its frames (the very bytes of the log), ``EndOfStream``.
 
@@ -133,16 +88,15 @@ def play(
         acks: The mapper's answers; needed for lockstep. Subscribe to ``ACK_TOPICS`` of the mapper.
         options: See ``PlayOptions``.
         stop: Ends the playing early when set.
-        on_frame: Called with each frame sent, with the mapper's answer in lockstep.
+        on_frame: Called with each frame sent, in lockstep once the mapper has answered it.
 
     Raises:
         NodeError: lockstep, and the mapper has gone or does not answer. ``EndOfStream`` has been sent then too.
         TransportError: no subscriber came, or one does not keep up.
     """
-    options = options or PlayOptions()
+    options, stop = options or PlayOptions(), stop or threading.Event()
     if options.mode == "lockstep" and acks is None:
         raise NodeError("lockstep needs the mapper's answers: give the player a subscriber to them")
-    stop = stop or threading.Event()
     total = len(log) if options.max_frames is None else min(len(log), options.max_frames)
     publisher.wait_for_subscribers("frame", options.subscribers, options.subscriber_timeout_s)
     if acks is not None:
@@ -152,122 +106,100 @@ def play(
         metadata["played_from_stamp_ns"] = str(options.from_stamp_ns)
     info = msgspec.structs.replace(log.info, frame_count=total, metadata=metadata)
     publisher.publish(encode(info, sender=options.source))
-    run = _Run(log, publisher, options, stop, on_frame)
+    run = _Run(log, publisher, acks, options, stop)
     reason, detail = "error", "the player failed"
     try:
-        run.frames(Lockstep(publisher, acks, options.ack_timeout_s) if acks and options.mode == "lockstep" else None)
+        for envelope in run.frames(total):
+            on_frame(envelope)
         reason, detail = ("stopped" if stop.is_set() else "end"), ""
     except NodeError as error:
         detail = str(error)
         raise
     finally:
-        patience = STOP_TIMEOUT_S if stop.is_set() else END_TIMEOUT_S
-        _say_end(
-            publisher, EndOfStream(options.source, reason, run.published, detail, run.damages, run.unreadable), patience
-        )
-    return PlayReport(run.published, run.fused, tuple(run.refused), tuple(log.errors + run.errors), stop.is_set())
-
-
-def _say_end(publisher: Publisher, end: EndOfStream, timeout_s: float) -> None:
-    try:
-        publisher.publish(encode(end), timeout_s)
-    except (
-        TransportError
-    ) as error:  # a peer that does not listen any more needs no end; what led here must not be hidden
-        logger.warning("end_of_stream_not_delivered", error=str(error))
+        end = EndOfStream(options.source, reason, run.published, detail, run.damages, len(run.unreadable))
+        try:
+            publisher.publish(encode(end), STOP_TIMEOUT_S if stop.is_set() else END_TIMEOUT_S)
+        except TransportError as error:  # who does not listen any more needs no end; what led here must not be hidden
+            logger.warning("end_of_stream_not_delivered", error=str(error))
+    return PlayReport(run.published, tuple(log.errors + run.errors), stop.is_set())
 
 
 class _Run:
-    """The counters of one playing."""
+    """One playing: what was sent, and what could not be."""
 
     def __init__(
         self,
         log: Log,
         publisher: Publisher,
+        acks: LosslessSubscriber | None,
         options: PlayOptions,
         stop: threading.Event,
-        on_frame: Callable[[Envelope, Ack | None], None] | None,
     ) -> None:
-        self.log = log
-        self.publisher = publisher
-        self.options = options
-        self.stop = stop
-        self.on_frame = on_frame
-        self.published = 0
-        self.fused = 0
-        self.refused: list[FrameRefused] = []
-        self.errors: list[LogError] = []
+        self._log, self._publisher, self._acks, self._options, self._stop = log, publisher, acks, options, stop
         self._known = {str(error) for error in log.errors}  # stretches in which no frame can be made out
+        self._began: tuple[float, int] | None = None  # clock and stamp at the first frame
+        self.published = 0
+        self.errors: list[LogError] = []
 
-    def frames(self, lockstep: Lockstep | None) -> None:
-        """Send frame after frame."""
-        clock = _Clock(self.options.rate) if self.options.mode == "realtime" else None
-        for envelope, parts in self.log.frame_parts():
-            if envelope.stamp_ns < self.options.from_stamp_ns:
+    def frames(self, total: int) -> Iterator[Envelope]:
+        """Send frame after frame.
+
+        Raises:
+            NodeError: lockstep, and the mapper has gone, or has not answered in time.
+            TransportError: a subscriber does not take the frame.
+        """
+        for envelope, parts in self._log.frame_parts():
+            if envelope.stamp_ns < self._options.from_stamp_ns:
                 continue
-            if self.options.max_frames is not None and self.published >= self.options.max_frames:
+            if self.published >= total:
                 return
-            if clock is not None:
-                clock.wait_for(envelope.stamp_ns, self.stop)
-            if self.stop.is_set():
+            if self._options.mode == "realtime":
+                self._wait_for(envelope.stamp_ns)
+            if self._stop.is_set():
                 return
-            if not self._can_be_decoded(parts, envelope):
+            try:  # a subscriber would drop what it cannot decode, and lockstep would wait for its answer for ever
+                decode_as(PosedFrame, parts)
+            except CodecError as error:
+                self.errors.append(LogError(f"{self._log.path}: frame seq={envelope.seq}: {error}"))
                 continue
-            ack = None
-            if lockstep is None:
-                self.publisher.publish(parts, self.options.ack_timeout_s)
-            else:
-                ack = lockstep.send(parts, envelope, self.stop)
+            self._publisher.publish(parts, self._options.ack_timeout_s)
+            if self._options.mode == "lockstep":
+                self._wait_for_answer(envelope)
             self.published += 1
-            self._count(ack)
-            if self.on_frame is not None:
-                self.on_frame(envelope, ack)
+            yield envelope
+
+    @property
+    def unreadable(self) -> list[str]:
+        """Frames that were left out so far."""
+        found = [str(error) for error in (*self._log.errors, *self.errors)]
+        return [text for text in found if text not in self._known]
 
     @property
     def damages(self) -> tuple[str, ...]:
         """What could not be read so far: frames first."""
-        texts = [str(error) for error in self.log.errors]
-        return tuple(self._unreadable_frames() + [text for text in texts if text in self._known])
+        return (*self.unreadable, *(text for error in self._log.errors if (text := str(error)) in self._known))
 
-    @property
-    def unreadable(self) -> int:
-        """Frames that were left out."""
-        return len(self._unreadable_frames())
+    def _wait_for(self, stamp_ns: int) -> None:
+        """Keep the distances in time of the recording."""
+        began, first_ns = self._began = self._began or (time.monotonic(), stamp_ns)
+        due = began + (stamp_ns - first_ns) / 1e9 / self._options.rate
+        self._stop.wait(max(0.0, due - time.monotonic()))
 
-    def _unreadable_frames(self) -> list[str]:
-        found = [str(error) for error in (*self.log.errors, *self.errors)]
-        return [text for text in found if text not in self._known]
-
-    def _can_be_decoded(self, parts: Parts, envelope: Envelope) -> bool:
-        """A subscriber would drop it without a word, and lockstep would wait for its answer for ever."""
-        try:
-            decode_as(PosedFrame, parts)
-        except CodecError as error:
-            self.errors.append(LogError(f"{self.log.path}: frame seq={envelope.seq}: {error}"))
-            return False
-        return True
-
-    def _count(self, ack: Ack | None) -> None:
-        if isinstance(ack, FrameRefused):
-            self.refused.append(ack)
-        elif ack is not None:
-            self.fused += ack.fused
-
-
-class _Clock:
-    """Keeps the distances in time of the recording."""
-
-    def __init__(self, rate: float) -> None:
-        self._rate = rate
-        self._first_ns: int | None = None
-        self._started = 0.0
-
-    def wait_for(self, stamp_ns: int, stop: threading.Event) -> None:
-        if self._first_ns is None:
-            self._first_ns, self._started = stamp_ns, time.monotonic()
-        due = self._started + (stamp_ns - self._first_ns) / 1e9 / self._rate
-        stop.wait(max(0.0, due - time.monotonic()))
-
-
-def _answers(ack: Ack, envelope: Envelope) -> bool:
-    return ack.camera_id == envelope.source and ack.seq == envelope.seq
+    def _wait_for_answer(self, envelope: Envelope) -> None:
+        assert self._acks is not None
+        deadline = time.monotonic() + self._options.ack_timeout_s
+        where = f"frame seq={envelope.seq} of camera '{envelope.source}'"
+        while not self._stop.is_set():
+            answer = self._acks.receive(_SLICE_S)
+            if answer is not None:
+                sent = envelope.source, envelope.seq
+                if isinstance(answer, MapUpdate | FrameRefused) and (answer.camera_id, answer.seq) == sent:
+                    return
+                continue
+            if self._acks.connections() == 0 or self._publisher.subscribers("frame", envelope.source) == 0:
+                raise NodeError(f"the mapper has gone while it worked on {where}; its log says why")
+            if time.monotonic() > deadline:
+                raise NodeError(
+                    f"the mapper has not answered {where} within {self._options.ack_timeout_s:g} s; is it busy with "
+                    "something else, or does it publish its answers at another endpoint?"
+                )

@@ -261,20 +261,13 @@ class Recording:
     def _on_failure(self, message: Parts, error: LogError) -> None:
         """The disk took no more, whatever it had promised: go on in a new part, if the rules can make room for one."""
         self._drop_failed_part()
-        while self._rules.disk_full == "delete-oldest":
-            reason = error.__cause__.errno if isinstance(error.__cause__, OSError) else None
-            # EFBIG: this file may not be larger, but another one may be begun.
-            if reason != errno.EFBIG and not (reason in _NO_ROOM and self._delete_oldest()):
-                break
+        while isinstance(error.__cause__, OSError) and error.__cause__.errno in _NO_ROOM and self._delete_oldest():
             try:
                 self._begin_part()
                 return self._write(message)
             except LogError as again:
-                hopeless = reason == errno.EFBIG
                 error = again
                 self._drop_failed_part()
-                if hopeless:
-                    break
         self.lost += 1
         self._stop(str(error))
         return None

@@ -19,19 +19,12 @@ _WINDOW, _LEVELS = (21, 21), 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchor:
-    """A registered frame.
+    """A registered frame."""
 
-    Args:
-        gray: (H, W) its picture.
-        xy: (N, 2) pixels of its points.
-        xyz: (N, 3) their places in the world.
-        T_world_camera: (4, 4).
-    """
-
-    gray: UInt8
-    xy: Float64
-    xyz: Float64
-    T_world_camera: Float64
+    gray: UInt8  # (H, W) its picture
+    xy: Float64  # (N, 2) pixels of its points
+    xyz: Float64  # (N, 3) their places in the world
+    T_world_camera: Float64  # (4, 4)
 
 
 def follow_pose(anchor: Anchor, gray: UInt8, intrinsics: CameraIntrinsics) -> Float64 | None:
@@ -67,9 +60,11 @@ def follow_pose(anchor: Anchor, gray: UInt8, intrinsics: CameraIntrinsics) -> Fl
     return invert_pose(T) if np.isfinite(T).all() else None
 
 
-def track(last: UInt8, now: UInt8, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def track(
+    last: UInt8, now: UInt8, xy: np.ndarray, window: tuple[int, int] = _WINDOW, levels: int = _LEVELS
+) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 1, 2) float32 of one picture in another, and (N,) whether they come back to where they were."""
-    options = {"winSize": _WINDOW, "maxLevel": _LEVELS}
+    options = {"winSize": window, "maxLevel": levels}
     moved, found, _ = cv2.calcOpticalFlowPyrLK(last, now, xy, np.zeros_like(xy), **options)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(now, last, moved, np.zeros_like(xy), **options)
     true = (np.linalg.norm(back - xy, axis=2) < 1.0) & (found > 0) & (found_back > 0)

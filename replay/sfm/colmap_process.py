@@ -39,118 +39,64 @@ TURN_PX, TURN_FOCALS = 3.0, np.geomspace(0.4, 2.0, 12)  # off a turn at most, fo
 # between the rays to what both see may be this small. COLMAP's defaults, 0.95 and 16 degrees, leave none to a camera
 # that goes forwards. It begins with the widest, and halves the angle twice.
 AHEAD_MAX_FORWARD, AHEAD_ANGLE_DEG = 1.0, 8.0
-MAX_POINT_SIGMAS = 2000  # points whose depths are judged
 UNKNOWN_FOCAL = 0.3  # standard deviation of a focal length that usual lenses tell better than the film: it is assumed
 
 
 class Camera(msgspec.Struct, frozen=True):
-    """The camera of all frames, in COLMAP's convention: the first pixel's centre is at 0.5.
-
-    Args:
-        width, height: Of the frames.
-        fixed: fx, fy, cx, cy of a calibrated camera, which stay; None = not calibrated.
-        focal_priors: Focal lengths to begin with, in this order, until most frames find their place; not calibrated.
-        about: The first of these is known about, and held until all frames have their place. Rows of pictures over flat
-            ground fit a wrong one as well.
-    """
+    """The camera of all frames, in COLMAP's convention: the first pixel's centre is at 0.5."""
 
     width: int
     height: int
-    fixed: tuple[float, float, float, float] | None
-    focal_priors: tuple[float, ...]
+    fixed: tuple[float, float, float, float] | None  # fx, fy, cx, cy of a calibrated camera, which stay
+    focal_priors: tuple[float, ...]  # to begin with, in this order, until most frames find their place
+    # The first of these is known about, and held until all frames have their place: rows of pictures over flat ground
+    # fit a wrong one as well.
     about: bool = False
 
 
 class Model(msgspec.Struct, frozen=True):
-    """One model that an attempt has given.
+    """One model that an attempt has given."""
 
-    Args:
-        folder: With COLMAP's binary files.
-        images: Registered.
-        error_px: Mean reprojection error.
-        focal_px: Found or given.
-    """
-
-    folder: str
-    images: int
-    error_px: float
-    focal_px: float
+    folder: str  # with COLMAP's binary files
+    images: int  # registered
+    error_px: float  # mean reprojection error
+    focal_px: float  # found or given
 
 
 class Attempt(msgspec.Struct, frozen=True):
-    """What came of one focal length.
+    """What came of one focal length."""
 
-    Args:
-        focal_prior_px: To begin with.
-        models: The largest first.
-        ahead: Begun with two frames that may lie straight ahead of each other.
-    """
-
-    focal_prior_px: float
-    models: list[Model]
-    ahead: bool = False
+    focal_prior_px: float  # to begin with
+    models: list[Model]  # the largest first
+    ahead: bool = False  # begun with two frames that may lie straight ahead of each other
 
 
 class Pair(msgspec.Struct, frozen=True):
-    """Two frames, by their places in the sequence, with matches that agree with one geometry.
-
-    Args:
-        first, second: The frames.
-        matches: That agree.
-        flat: Of these, the fraction that one homography explains: 1 for a camera that only turns, or one plane.
-        turn: The fraction that a turn on the spot explains.
-    """
+    """Two frames, by their places in the sequence, with matches that agree with one geometry."""
 
     first: int
     second: int
     matches: int
-    flat: float
-    turn: float = 0.0
+    flat: float  # fraction that one homography explains: 1 for a camera that only turns, or one plane
+    turn: float = 0.0  # fraction that a turn on the spot explains
 
 
 class FocalCheck(msgspec.Struct, frozen=True):
-    """What the pictures say of a given focal length.
+    """What the pictures say of a given focal length."""
 
-    Args:
-        factor: By which it has to be multiplied to fit them best.
-        sigmas: How sure that is: the difference over its own standard deviation.
-    """
-
-    factor: float
-    sigmas: float
-
-
-class Sigmas(msgspec.Struct, frozen=True):
-    """Standard deviations of a model, by the covariance of its bundle adjustment: noise of the features alone.
-
-    Args:
-        focal: Of the focal length, as a fraction of it, 1 at most; None where it was not free. Above ``UNKNOWN_FOCAL``
-            the model has the one that the attempt was given.
-        position: Of the place of a camera, the largest, as a fraction of the path, with the path's beginning held.
-        depth: Of the depths of points, with the cameras held: the median of their fractions.
-    """
-
-    focal: float | None
-    position: float
-    depth: float
+    factor: float  # by which it has to be multiplied to fit them best
+    sigmas: float  # how sure that is: the difference over its own standard deviation
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """All that the process tells.
+    """All that the process tells."""
 
-    Args:
-        attempts: In the order of trial.
-        pairs: Of frames near each other.
-        features: Of each frame.
-        focal: Of the largest model of a calibrated camera.
-        sigmas: Of the largest model of the best attempt; None where the adjustment is degenerate.
-    """
-
-    attempts: list[Attempt]
-    pairs: list[Pair]
-    features: list[int]
-    focal: FocalCheck | None = None
-    sigmas: Sigmas | None = None
+    attempts: list[Attempt]  # in the order of trial
+    pairs: list[Pair]  # of frames near each other
+    focal: FocalCheck | None = None  # of the largest model of a calibrated camera
+    # Standard deviation of a focal length that was found, as a fraction of it: noise of the features alone. Above
+    # ``UNKNOWN_FOCAL`` the model has the one that the attempt began with.
+    focal_sigma: float | None = None
 
 
 def best_attempt(attempts: Sequence[Attempt]) -> int:
@@ -159,16 +105,21 @@ def best_attempt(attempts: Sequence[Attempt]) -> int:
     return max(range(len(attempts)), key=sizes.__getitem__)
 
 
-def flat_fraction(pairs: Sequence[Pair]) -> float:
-    """Of the pairs some steps apart, those that one homography explains."""
-    apart = [p for p in pairs if p.second - p.first >= 2 and p.matches >= LINK_MATCHES]
-    return float(np.mean([p.flat >= FLAT for p in apart])) if apart else 0.0
-
-
 def turn_fraction(pairs: Sequence[Pair]) -> float:
     """Of the pairs some steps apart, those that a turn on the spot explains."""
-    apart = [p for p in pairs if p.second - p.first >= 2 and p.matches >= LINK_MATCHES]
+    apart = _apart(pairs)
     return float(np.mean([p.turn >= TURNED for p in apart])) if apart else 0.0
+
+
+def only_turns(pairs: Sequence[Pair]) -> bool:
+    """Whether half of the pairs some steps apart show nothing but a turn, or one plane."""
+    apart = _apart(pairs)
+    flat = float(np.mean([p.flat >= FLAT for p in apart])) if apart else 0.0
+    return max(flat, turn_fraction(pairs)) >= 0.5
+
+
+def _apart(pairs: Sequence[Pair]) -> list[Pair]:
+    return [p for p in pairs if p.second - p.first >= 2 and p.matches >= LINK_MATCHES]
 
 
 def main(folder: Path) -> None:
@@ -184,18 +135,15 @@ def main(folder: Path) -> None:
     pairs += loop_pairs(descriptors, OVERLAP, SEED)
     _match(pycolmap, folder, [file.stem for file in files], descriptors, pairs, _precision(camera))
     verified = _verified(pycolmap, folder / DATABASE, camera)
-    turns = max(flat_fraction(verified), turn_fraction(verified)) >= 0.5
-    attempts = _attempts(pycolmap, folder, camera, len(files), turns=turns)
-    counts = [len(rows) for rows in descriptors]
+    attempts = _attempts(pycolmap, folder, camera, len(files), turns=only_turns(verified))
     best = attempts[best_attempt(attempts)]
-    focal = sigmas = None
+    focal = focal_sigma = None
     if best.models:
         at = folder / best.models[0].folder
         focal = None if camera.fixed is None else _check_focal(pycolmap, at)
         known = camera.about and best.focal_prior_px == camera.focal_priors[0]
-        sigmas = _settle(pycolmap, at, camera, best.focal_prior_px, free=camera.fixed is None and not known)
-    outcome = Outcome(attempts, verified, counts, focal, sigmas)
-    (folder / RESULT).write_bytes(msgspec.json.encode(outcome))
+        focal_sigma = _settle(pycolmap, at, camera, best.focal_prior_px, free=camera.fixed is None and not known)
+    (folder / RESULT).write_bytes(msgspec.json.encode(Outcome(attempts, verified, focal, focal_sigma)))
 
 
 def _attempts(pycolmap: Any, folder: Path, camera: Camera, count: int, *, turns: bool) -> list[Attempt]:
@@ -347,13 +295,20 @@ def _figures(folder: str, model: Any) -> Model:
     )
 
 
+def _adjustment(pycolmap: Any, **options: bool) -> Any:
+    """Options of a bundle adjustment in one thread: several add up in another order each time."""
+    found = pycolmap.BundleAdjustmentOptions()
+    found.print_summary = False
+    found.ceres.solver_options.num_threads = 1
+    for name, value in options.items():
+        setattr(found, name, value)
+    return found
+
+
 def _freed(pycolmap: Any, folder: Path, held: Model, prior: float) -> Model:
     """A model, adjusted with a free focal length; as it was where that runs away from the known one."""
     model = pycolmap.Reconstruction(folder / held.folder)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.num_threads = 1  # as above
-    pycolmap.bundle_adjustment(model, options)
+    pycolmap.bundle_adjustment(model, _adjustment(pycolmap))
     model.update_point_3d_errors()
     freed = _figures(held.folder, model)
     if abs(freed.focal_px / prior - 1) > MAX_FOCAL_CHANGE:
@@ -368,102 +323,77 @@ def _check_focal(pycolmap: Any, folder: Path) -> FocalCheck:
     What the squared errors lose, over their mean, is the square of the difference in standard deviations.
     """
     model = pycolmap.Reconstruction(folder)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_extra_params = options.print_summary = False
-    options.ceres.solver_options.num_threads = 1  # as above
     errors, focal = list[float](), list[float]()
     for free in (False, True):
-        options.refine_focal_length = free
+        options = _adjustment(pycolmap, refine_extra_params=False, refine_focal_length=free)
         pycolmap.bundle_adjustment(model, options)
         model.update_point_3d_errors()
-        errors.append(sum(point.track.length() * point.error**2 for point in model.points3D.values()))
+        errors.append(_squared_px(model))
         focal.append(float(next(iter(model.cameras.values())).mean_focal_length()))
-    seen = sum(point.track.length() for point in model.points3D.values())
-    free_values = 2 * seen - 6 * model.num_reg_images() - 3 * len(model.points3D)
-    if free_values <= 0 or errors[1] <= 0:
+    if errors[1] <= 0:
         return FocalCheck(1.0, 0.0)
-    return FocalCheck(focal[1] / focal[0], (max(0.0, errors[0] - errors[1]) * free_values / errors[1]) ** 0.5)
+    return FocalCheck(focal[1] / focal[0], (max(0.0, errors[0] / errors[1] - 1) * _free_values(model)) ** 0.5)
 
 
-def _settle(
-    pycolmap: Any, folder: Path, camera: Camera, prior: float, *, free: bool, assumed: bool = False
-) -> Sigmas | None:
-    """Adjust the model in a folder until it converges, and say how exact it is; None where that is unknown.
+def _settle(pycolmap: Any, folder: Path, camera: Camera, prior: float, *, free: bool) -> float | None:
+    """Adjust the model in a folder until it converges; the standard deviation of a free focal length, as a fraction.
 
-    A covariance belongs to the minimum, and while it maps, COLMAP ends its adjustments before that.
+    A covariance belongs to the minimum, and while it maps, COLMAP ends its adjustments before that. A focal length that
+    the film does not tell becomes the prior.
 
     Args:
         pycolmap, folder, camera, prior: What to adjust.
         free: The focal length.
-        assumed: The focal length becomes the prior, and stays.
     """
     model = pycolmap.Reconstruction(folder)
-    lens = next(iter(model.cameras.values()))
-    if assumed:
+    adjuster = _adjust(pycolmap, model, camera, free=free)
+    sigma = _focal_sigma(pycolmap, model, camera, adjuster) if free and adjuster is not None else None
+    if sigma is not None and sigma > UNKNOWN_FOCAL:
+        model = pycolmap.Reconstruction(folder)
+        lens = next(iter(model.cameras.values()))
         lens.params = [prior, *lens.params[1:]]
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length, options.refine_extra_params = free, camera.fixed is None
-    options.ceres.solver_options.num_threads = 1  # as above
+        adjuster = _adjust(pycolmap, model, camera, free=False)
+    if adjuster is not None:
+        model.write(folder)
+    return sigma
+
+
+def _adjust(pycolmap: Any, model: Any, camera: Camera, *, free: bool) -> Any | None:
+    """Adjust a model until it converges, with the first two cameras held; what did it, None if it failed."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = _adjustment(pycolmap, refine_focal_length=free, refine_extra_params=camera.fixed is None)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    if not adjuster.solve().is_solution_usable():
-        return None
-    focal = float(lens.mean_focal_length())
-    covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+    usable = adjuster.solve().is_solution_usable()
     model.update_point_3d_errors()
-    noise_px = _noise_px(model)
-    if covariance is None:
+    return adjuster if usable else None
+
+
+def _focal_sigma(pycolmap: Any, model: Any, camera: Camera, adjuster: Any) -> float | None:
+    """Standard deviation of the focal length as a fraction, 1 at most; None = unknown."""
+    lens = next(iter(model.cameras.values()))
+    focal = float(lens.mean_focal_length())
+    if not FOCAL_RANGE[0] < focal / max(camera.width, camera.height) < FOCAL_RANGE[1]:
+        return 1.0
+    covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+    of_lens = None if covariance is None else covariance.get_other_params_cov(lens.params)
+    if of_lens is None:
         return None
-    of_lens = covariance.get_other_params_cov(lens.params) if free else None
-    of_focal = None if of_lens is None else min(1.0, noise_px * float(np.sqrt(of_lens[0, 0])) / focal)
-    in_range = FOCAL_RANGE[0] < focal / max(camera.width, camera.height) < FOCAL_RANGE[1]
-    if of_focal is not None and (of_focal > UNKNOWN_FOCAL or not in_range):
-        held = _settle(pycolmap, folder, camera, prior, free=False, assumed=True)
-        return None if held is None else msgspec.structs.replace(held, focal=1.0 if not in_range else of_focal)
-    model.write(folder)
-    return Sigmas(of_focal, noise_px * _position_sigma(model, covariance), noise_px * _depth_sigma(model, covariance))
+    noise_px = np.sqrt(_squared_px(model) / max(1, _free_values(model)))  # of one coordinate of a feature
+    return min(1.0, float(noise_px * np.sqrt(of_lens[0, 0])) / focal)
 
 
-def _noise_px(model: Any) -> float:
-    """Standard deviation of one coordinate of a feature, by the residuals."""
-    points = model.points3D.values()
-    seen = sum(point.track.length() for point in points)
-    squares = sum(point.track.length() * point.error**2 for point in points)
-    return float(np.sqrt(squares / max(1, 2 * seen - 6 * model.num_reg_images() - 3 * len(points))))
+def _squared_px(model: Any) -> float:
+    """Sum of the squared residuals."""
+    return sum(point.track.length() * point.error**2 for point in model.points3D.values())
 
 
-def _position_sigma(model: Any, covariance: Any) -> float:
-    """Largest of a camera's place over the length of the path, for features that are off by a pixel."""
-    images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
-    places = np.stack([image.projection_center() for image in images])
-    way = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-    largest = 0.0
-    for image in images:
-        of_pose = covariance.get_cam_cov_from_world(image.image_id)
-        if of_pose is None or of_pose.shape != (6, 6):
-            continue  # held
-        R, (x, y, z) = image.cam_from_world().rotation.matrix(), image.cam_from_world().translation
-        across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        # The place is -R^T t. Ceres' tangent of a quaternion is half the angle.
-        jacobian = np.hstack((-2 * R.T @ across, -R.T))
-        largest = max(largest, float(np.sqrt(np.trace(jacobian @ of_pose @ jacobian.T))))
-    return largest / max(way, 1e-12)
-
-
-def _depth_sigma(model: Any, covariance: Any) -> float:
-    """Median of the points' depths as fractions, along the ray from the first frame that sees each; as above."""
-    ids = sorted(model.points3D)
-    fractions: list[float] = []
-    for point_id in ids[:: max(1, len(ids) // MAX_POINT_SIGMAS)]:
-        of_point, point = covariance.get_point_cov(point_id), model.points3D[point_id]
-        if of_point is not None:
-            ray = point.xyz - model.images[point.track.elements[0].image_id].projection_center()
-            fractions.append(float(np.sqrt(ray @ of_point @ ray)) / float(ray @ ray))
-    return float(np.median(fractions)) if fractions else 0.0
+def _free_values(model: Any) -> int:
+    """Measurements beyond those that make the model."""
+    seen = sum(point.track.length() for point in model.points3D.values())
+    return max(0, 2 * seen - 6 * model.num_reg_images() - 3 * len(model.points3D))
 
 
 def _precision(camera: Camera) -> float:

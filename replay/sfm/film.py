@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from PIL import Image
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.files import numeric_order
 from semantic_mapper.replay.log.reader import LogAttachment
-from semantic_mapper.replay.sfm.colmap_process import Sigmas
+from semantic_mapper.replay.sfm.between import track
 from semantic_mapper.replay.sfm.gps import GpsPosition, read_position
 from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
@@ -32,17 +33,11 @@ _FOCAL_35MM, _DIAGONAL_35MM = 0xA405, 43.27  # EXIF: FocalLengthIn35mmFilm; the 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmFrame:
-    """One decoded frame.
+    """One decoded frame."""
 
-    Args:
-        index: Counts from 0 over all frames of the film, good and bad.
-        stamp_ns: Time within the film, nanoseconds; rises.
-        bgr: (H, W, 3), upright as the film's rotation mark says, at most ``MAX_SIDE_PX`` wide and high.
-    """
-
-    index: int
-    stamp_ns: int
-    bgr: UInt8
+    index: int  # counts from 0 over all frames of the film, good and bad
+    stamp_ns: int  # time within the film; rises
+    bgr: UInt8  # (H, W, 3), upright as the film's rotation mark says, at most ``MAX_SIDE_PX`` wide and high
 
 
 class Film:
@@ -75,13 +70,12 @@ class Film:
             raise ImportSourceError(f"{path}: no pictures in it ({', '.join(PICTURE_SUFFIXES)})")
         if not path.exists():
             raise ImportSourceError(f"{path}: no such film or folder of pictures")
-        first, self.count, self.hz = self._look() if not self._pictures else self._look_at_pictures()
-        full = first if self._turn is None else np.asarray(cv2.rotate(first, self._turn), np.uint8)
-        self.full_height, self.full_width = full.shape[:2]
-        self._ratio = min(1.0, MAX_SIDE_PX / max(full.shape[:2]))
-        self.width, self.height = (max(1, round(side * self._ratio)) for side in (self.full_width, self.full_height))
+        first, self.count, self.hz = self._look_at_pictures() if self._pictures else self._look_at_film()
+        self.full_height, self.full_width = first.shape[:2]
+        ratio = min(1.0, MAX_SIDE_PX / max(first.shape[:2]))
+        self.width, self.height = (max(1, round(side * ratio)) for side in (self.full_width, self.full_height))
         if self.focal_px is not None:
-            self.focal_px *= self._ratio
+            self.focal_px *= ratio
 
     def position(self, index: int) -> GpsPosition | None:
         """Where a picture of a folder was taken by its EXIF data; None of a film, or where that tells nothing."""
@@ -92,9 +86,8 @@ class Film:
         return self._iterate_pictures() if self._pictures else self._iterate_film()
 
     def _iterate_film(self) -> Iterator[FilmFrame]:
-        capture = self._open()
-        try:
-            last_ns, read, failed = -1, 0, 0
+        last_ns, read, failed = -1, 0, 0
+        with self._opened() as capture:
             for index in itertools.count():
                 good, bgr = capture.read()
                 if not good or bgr is None:
@@ -108,9 +101,7 @@ class Film:
                 if stamp_ns <= last_ns:  # containers without times
                     stamp_ns = last_ns + round(1e9 / self.hz)
                 last_ns = stamp_ns
-                yield FilmFrame(index, stamp_ns, self._as_given(np.asarray(bgr, np.uint8)))
-        finally:
-            capture.release()
+                yield FilmFrame(index, stamp_ns, self._smaller(self._turned(bgr)))
 
     def _iterate_pictures(self) -> Iterator[FilmFrame]:
         for index, file in enumerate(self._pictures):
@@ -118,50 +109,51 @@ class Film:
             if bgr is None:
                 self.odd_pictures[file] = "is damaged, or no picture that OpenCV can read"
                 continue
-            given = np.asarray(bgr, np.uint8)
-            turned = given if self._turn is None else np.asarray(cv2.rotate(given, self._turn), np.uint8)
+            turned = self._turned(bgr)
             if turned.shape[:2] != (self.full_height, self.full_width):
                 self.odd_pictures[file] = (
                     f"is {turned.shape[1]}x{turned.shape[0]}, the first picture {self.full_width}x{self.full_height}"
                 )
                 continue
-            yield FilmFrame(index, round(index * 1e9 / PICTURE_HZ), self._as_given(given))
+            yield FilmFrame(index, round(index * 1e9 / PICTURE_HZ), self._smaller(turned))
 
-    def _as_given(self, bgr: UInt8) -> UInt8:
-        if self._turn is not None:
-            bgr = np.asarray(cv2.rotate(bgr, self._turn), np.uint8)
+    def _turned(self, bgr: np.ndarray) -> UInt8:
+        return np.asarray(bgr if self._turn is None else cv2.rotate(bgr, self._turn), np.uint8)
+
+    def _smaller(self, bgr: UInt8) -> UInt8:
         if bgr.shape[:2] == (self.height, self.width):
             return bgr
         return np.asarray(cv2.resize(bgr, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8)
 
-    def _open(self) -> cv2.VideoCapture:
+    @contextmanager
+    def _opened(self) -> Iterator[cv2.VideoCapture]:
         capture = cv2.VideoCapture(str(self.path))
-        if not capture.isOpened():
-            capture.release()
-            raise ImportSourceError(
-                f"{self.path}: is no film that OpenCV can decode; is it complete? convert it to H.264 in an mp4 file"
-            )
-        return capture
-
-    def _look(self) -> tuple[UInt8, int, float]:
-        capture = self._open()
         try:
+            if not capture.isOpened():
+                raise ImportSourceError(
+                    f"{self.path}: is no film that OpenCV can decode; is it complete? convert it to H.264 in mp4"
+                )
+            yield capture
+        finally:
+            capture.release()
+
+    def _look_at_film(self) -> tuple[UInt8, int, float]:
+        """The first frame, how many there are, and the rate."""
+        with self._opened() as capture:
             hz = capture.get(cv2.CAP_PROP_FPS)
             count = max(1, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
             for _ in range(min(count, MAX_FAILED)):
                 good, bgr = capture.read()
                 if good and bgr is not None:
-                    return np.asarray(bgr, np.uint8), count, hz if 0.01 < hz < 1000 else DEFAULT_HZ
-            raise ImportSourceError(f"{self.path}: holds no frame that can be decoded; copy or convert it again")
-        finally:
-            capture.release()
+                    return self._turned(bgr), count, hz if 0.01 < hz < 1000 else DEFAULT_HZ
+        raise ImportSourceError(f"{self.path}: holds no frame that can be decoded; copy or convert it again")
 
     def _look_at_pictures(self) -> tuple[UInt8, int, float]:
         for file in self._pictures:
             bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)
             if bgr is not None:
-                self.focal_px = focal_of_exif(file, max(bgr.shape[:2]), min(bgr.shape[:2]))
-                return np.asarray(bgr, np.uint8), len(self._pictures), PICTURE_HZ
+                self.focal_px = focal_of_exif(file, bgr.shape[:2])
+                return self._turned(bgr), len(self._pictures), PICTURE_HZ
         raise ImportSourceError(f"{self.path}: none of its {len(self._pictures)} pictures can be read")
 
 
@@ -171,13 +163,8 @@ def pictures_of(folder: Path) -> list[Path]:
     return sorted(files, key=lambda file: numeric_order(file.name))
 
 
-def focal_of_exif(file: Path, longer_px: int, shorter_px: int) -> float | None:
-    """Focal length in pixels by the EXIF data of a picture; None where it does not tell one.
-
-    Args:
-        file: JPEG or another format with EXIF data.
-        longer_px, shorter_px: Sides of the picture.
-    """
+def focal_of_exif(file: Path, sides_px: tuple[int, ...]) -> float | None:
+    """Focal length in pixels by the EXIF data of a picture with these sides; None where it does not tell one."""
     try:
         with Image.open(file) as image:
             focal_mm = image.getexif().get_ifd(0x8769).get(_FOCAL_35MM, 0)
@@ -185,7 +172,7 @@ def focal_of_exif(file: Path, longer_px: int, shorter_px: int) -> float | None:
         return None
     if not isinstance(focal_mm, int | float) or not 5 <= focal_mm <= 1000:
         return None
-    return float(focal_mm) * float(np.hypot(longer_px, shorter_px)) / _DIAGONAL_35MM
+    return float(focal_mm) * float(np.hypot(sides_px[0], sides_px[1])) / _DIAGONAL_35MM
 
 
 LOOK_WIDTH = 320  # frames are looked at in this size
@@ -201,24 +188,16 @@ _CORNERS, _LEAST_TRACKED = 150, 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmLook:
-    """What the first pass over a film has found, a value for each of its N frames.
+    """What the first pass over a film has found, a value for each of its N frames."""
 
-    Args:
-        index: (N,) number of the frame in the film.
-        stamp_ns: (N,) rising.
-        motion: (N,) since the frame before, of the image's width: median of what is followed; NaN where nothing is.
-        fast: (N,) the same of what moves most: 85th percentile. Without rotation, a camera moving sideways has about
-            1.25 times the median, one moving straight ahead 2 to 3 times.
-        sharpness: (N,) RMS of the Laplacian over the contrast, to be compared with frames nearby only.
-        dark: (N,) whether it shows nothing: black, covered, or one colour.
-    """
-
-    index: Int64
-    stamp_ns: Int64
-    motion: Float64
+    index: Int64  # (N,) number of the frame in the film
+    stamp_ns: Int64  # (N,) rising
+    motion: Float64  # (N,) since the frame before, of the image's width: median of what is followed; NaN = nothing is
+    # (N,) the same of what moves most: 85th percentile. Without rotation, a camera moving sideways has about 1.25 times
+    # the median, one moving straight ahead 2 to 3 times.
     fast: Float64
-    sharpness: Float64
-    dark: Bool
+    sharpness: Float64  # (N,) RMS of the Laplacian over the contrast, to be compared with frames nearby only
+    dark: Bool  # (N,) whether it shows nothing: black, covered, or one colour
 
     @property
     def blurred(self) -> Bool:
@@ -283,14 +262,10 @@ def _motion(last: UInt8, now: UInt8) -> tuple[float, float]:
     corners = cv2.goodFeaturesToTrack(last, _CORNERS, 0.01, 7)
     if corners is None or len(corners) < _LEAST_TRACKED:
         return float("nan"), float("nan")
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(last, now, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        now, last, moved, np.zeros_like(corners), winSize=(15, 15), maxLevel=3
-    )
-    true = (np.linalg.norm(back - corners, axis=2) < 1.0) & (found > 0) & (found_back > 0)
+    moved, true = track(last, now, corners, window=(15, 15), levels=3)
     if true.sum() < _LEAST_TRACKED:
         return float("nan"), float("nan")
-    median, fast = np.percentile(np.linalg.norm(moved - corners, axis=2)[true], (50, 85)) / now.shape[1]
+    median, fast = np.percentile(np.linalg.norm(moved - corners, axis=2)[true, 0], (50, 85)) / now.shape[1]
     return float(median), float(fast)
 
 
@@ -298,24 +273,14 @@ FILM_ATTACHMENT = "film.json"
 
 
 class FilmNote(msgspec.Struct, frozen=True):
-    """How a film became a log.
+    """How a film became a log."""
 
-    Args:
-        frames: Of the film.
-        left_out: Of these, not in the log, by reason.
-        picked, registered: Frames that structure from motion was given, and has registered.
-        error_px: Mean reprojection error.
-        focal_px: In pixels of the film.
-        sigmas: How exact the poses are; None where that is unknown.
-    """
-
-    frames: int
-    left_out: dict[str, int]
-    picked: int
-    registered: int
-    error_px: float
-    focal_px: float
-    sigmas: Sigmas | None = None
+    frames: int  # of the film
+    left_out: dict[str, int]  # of these, not in the log, by reason
+    picked: int  # frames that structure from motion was given
+    registered: int  # ... and has registered
+    error_px: float  # mean reprojection error
+    focal_px: float  # in pixels of the film
 
     def attachment(self) -> LogAttachment:
         """As it stands in the log."""

@@ -6,8 +6,8 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,14 +15,14 @@ import cv2
 import msgspec
 import numpy as np
 
+from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.drivers.calibration import Rectifier, load_calibration
 from semantic_mapper.errors import ConfigError, DependencyError, FrameError, ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
-from semantic_mapper.geometry import camera_matrix, scale_intrinsics
+from semantic_mapper.geometry import camera_matrix, scale_intrinsics, transform
 from semantic_mapper.image_rotation import rotate_intrinsics
-from semantic_mapper.log_events import get_logger
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.log.format import atomic_log
+from semantic_mapper.replay.log.format import LogWriter, atomic_log
 from semantic_mapper.replay.sfm import colmap_process as colmap
 from semantic_mapper.replay.sfm.between import Anchor, follow_pose
 from semantic_mapper.replay.sfm.colmap_model import ColmapModel, read_model
@@ -40,12 +40,12 @@ from semantic_mapper.replay.sfm.film import (
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsFit, place_by_gps
 from semantic_mapper.replay.sfm.refusals import (
     LEAST_ANGLE_DEG,
+    TURNING,
     baseline_notes,
     focal_note,
     refuse_features,
     refuse_look,
     refuse_outcome,
-    turning,
 )
 from semantic_mapper.replay.sfm.scale import (
     NEIGHBOURS,
@@ -55,7 +55,6 @@ from semantic_mapper.replay.sfm.scale import (
     RegisteredFrame,
     ScaleHint,
     find_edges,
-    floor_under,
     marked_place,
     median_depth,
     nearest_frame,
@@ -78,53 +77,29 @@ EDGE_FRAMES = 60  # about as many are searched for upright edges
 MAX_POINTS = 20_000  # that the report shows
 PACKING = CodecOptions(rgb="jpeg", jpeg_quality=95)  # a film has lost more already
 
-_log = get_logger(__name__)
+CAMERA_ID = "camera"  # in the log
 
 Progress = Callable[[str, int, int], None]  # what is done; how much of it; of how much
 
 
 @dataclass(frozen=True, slots=True)
 class FilmOptions:
-    """How to read a film.
+    """How to read a film."""
 
-    Args:
-        calibration: File of the camera's calibration; None = focal length and distortion are found.
-        focal_prior_px: About the focal length, in pixels of the film; None = guessed, or by the picture's EXIF data.
-        scale: What tells the size of the scene.
-        quarters: Turn every frame clockwise by this many quarters.
-        camera_id: Name that the camera gets in the log.
-    """
-
-    calibration: Path | None = None
-    focal_prior_px: float | None = None
-    scale: ScaleHint = field(default_factory=ScaleHint)
-    quarters: int = 0
-    camera_id: str = "camera"
+    calibration: Path | None = None  # file of the camera's calibration; None = focal length and distortion are found
+    focal_prior_px: float | None = None  # about the focal length, in pixels of the film; None = guessed, or by EXIF
+    scale: ScaleHint = field(default_factory=ScaleHint)  # what tells the size of the scene
+    quarters: int = 0  # turn every frame clockwise by this many quarters
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Frames one after the other that are not in the log.
-
-    Args:
-        reason: Why.
-        start_s, end_s: Times of the first and the last.
-        frames: How many.
-    """
+    """Frames one after the other that are not in the log."""
 
     reason: str
-    start_s: float
-    end_s: float
+    start_s: float  # time of the first
+    end_s: float  # and of the last
     frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class OtherModel:
-    """A part of the film that does not hang together with the largest one, and is left out."""
-
-    frames: int
-    start_s: float
-    end_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,8 +110,7 @@ class FilmReport:
         film: Its file or folder.
         looked_at: Frames of the film.
         picked, registered: Frames that structure from motion was given, and has registered.
-        frames: In the log, with those in between.
-        left_out: The others, in order.
+        left_out: Frames that are not in the log, in order.
         error_px: Mean reprojection error of the points.
         points: How many there are.
         focal_px: Of the frames before they are rectified, in pixels of the film.
@@ -144,22 +118,18 @@ class FilmReport:
         distortion: OpenCV's coefficients.
         scale: How the scale was found; empty = unknown.
         height_m: Median height of the camera over the floor; None where no floor is found.
-        stamps_ns: (N,) of the frames in the log.
-        T_world_camera: (N, 4, 4) theirs.
+        T_world_camera: (N, 4, 4) of the N frames in the log.
         xyz: (M, 3) points, some of them.
-        others: Parts that are left out.
         notices: Sentences on what had to be assumed.
         pictures: RGB of a few frames of the log, with their times in seconds.
         info: What stands in the log's head.
         bytes: Size of the log.
-        sigmas: How exact focal length, places and depths are; None where that is unknown.
     """
 
     film: Path
     looked_at: int
     picked: int
     registered: int
-    frames: int
     left_out: tuple[LeftOut, ...]
     error_px: float
     points: int
@@ -168,15 +138,17 @@ class FilmReport:
     distortion: tuple[float, ...]
     scale: str
     height_m: float | None
-    stamps_ns: Int64
     T_world_camera: Float64
     xyz: Float64
-    others: tuple[OtherModel, ...]
     notices: tuple[str, ...]
     pictures: tuple[tuple[float, UInt8], ...]
     info: StreamInfo
     bytes: int
-    sigmas: colmap.Sigmas | None = None
+
+    @property
+    def frames(self) -> int:
+        """In the log."""
+        return len(self.T_world_camera)
 
     @property
     def path_m(self) -> float:
@@ -186,10 +158,14 @@ class FilmReport:
     @property
     def left_out_counts(self) -> dict[str, int]:
         """Frames that are not in the log, by reason."""
-        counts: Counter[str] = Counter()
-        for part in self.left_out:
-            counts[part.reason] += part.frames
-        return dict(counts)
+        return _counts(self.left_out)
+
+
+def _counts(left_out: Iterable[LeftOut]) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    for part in left_out:
+        counts[part.reason] += part.frames
+    return dict(counts)
 
 
 def import_film(
@@ -209,8 +185,7 @@ def import_film(
         overwrite: Whether a log that is there may be replaced.
 
     Raises:
-        FilmError: no poses can be found; says why and what to do.
-        ImportSourceError: no film, or nothing of what was to tell the scale is found in it.
+        ImportSourceError: no film, no poses can be found, or nothing of what was to tell the scale is found in it.
         ConfigError: a calibration that does not fit.
         DependencyError: pycolmap is not installed.
         LogError: ``dst`` is there already, or cannot be written.
@@ -317,35 +292,9 @@ class _Import:
         board = None if self._options.scale.board is None else BoardScale(self._options.scale.board)
         picked = self._find_features(look, rows, board)
         outcome = self._run_colmap()
-        models, attempt = self._judge(outcome, look, picked)
-        registered, scale, height, others = self._orient(models, look, picked, board)
-        chosen = attempt.models[0]
-        report = self._write(dst, look, picked, registered, scale, chosen.error_px, outcome.sigmas, overwrite=overwrite)
-        ratio = film.full_width / film.width
-        return FilmReport(
-            film=film.path,
-            looked_at=len(look.index),
-            picked=len(picked),
-            registered=len(registered.frames),
-            frames=len(report.stamps),
-            left_out=tuple(report.left_out),
-            error_px=chosen.error_px,
-            points=len(models[0].points),
-            focal_px=registered.seen.fx * ratio,
-            focal_source=self._lens.source,
-            distortion=(self._lens.measured or registered.seen).distortion,
-            scale=scale,
-            height_m=height,
-            stamps_ns=np.array(report.stamps, np.int64),
-            T_world_camera=np.stack(report.poses),
-            xyz=self._some_points(registered),
-            others=others,
-            notices=tuple(self._notices),
-            pictures=tuple(report.pictures),
-            info=report.info,
-            bytes=dst.stat().st_size,
-            sigmas=outcome.sigmas,
-        )
+        models, error_px = self._judge(outcome, look, picked)
+        registered, scale, height = self._orient(models, look, picked, board)
+        return self._write(dst, look, picked, registered, scale, height, error_px, overwrite=overwrite)
 
     def _find_features(self, look: FilmLook, rows: Int64, board: BoardScale | None) -> list[int]:
         """Index of each picked frame; its features are in the folder, under its place in the sequence."""
@@ -399,101 +348,79 @@ class _Import:
             )
         return msgspec.json.decode((self._folder / colmap.RESULT).read_bytes(), type=colmap.Outcome)
 
-    def _judge(
-        self, outcome: colmap.Outcome, look: FilmLook, picked: list[int]
-    ) -> tuple[list[ColmapModel], colmap.Attempt]:
-        """Models of the best attempt, the largest first.
+    def _judge(self, outcome: colmap.Outcome, look: FilmLook, picked: list[int]) -> tuple[list[ColmapModel], float]:
+        """Models of the best attempt, the largest first, and the mean reprojection error of that one.
 
         Raises:
-            FilmError: see ``refuse_outcome``.
+            ImportSourceError: see ``refuse_outcome``.
         """
-        best = outcome.attempts[colmap.best_attempt(outcome.attempts)]
+        film, best = self._film, outcome.attempts[colmap.best_attempt(outcome.attempts)]
         models = [read_model(self._folder / model.folder) for model in best.models]
         spans = [[int(image.name) for image in model.images] for model in models]
         times = [_seconds(look, index) for index in picked]
-        refuse_outcome(self._film.path, outcome, times, spans)
+        refuse_outcome(film.path, outcome, times, spans)
         angle_deg = _parallax_deg(models[0])
         if angle_deg < LEAST_ANGLE_DEG:
-            raise turning(self._film.path)
-        self._notices += baseline_notes(best.ahead, angle_deg, outcome.sigmas)
+            raise ImportSourceError(f"{film.path}: {TURNING}")
+        self._notices += baseline_notes(best.ahead, angle_deg, outcome.focal_sigma)
         if outcome.focal is not None and self._lens.measured is not None:
-            given_px = self._lens.measured.fx * self._film.full_width / self._film.width
-            note = focal_note(self._film.path, self._options.calibration, given_px, outcome.focal)
-            self._notices += [note] if note else []
-        priors = list(dict.fromkeys(f"{a.focal_prior_px:.0f}" for a in outcome.attempts))
-        if len(priors) > 1:
-            self._notices.append(
-                f"{len(priors)} focal lengths were tried: {', '.join(priors)} px; that of the largest model was kept"
-            )
-        return models, best
+            given_px = self._lens.measured.fx * film.full_width / film.width
+            self._notices += focal_note(film.path, self._options.calibration, given_px, outcome.focal)
+        for span in spans[1:]:
+            if len(span) >= colmap.MIN_MODEL_IMAGES:
+                self._notices.append(
+                    f"the part from {times[min(span)]:.1f} to {times[max(span)]:.1f} s ({counted(len(span), 'view')}) "
+                    "does not hang together with the rest and is left out; import it as a film of its own"
+                )
+        return models, best.models[0].error_px
 
     def _orient(
         self, models: list[ColmapModel], look: FilmLook, picked: list[int], board: BoardScale | None
-    ) -> tuple[_Registered, str, float | None, tuple[OtherModel, ...]]:
-        """The largest model with z up, in metres, its floor at 0; how its scale was found; and the other ones."""
+    ) -> tuple[_Registered, str, float | None]:
+        """The largest model with z up, in metres, its floor at 0; how its scale was found; the camera's height."""
         model = models[0]
         seen = model.cameras[model.images[0].camera_id]
         frames: dict[int, RegisteredFrame] = {}
         xy: dict[int, Float64] = {}
         for image in model.images:
             index = picked[int(image.name)]
-            good = [
-                (n, int(p))
-                for n, p in enumerate(image.point_ids)
-                if p >= 0 and model.errors_px.get(int(p), np.inf) < MAX_POINT_ERROR_PX
-            ]
-            xyz = np.array([model.points[p] for _, p in good]).reshape(-1, 3)
-            xy[index] = image.xy[[n for n, _ in good]]
-            frames[index] = RegisteredFrame(_stamp(look, index), image.T_world_camera, xyz)
+            errors_px = np.array([model.errors_px.get(int(p), np.inf) for p in image.point_ids])
+            good = errors_px < MAX_POINT_ERROR_PX
+            xyz = np.array([model.points[int(p)] for p in image.point_ids[good]]).reshape(-1, 3)
+            xy[index] = image.xy[good]
+            frames[index] = RegisteredFrame(image.T_world_camera, xyz)
         poses = {index: frame.T_world_camera for index, frame in frames.items()}
         guess = camera_up(np.stack(list(poses.values())))
         up = vertical(self._edges, poses, seen, guess)
         if up is None:
             self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
         frames = _moved(frames, upright(frames[min(frames)].T_world_camera, guess if up is None else up), 1.0)
-        registered = _Registered(
-            _moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values()))), xy, seen
-        )
-        self._gps = self._place_by_gps(registered)
+        frames = _moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values())))
+        self._gps = self._place_by_gps(frames)
         if self._gps is not None:
             fit, scale = self._gps, str(self._gps)
             T_world_model = fit.T_world_model.copy()
             T_world_model[:3, 3] /= fit.scale
-            frames = _moved(registered.frames, T_world_model, fit.scale)
+            frames = _moved(frames, T_world_model, fit.scale)
         else:
-            factor, scale = self._scale(registered, look, board)
-            frames = _moved(registered.frames, np.eye(4), factor)
-        floor = floor_under(list(frames.values()))
-        height = None
-        if floor is not None:
-            height = float(np.median([f.T_world_camera[2, 3] for f in frames.values()])) - floor
+            factor, scale = self._scale(_Registered(frames, xy, seen), look, board)
+            frames = _moved(frames, np.eye(4), factor)
+        floor, height = _floor_and_height(frames)
         if floor is not None and self._gps is None:
             down = np.eye(4)
             down[2, 3] = -floor
             frames = _moved(frames, down, 1.0)
-        others = tuple(
-            OtherModel(
-                len(m.images),
-                _seconds(look, picked[int(m.images[0].name)]),
-                _seconds(look, picked[int(m.images[-1].name)]),
-            )
-            for m in models[1:]
-            if len(m.images) >= colmap.MIN_MODEL_IMAGES
-        )
-        for other in others:
-            self._notices.append(
-                f"the part from {other.start_s:.1f} to {other.end_s:.1f} s ({counted(other.frames, 'view')}) does not "
-                "hang together with the rest and is left out; import it as a film of its own"
-            )
-        return _Registered(frames, xy, seen), scale, height, others
+        return _Registered(frames, xy, seen), scale, height
 
-    def _place_by_gps(self, registered: _Registered) -> GpsFit | None:
+    def _place_by_gps(self, frames: dict[int, RegisteredFrame]) -> GpsFit | None:
         """Where the pictures' positions put the model, unless a scale is given; None = they do not say."""
         if self._options.scale != ScaleHint():
             return None
-        poses = np.stack([frame.T_world_camera for frame in registered.frames.values()])
         try:
-            return place_by_gps(poses, [self._film.position(index) for index in registered.frames])
+            return place_by_gps(
+                np.stack([frame.T_world_camera for frame in frames.values()]),
+                [self._film.position(index) for index in frames],
+            )
         except ImportSourceError as error:
             self._notices.append(f"GPS is not used: {error}")
             return None
@@ -506,13 +433,12 @@ class _Import:
         if board is not None:
             return board.metres_per_unit({i: f.T_world_camera for i, f in frames.items()}, registered.seen)
         if hint.camera_height_m is not None:
-            floor = floor_under(list(frames.values()))
-            if floor is None:
+            _, height = _floor_and_height(frames)
+            if height is None:
                 raise ImportSourceError(
                     f"{self._film.path}: no floor is found under the camera, so its height tells no scale; film more "
                     "of the floor, or give the scale in another way"
                 )
-            height = float(np.median([f.T_world_camera[2, 3] for f in frames.values()])) - floor
             return hint.camera_height_m / height, f"camera {hint.camera_height_m:g} m over the floor that was found"
         if hint.distance is not None:
             a, b = (self._marked_place(mark, registered, look) for mark in (hint.distance.a, hint.distance.b))
@@ -567,12 +493,12 @@ class _Import:
         picked: list[int],
         registered: _Registered,
         scale: str,
+        height_m: float | None,
         error_px: float,
-        sigmas: colmap.Sigmas | None,
         *,
         overwrite: bool,
-    ) -> _Written:
-        film, camera = self._film, self._options.camera_id
+    ) -> FilmReport:
+        film = self._film
         try:
             rectify = self._lens.rectify or Rectifier(registered.seen)
         except ConfigError as error:
@@ -580,7 +506,7 @@ class _Import:
         chooser = _Chooser(look, set(picked), registered)
         info = StreamInfo(
             source=f"film {film.path.resolve().name}",
-            cameras={camera: rectify.intrinsics},
+            cameras={CAMERA_ID: rectify.intrinsics},
             frame_hz=film.hz,
             metadata={
                 "poses": "structure from motion",
@@ -590,77 +516,75 @@ class _Import:
             }
             | ({} if self._gps is None else {ORIGIN_KEY: str(self._gps.origin)}),
         )
-        written = _Written(info)
+        poses: list[Float64] = []
+        left_out: list[LeftOut] = []
+        pictures: list[tuple[float, UInt8]] = []
+        focal_px = registered.seen.fx * film.full_width / film.width
         shown = set(np.linspace(0, len(look.index) - 1, 14).astype(int)[1:-1].tolist())
         with atomic_log(dst, info, options=PACKING, overwrite=overwrite) as writer:
+            last = ""
             for row, frame in enumerate(film):
                 self._progress("write", row + 1, len(look.index))
+                seconds = frame.stamp_ns / 1e9
                 pose, reason = chooser.pose(row, frame, self._lens)
-                if pose is None:
-                    written.leave_out(reason, frame.stamp_ns)
-                    continue
-                rgb = rectify(frame.bgr)
-                if shown and row >= min(shown):
-                    shown = {s for s in shown if s > row}
-                    written.pictures.append((frame.stamp_ns / 1e9, rgb))
-                posed = PosedFrame(
-                    stamp_ns=frame.stamp_ns,
-                    seq=frame.index,
-                    camera_id=camera,
-                    rgb=rgb,
-                    depth_m=None,
-                    label=None,
-                    intrinsics=rectify.intrinsics,
-                    T_world_camera=pose,
-                    pose_source="sfm",
-                )
-                try:
-                    writer.write_frame(posed)
-                except FrameError as error:
-                    written.leave_out(str(error), frame.stamp_ns)
-                    continue
-                written.stamps.append(frame.stamp_ns)
-                written.poses.append(pose)
-            counts: Counter[str] = Counter()
-            for part in written.left_out:
-                counts[part.reason] += part.frames
-            ratio = film.full_width / film.width
-            note = FilmNote(
-                frames=len(look.index),
-                left_out=dict(counts),
-                picked=len(picked),
-                registered=len(registered.frames),
-                error_px=error_px,
-                focal_px=registered.seen.fx * ratio,
-                sigmas=sigmas,
-            )
+                if pose is not None:
+                    rgb = rectify(frame.bgr)
+                    reason = _written(writer, frame, rgb, rectify.intrinsics, pose)
+                    if not reason:
+                        poses.append(pose)
+                        if shown and row >= min(shown):
+                            shown = {s for s in shown if s > row}
+                            pictures.append((seconds, rgb))
+                if reason and reason == last:
+                    left_out[-1] = replace(left_out[-1], end_s=seconds, frames=left_out[-1].frames + 1)
+                elif reason:
+                    left_out.append(LeftOut(reason, seconds, seconds, 1))
+                last = reason
+            note = FilmNote(len(look.index), _counts(left_out), len(picked), len(registered.frames), error_px, focal_px)
             writer.attach(note.attachment())
-        for file, reason in film.odd_pictures.items():
-            self._notices.append(f"{file.name} {reason}; it is left out")
-        return written
-
-    def _some_points(self, registered: _Registered) -> Float64:
+        self._notices += [f"{file.name} {reason}; it is left out" for file, reason in film.odd_pictures.items()]
         xyz = np.unique(np.concatenate([frame.xyz for frame in registered.frames.values()]), axis=0)
-        return xyz[np.random.default_rng(0).permutation(len(xyz))[:MAX_POINTS]]
+        return FilmReport(
+            film=film.path,
+            looked_at=len(look.index),
+            picked=len(picked),
+            registered=len(registered.frames),
+            left_out=tuple(left_out),
+            error_px=error_px,
+            points=len(xyz),
+            focal_px=focal_px,
+            focal_source=self._lens.source,
+            distortion=(self._lens.measured or registered.seen).distortion,
+            scale=scale,
+            height_m=height_m,
+            T_world_camera=np.stack(poses),
+            xyz=xyz[np.random.default_rng(0).permutation(len(xyz))[:MAX_POINTS]],
+            notices=tuple(self._notices),
+            pictures=tuple(pictures),
+            info=info,
+            bytes=dst.stat().st_size,
+        )
 
 
-@dataclass(slots=True)
-class _Written:
-    """What the log holds, and what it does not."""
-
-    info: StreamInfo
-    stamps: list[int] = field(default_factory=list[int])
-    poses: list[Float64] = field(default_factory=list[Float64])
-    left_out: list[LeftOut] = field(default_factory=list[LeftOut])
-    pictures: list[tuple[float, UInt8]] = field(default_factory=list[tuple[float, UInt8]])
-
-    def leave_out(self, reason: str, stamp_ns: int) -> None:
-        """Count one more frame; those of one reason that follow each other are one entry."""
-        last = self.left_out[-1] if self.left_out else None
-        if last is not None and last.reason == reason and (not self.stamps or last.end_s * 1e9 >= self.stamps[-1]):
-            self.left_out[-1] = LeftOut(reason, last.start_s, stamp_ns / 1e9, last.frames + 1)
-        else:
-            self.left_out.append(LeftOut(reason, stamp_ns / 1e9, stamp_ns / 1e9, 1))
+def _written(writer: LogWriter, frame: FilmFrame, rgb: UInt8, intrinsics: CameraIntrinsics, pose: Float64) -> str:
+    """Write a frame; why it cannot be written, else empty."""
+    try:
+        writer.write_frame(
+            PosedFrame(
+                stamp_ns=frame.stamp_ns,
+                seq=frame.index,
+                camera_id=CAMERA_ID,
+                rgb=rgb,
+                depth_m=None,
+                label=None,
+                intrinsics=intrinsics,
+                T_world_camera=pose,
+                pose_source="sfm",
+            )
+        )
+    except FrameError as error:
+        return str(error)
+    return ""
 
 
 class _Chooser:
@@ -710,8 +634,15 @@ def _moved(frames: dict[int, RegisteredFrame], T: Float64, scale: float) -> dict
     for index, frame in frames.items():
         pose = T @ frame.T_world_camera
         pose[:3, 3] *= scale
-        result[index] = RegisteredFrame(frame.stamp_ns, pose, scale * (frame.xyz @ T[:3, :3].T + T[:3, 3]))
+        result[index] = RegisteredFrame(pose, scale * transform(T, frame.xyz))
     return result
+
+
+def _floor_and_height(frames: dict[int, RegisteredFrame]) -> tuple[float | None, float | None]:
+    """z of the floor, where z is up, and the camera's median height over it; None if no floor is found."""
+    camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames.values()]))
+    floor = floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames.values()]), camera_z)
+    return floor, None if floor is None else camera_z - floor
 
 
 def _parallax_deg(model: ColmapModel) -> float:
@@ -732,9 +663,5 @@ def _gray(bgr: UInt8) -> UInt8:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def _stamp(look: FilmLook, index: int) -> int:
-    return int(look.stamp_ns[np.searchsorted(look.index, index)])
-
-
 def _seconds(look: FilmLook, index: int) -> float:
-    return _stamp(look, index) / 1e9
+    return float(look.stamp_ns[np.searchsorted(look.index, index)]) / 1e9

@@ -12,14 +12,12 @@ from semantic_mapper.replay.sfm.colmap_process import (
     UNKNOWN_FOCAL,
     FocalCheck,
     Outcome,
-    Sigmas,
-    flat_fraction,
+    only_turns,
     turn_fraction,
 )
-from semantic_mapper.replay.sfm.film import STEP, FilmLook
+from semantic_mapper.replay.sfm.film import FilmLook
 
 LEAST_PICKS = 8
-LEAST_WAY = LEAST_PICKS * STEP / 2  # of the image's width
 STILL = 0.1  # of the image's width: less motion in all is a camera that stands still
 MOST_DARK = 0.7  # of the frames
 LEAST_FEATURES = 80  # of a frame that can be matched, the median
@@ -27,56 +25,43 @@ LEAST_LINKED = 0.5  # of the neighbours in the sequence
 MOST_TURNED = 0.9  # of the pairs some steps apart, that a turn explains: their model is noise, however large
 LEAST_MODEL = 0.6  # of the picked frames in the largest model
 LEAST_ANGLE_DEG = 1.0  # between the rays to a point, the median: less is a camera that turns on the spot
+SMALL_ANGLE_DEG = 4.0  # ... less, and depths are uncertain
 UNCERTAIN_FOCAL, WRONG_FOCAL = 0.05, 0.1  # of a given focal length: its difference from what the pictures say
-UNSURE_FOCAL, UNSURE_DEPTH, UNSURE_POSITION = 0.02, 0.03, 0.02  # standard deviations that are worth a note
 LEAST_SIGMAS = 10.0  # of this difference: rolling shutter and the like make a few
+UNSURE_FOCAL = 0.02  # standard deviation of a focal length that is worth a note
 _HOW = "film again: walk slowly, sideways past things with texture, in good light"
-
-
-class FilmError(ImportSourceError):
-    """A film from which no poses can be found; ``reason`` is one word for it.
-
-    Args:
-        film: Its name.
-        reason: "dark", "still", "short", "blurred", "no-matches", "turning", "several-scenes" or
-            "calibration".
-        text: What is wrong, and what to do.
-    """
-
-    def __init__(self, film: object, reason: str, text: str) -> None:
-        super().__init__(f"{film}: {text}")
-        self.reason = reason
+TURNING = (
+    "the camera only turns on the spot, or sees one flat surface: from one place nothing can be measured; walk while "
+    "filming, a step or more to the side for each turn"
+)
 
 
 def refuse_look(film: object, look: FilmLook, picks: int) -> None:
     """Refuse a film by the first look at it.
 
     Raises:
-        FilmError: dark, still, or too short.
+        ImportSourceError: dark, still, or too short.
     """
     count = len(look.index)
     if not count:
-        raise FilmError(film, "short", "holds no frame that can be decoded; copy or convert it again")
+        raise ImportSourceError(f"{film}: holds no frame that can be decoded; copy or convert it again")
     dark = float(look.dark.mean())
     if dark > MOST_DARK:
-        raise FilmError(
-            film, "dark", f"{100 * dark:.0f} % of its frames are black or show nothing; is the lens covered? {_HOW}"
+        raise ImportSourceError(
+            f"{film}: {100 * dark:.0f} % of its frames are black or show nothing; is the lens covered? {_HOW}"
         )
     seconds = (look.stamp_ns[-1] - look.stamp_ns[0]) / 1e9
     way = float(np.nansum(look.motion))
     if way < STILL and count >= LEAST_PICKS and np.isfinite(look.motion).mean() > 0.5:
-        raise FilmError(
-            film,
-            "still",
-            f"the camera does not move: in {seconds:.1f} s the picture shifts by {100 * way:.1f} % of its width; a map "
-            "needs views from different places; walk, or map a camera that stands still with poses of kind 'fixed'",
+        raise ImportSourceError(
+            f"{film}: the camera does not move: in {seconds:.1f} s the picture shifts by {100 * way:.1f} % of its "
+            "width; a map needs views from different places; walk, or map a camera that stands still with poses of "
+            "kind 'fixed'"
         )
     if picks < LEAST_PICKS:
-        raise FilmError(
-            film,
-            "short",
-            f"is too short: {count} frames in {seconds:.1f} s give {picks} views a step apart, {LEAST_PICKS} needed; "
-            "film for ten seconds or more while walking",
+        raise ImportSourceError(
+            f"{film}: is too short: {count} frames in {seconds:.1f} s give {picks} views a step apart, {LEAST_PICKS} "
+            "needed; film for ten seconds or more while walking"
         )
 
 
@@ -84,15 +69,13 @@ def refuse_features(film: object, features: Sequence[int]) -> None:
     """Refuse a film whose frames have nothing that can be found again.
 
     Raises:
-        FilmError: blurred, or without texture.
+        ImportSourceError: blurred, or without texture.
     """
     found = float(np.median(features))
     if found < LEAST_FEATURES:
-        raise FilmError(
-            film,
-            "blurred",
-            f"its frames are blurred, or show surfaces without texture: half of them have fewer than {found:.0f} "
-            f"features, {LEAST_FEATURES} needed; hold the camera still enough, wipe the lens, and {_HOW}",
+        raise ImportSourceError(
+            f"{film}: its frames are blurred, or show surfaces without texture: half of them have fewer than "
+            f"{found:.0f} features, {LEAST_FEATURES} needed; hold the camera still enough, wipe the lens, and {_HOW}"
         )
 
 
@@ -106,54 +89,36 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
         spans: Places in the sequence of the frames of each model of the best attempt, the largest first.
 
     Raises:
-        FilmError: nothing matches, the camera only turns, or the film falls apart.
+        ImportSourceError: nothing matches, the camera only turns, or the film falls apart.
     """
     picks = len(times_s)
+    complete = bool(spans) and len(spans[0]) >= LEAST_MODEL * picks
     linked = {p.second for p in outcome.pairs if p.matches >= LINK_MATCHES and p.second - p.first == 1}
-    if len(linked) < LEAST_LINKED * (picks - 1) and (not spans or len(spans[0]) < LEAST_MODEL * picks):
-        raise FilmError(
-            film,
-            "no-matches",
-            f"its pictures do not match each other: {len(linked)} of {picks - 1} neighbours show the same place; the "
-            f"camera moves too fast, or what it sees changes or has no texture; {_HOW}",
+    if len(linked) < LEAST_LINKED * (picks - 1) and not complete:
+        raise ImportSourceError(
+            f"{film}: its pictures do not match each other: {len(linked)} of {picks - 1} neighbours show the same "
+            f"place; the camera moves too fast, or what it sees changes or has no texture; {_HOW}"
         )
+    # What models a camera that turns gives are noise.
+    if turn_fraction(outcome.pairs) >= MOST_TURNED or (not complete and only_turns(outcome.pairs)):
+        raise ImportSourceError(f"{film}: {TURNING}")
     if not spans:
-        if max(flat_fraction(outcome.pairs), turn_fraction(outcome.pairs)) >= 0.5:
-            raise turning(film)
-        raise FilmError(
-            film,
-            "no-matches",
-            "no two of its pictures show one place from two sides far enough apart; give --calibration or "
-            f"--focal-prior where the lens is unusual, film a longer way, or {_HOW}",
+        raise ImportSourceError(
+            f"{film}: no two of its pictures show one place from two sides far enough apart; give --calibration or "
+            f"--focal-prior where the lens is unusual, film a longer way, or {_HOW}"
         )
-    if turn_fraction(outcome.pairs) >= MOST_TURNED:
-        raise turning(film)
-    if len(spans[0]) < LEAST_MODEL * picks:
-        if max(flat_fraction(outcome.pairs), turn_fraction(outcome.pairs)) >= 0.5:  # what models it gives are noise
-            raise turning(film)
+    if not complete:
         listed = "; ".join(
             f"{times_s[min(span)]:.1f} to {times_s[max(span)]:.1f} s ({len(span)} of {picks} views)"
             for span in spans[:4]
         )
-        raise FilmError(
-            film,
-            "several-scenes",
-            f"falls into parts that do not hang together: {listed}; cut it into one film for each scene, or film again "
-            "a longer way, without cuts and fast turns",
+        raise ImportSourceError(
+            f"{film}: falls into parts that do not hang together: {listed}; cut it into one film for each scene, or "
+            "film again a longer way, without cuts and fast turns"
         )
 
 
-def turning(film: object) -> FilmError:
-    """The error of a camera that turns on the spot."""
-    return FilmError(
-        film,
-        "turning",
-        "the camera only turns on the spot, or sees one flat surface: from one place nothing can be measured; "
-        "walk while filming, a step or more to the side for each turn",
-    )
-
-
-def focal_note(film: object, calibration: object, focal_px: float, check: FocalCheck) -> str:
+def focal_note(film: object, calibration: object, focal_px: float, check: FocalCheck) -> list[str]:
     """What is wrong with the focal length of a calibration; empty where nothing is, or the film does not tell.
 
     Args:
@@ -163,50 +128,42 @@ def focal_note(film: object, calibration: object, focal_px: float, check: FocalC
         check: What the pictures say.
 
     Raises:
-        FilmError: it is far off.
+        ImportSourceError: it is far off.
     """
     off = abs(check.factor - 1)
     if off < UNCERTAIN_FOCAL or check.sigmas < LEAST_SIGMAS:
-        return ""
+        return []
     text = (
         f"the focal length of {calibration} is {focal_px:.0f} px of the film, and its pictures fit "
         f"{focal_px * check.factor:.0f} px better; calibrate in the mode (size, zoom, stabilisation) of the film, or "
         "leave out --calibration to have the focal length found"
     )
     if off > WRONG_FOCAL:
-        raise FilmError(film, "calibration", text)
-    return text
+        raise ImportSourceError(f"{film}: {text}")
+    return [text]
 
 
-def baseline_notes(ahead: bool, angle_deg: float, sigmas: Sigmas | None) -> list[str]:
+def baseline_notes(ahead: bool, angle_deg: float, focal_sigma: float | None) -> list[str]:
     """Notes on what a film tells badly, because its camera hardly moves sideways; none where it tells all.
 
     Args:
         ahead: The model begins with two frames that lie straight ahead of each other.
         angle_deg: Between the rays to a point, the median.
-        sigmas: Of the model.
+        focal_sigma: Standard deviation of the focal length that was found, as a fraction.
     """
-    if sigmas is None:
-        return ["how exact the poses are is unknown: their adjustment is degenerate"]
     notes: list[str] = []
-    if ahead or sigmas.depth > UNSURE_DEPTH or sigmas.position > UNSURE_POSITION:
+    if ahead or angle_deg < SMALL_ANGLE_DEG:
         notes.append(
             f"the camera {'goes straight ahead' if ahead else 'hardly moves sideways'}: half of the points are seen "
-            f"from less than {angle_deg:.1f} degrees apart; depths are exact to {_percent(sigmas.depth)} (median), "
-            f"places to {_percent(sigmas.position)} of the way (one standard deviation, noise of the features alone)"
+            f"from less than {angle_deg:.1f} degrees apart, so their depths are uncertain"
         )
-    if sigmas.focal is not None and sigmas.focal > UNSURE_FOCAL:
-        found = (
-            f"is assumed: by the film alone it is exact to {_percent(sigmas.focal)}"
-            if sigmas.focal > UNKNOWN_FOCAL
-            else f"is exact to {_percent(sigmas.focal)} only"
-        )
+    if focal_sigma is not None and focal_sigma > UNSURE_FOCAL:
+        percent = f"{100 * focal_sigma:.2g} %"
+        found = f"is exact to {percent} only"
+        if focal_sigma > UNKNOWN_FOCAL:
+            found = f"is assumed: by the film alone it is exact to {percent}"
         notes.append(
             f"the focal length {found}; a straight way fits many nearly as well, and lengths along it against those "
             "across are off by as much; calibrate the camera and give --calibration"
         )
     return notes
-
-
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.2g} %"

@@ -12,7 +12,6 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.drivers.poses.config import BoardPoses
@@ -98,17 +97,10 @@ def parse_distance(text: str) -> MarkedDistance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegisteredFrame:
-    """A frame of the model.
+    """A frame of the model."""
 
-    Args:
-        stamp_ns: Time within the film.
-        T_world_camera: (4, 4).
-        xyz: (N, 3) the points that it sees, in the world.
-    """
-
-    stamp_ns: int
-    T_world_camera: Float64
-    xyz: Float64
+    T_world_camera: Float64  # (4, 4)
+    xyz: Float64  # (N, 3) the points that it sees, in the world
 
 
 def upright(T_world_first: Float64, up: Float64) -> Float64:
@@ -166,12 +158,6 @@ def fit_to_scene(config: MapperConfig, info: StreamInfo) -> tuple[MapperConfig, 
     )
     fitted_depth = msgspec.structs.replace(config.depth, from_motion=motion)
     return msgspec.structs.replace(config, voxel_map=voxel_map, depth=fitted_depth), said
-
-
-def floor_under(frames: Sequence[RegisteredFrame]) -> float | None:
-    """z of the floor under the frames, where z is up; None if no floor is found."""
-    camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames]))
-    return floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames]), camera_z)
 
 
 def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:

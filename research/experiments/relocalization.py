@@ -40,10 +40,17 @@ from research.scenes.scene import Scene
 from semantic_mapper.config import VoxelMapConfig, convert_config
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import MAX_FEATURES, PlaceStore, make_place
-from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.localization.relocalizer import (
+    NotFound,
+    Relocalized,
+    Relocalizer,
+    Sighting,
+    agreed,
+    find_consensus,
+    sighting,
+)
 from semantic_mapper.mapping.odometry_sessions import REMEMBERED
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.sequence import open_log
@@ -82,13 +89,13 @@ def map_frames(frames: Iterable[PosedFrame]) -> Mapped:
 def look_for(mapped: Mapped, frame: PosedFrame, truth: Float64 | None) -> dict[str, Any]:
     """One query. Without a truth, whatever is found is false."""
     began = time.process_time()
-    found = mapped.relocalizer.find(frame.rgb, frame.depth_m, frame.intrinsics, frame.label)
+    label = frame.label
+    classify = None if label is None else lambda: label
+    found = mapped.relocalizer.find(frame.rgb, frame.depth_m, frame.intrinsics, classify)
     seconds = time.process_time() - began
     row: dict[str, Any] = {"found": isinstance(found, Relocalized), "cpu_s": seconds, "inliers": found.inliers}
     row["reason"] = found.reason if isinstance(found, NotFound) else ""
-    if found.fit is not None:
-        row |= {n: getattr(found.fit, n) for n in ("overlap", "agree", "through", "before", "likeness", "classes")}
-    if truth is not None and found.T_map_camera is not None:
+    if truth is not None and isinstance(found, Relocalized):
         row["T_map_camera"] = found.T_map_camera.tolist()
         off = invert_pose(truth) @ found.T_map_camera
         row["off_m"] = float(np.linalg.norm(off[:3, 3]))
@@ -100,7 +107,7 @@ def look_for(mapped: Mapped, frame: PosedFrame, truth: Float64 | None) -> dict[s
 def locked_in(rows: list[dict[str, Any]], frames: list[PosedFrame]) -> dict[str, Any]:
     """How far off a mapper would lock in the world of a camera that starts at any of these frames."""
     seen = [
-        sighting(np.array(row["T_map_camera"]), frame.T_world_camera, row["inliers"]) if row["found"] else None
+        sighting(np.array(row["T_map_camera"]), frame.T_world_camera) if row["found"] else None
         for row, frame in zip(rows, frames, strict=True)
     ]
     errors: list[float] = []

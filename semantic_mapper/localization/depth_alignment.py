@@ -169,12 +169,18 @@ def align(levels: Sequence[Level], targets: Sequence[Target], T_world_camera: Fl
                 return None
             total = sum((f.normal_matrix for f in fits), np.zeros((6, 6)))
             gradient = sum((f.gradient for f in fits), np.zeros(6))
-            change = -np.linalg.solve(total + _DAMPING * np.trace(total) / 6 * np.eye(6), gradient)
-            step = make_pose(change[:3], change[3:])
+            step = gauss_newton_step(total, gradient)
             pose = pose @ step
             if np.linalg.norm(step[:3, 3]) < _STILL_M and np.linalg.norm(step[:3, :3] - np.eye(3)) < 2 * _STILL_RAD:
                 break
     return nearest_pose(pose)  # rounding errors would add up from keyframe to keyframe
+
+
+def gauss_newton_step(normal_matrix: Float64, gradient: Float64) -> Float64:
+    """Motion of the camera in its own axes, (4, 4) to be multiplied from the right, that lowers the cost the most."""
+    damping = _DAMPING * np.trace(normal_matrix) / 6 * np.eye(6)
+    change = -np.linalg.solve(normal_matrix + damping, gradient)
+    return make_pose(change[:3], change[3:])
 
 
 def flat_directions(normal_matrices: Sequence[Float64]) -> tuple[Float64, Float64] | None:

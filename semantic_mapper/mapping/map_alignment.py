@@ -10,10 +10,18 @@ import numpy as np
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import project
-from semantic_mapper.localization.consensus import Sighting, agreed, agreeing_with, find_consensus, sighting
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import Place
-from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.localization.relocalizer import (
+    NotFound,
+    Relocalized,
+    Relocalizer,
+    Sighting,
+    agreed,
+    agreeing_with,
+    find_consensus,
+    sighting,
+)
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.merge import check_fit
@@ -99,7 +107,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
         if isinstance(found, NotFound):
             reasons[found.reason] += 1
         else:
-            seen.append(sighting(found.T_map_camera, place.T_world_camera, found.inliers))
+            seen.append(sighting(found.T_map_camera, place.T_world_camera))
     consensus = find_consensus(seen)
     if consensus.refusal:
         refused = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
@@ -109,9 +117,8 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
         )
     T = agreed(consensus.agreeing)
     refined = _refine(voxel_map, other, T)
-    if 2 * sum(bool(agreeing_with(Sighting(refined, s.T_world_camera, 0), [s])) for s in consensus.agreeing) >= len(
-        consensus.agreeing
-    ):
+    kept = [s for s in consensus.agreeing if agreeing_with(Sighting(refined, s.T_world_camera), [s])]
+    if 2 * len(kept) >= len(consensus.agreeing):
         T = refined
     else:
         _log.warning("alignment_not_refined", reason="the surfaces fit best where the places do not agree")
@@ -149,4 +156,4 @@ def _find(finder: Relocalizer, other: VoxelMap, place: Place) -> Relocalized | N
     points = place.points.astype(np.float64)
     features = Features(project(points, _VIEW), points[:, 2], place.descriptors)
     label = np.where(view.confidence >= SURE, view.label, np.uint8(other.label_set.ignore_id)).astype(np.uint8)
-    return finder.find_features(features, view.rgb, view.depth_m, _VIEW, label)
+    return finder.find(view.rgb, view.depth_m, _VIEW, lambda: label, features)

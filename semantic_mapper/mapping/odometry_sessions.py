@@ -17,8 +17,15 @@ import numpy as np
 
 from semantic_mapper.errors import PoseError
 from semantic_mapper.geometry import check_pose, invert_pose, move
-from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
-from semantic_mapper.localization.relocalizer import NotFound, Relocalized, Relocalizer
+from semantic_mapper.localization.relocalizer import (
+    NotFound,
+    Relocalized,
+    Relocalizer,
+    Sighting,
+    agreed,
+    find_consensus,
+    sighting,
+)
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.map_types import CorrectedPoses
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -185,7 +192,7 @@ class OdometrySessions:
             self.reason = found.detail
             return False
         seen = self._sightings.setdefault(frame.world, deque(maxlen=REMEMBERED))
-        seen.append(sighting(found.T_map_camera, frame.T_world_camera, found.inliers))
+        seen.append(sighting(found.T_map_camera, frame.T_world_camera))
         consensus = find_consensus(seen)
         if consensus.refusal:
             self.refused["alone"] += 1
@@ -201,7 +208,5 @@ class OdometrySessions:
     def _find(self, frame: PosedFrame) -> Relocalized | NotFound:
         depth = None if frame.depth_sigma_m is not None else frame.depth_m
         finder = Relocalizer(self._map.places.places, self._map, self._map.label_set.ignore_id)
-        found = finder.find(frame.rgb, depth, frame.intrinsics)
-        if depth is None or self._classify is None or isinstance(found, NotFound):
-            return found
-        return finder.check_classes(found, frame.rgb, depth, frame.intrinsics, self._classify(frame))
+        classify = self._classify
+        return finder.find(frame.rgb, depth, frame.intrinsics, None if classify is None else lambda: classify(frame))

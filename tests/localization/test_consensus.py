@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.geometry import rotation_vector
-from semantic_mapper.localization.consensus import Sighting, agreed, find_consensus, sighting
+from semantic_mapper.localization.relocalizer import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.types import Float64
 
 
@@ -19,7 +19,7 @@ def pose(x: float, y: float = 0.0, turn: float = 0.0) -> Float64:
 
 def seen_at(step: float, off: Float64) -> Sighting:
     """A camera at ``step`` metres that is found ``off`` from where it is."""
-    return sighting(off @ pose(step), pose(step), 50)
+    return sighting(off @ pose(step), pose(step))
 
 
 def test_a_minority_and_a_group_with_a_rival_are_not_believed() -> None:

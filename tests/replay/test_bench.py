@@ -6,7 +6,7 @@ import pytest
 
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
-from semantic_mapper.replay.log.demo import demo_log
+from semantic_mapper.replay.log import demo_log
 
 
 def test_fusion_is_measured_against_open3d() -> None:

@@ -20,7 +20,7 @@ from semantic_mapper.errors import ConfigError, ImportSourceError, LogError, Map
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.export import export_recording
 from semantic_mapper.nodes.console import Output
-from semantic_mapper.replay.exporters import LogExportReport, LogExportRequest, export_log, log_format_of
+from semantic_mapper.replay.exporters import LogExportReport, export_log, log_format_of
 from semantic_mapper.replay.importers import ImportOptions, import_recording
 from semantic_mapper.replay.importers.tum import read_trajectory
 from semantic_mapper.replay.log.format import LogReader, LogWriter
@@ -58,7 +58,7 @@ def write_log(path: Path, frames: list[PosedFrame], packing: tuple[CodecOptions,
 
 def exported(log: Path, out: Path, name: str | None = None, **more: Any) -> LogExportReport:
     with LogReader(log) as reader:
-        return export_log(reader, out, LogExportRequest(log_format_of(out, name), **more), lambda: None)
+        return export_log(reader, out, log_format_of(out, name), **more)
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_a_sequence_folder_comes_back_bit_for_bit(log: Path, tmp_path: Path) -> 
     report = exported(log, tmp_path / "sequence")
     assert (report.frames, report.left_out, report.notices) == (7, (), ())
     back = import_recording(tmp_path / "sequence", tmp_path / "back.mcap")
-    assert (back.format, back.frames, back.labelled, back.skipped) == ("folder", 7, 7, ())
+    assert (back.format, back.frames, back.labelled, back.skipped) == ("folder", 7, 7, [])
     with LogReader(log) as one, LogReader(tmp_path / "back.mcap") as other:
         assert other.info.label_set is not None and other.info.label_set.colors == LABELS.colors
         assert (other.info.label_set.ids, other.info.label_set.names) == (LABELS.ids, LABELS.names)
@@ -145,7 +145,7 @@ def test_tum_sequence_and_trajectory(log: Path, tmp_path: Path) -> None:
     assert (tmp_path / "poses.txt").read_text() == (tmp_path / "desk" / "groundtruth.txt").read_text()
     stamps, rows, left_out = read_trajectory(tmp_path / "poses.txt")
     back = import_recording(tmp_path / "desk", tmp_path / "back.mcap")
-    assert (back.format, back.frames, back.skipped, left_out) == ("tum", 7, (), [])
+    assert (back.format, back.frames, back.skipped, left_out) == ("tum", 7, [], [])
     with LogReader(log) as one, LogReader(tmp_path / "back.mcap") as other:
         for i, (a, b) in enumerate(zip(one, other, strict=True)):
             assert a.stamp_ns == b.stamp_ns == stamps[i] and np.array_equal(a.rgb, b.rgb)
@@ -270,5 +270,5 @@ def test_the_verb_takes_logs_and_tells_them_from_maps(log: Path, tmp_path: Path)
     (tmp_path / "run" / "map.npz").touch()
     assert not is_log(tmp_path / "run")
     told = io.StringIO()
-    export_recording(Output(told), log, tmp_path / "poses.txt", LogExportRequest("trajectory", "", 2))
+    export_recording(Output(told), log, tmp_path / "poses.txt", "trajectory", "", 2)
     assert f"{tmp_path / 'poses.txt'}: 2 frames (trajectory)" in told.getvalue()

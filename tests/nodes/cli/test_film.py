@@ -11,7 +11,7 @@ import pytest
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.importing import SourceOptions, is_film, write_film_report
-from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut, OtherModel
+from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from tests.nodes.support import run, run_process
 from tests.replay import recordings as rec
@@ -46,7 +46,6 @@ def report(**changes: object) -> FilmReport:
         "looked_at": 10,
         "picked": 4,
         "registered": 3,
-        "frames": 3,
         "left_out": (
             LeftOut("blurred", 0.5, 0.7, 3),
             LeftOut("moved too little", 1.0, 2.0, 3),
@@ -59,10 +58,8 @@ def report(**changes: object) -> FilmReport:
         "distortion": (0.01, 0.0, 0.0, 0.0),
         "scale": "",
         "height_m": None,
-        "stamps_ns": np.arange(3),
         "T_world_camera": poses,
         "xyz": np.random.default_rng(0).normal(size=(50, 3)),
-        "others": (OtherModel(5, 4.0, 5.0),),
         "notices": ("the scale is unknown",),
         "pictures": ((0.5, np.zeros((8, 8, 3), np.uint8)),),
         "info": StreamInfo("film walk.mp4", metadata={SCALE_KEY: SCALE_UNKNOWN}),

@@ -52,7 +52,7 @@ def reasons(report: ImportReport) -> dict[int, str]:
 def test_a_sequence_folder_is_imported_without_loss(tmp_path: Path, suffix: str) -> None:
     src = rec.make_folder(tmp_path / "kitchen", suffix=suffix)
     report, log = imported(src)
-    assert (report.format, report.frames, report.labelled, report.skipped) == ("folder", 6, 6, ())
+    assert (report.format, report.frames, report.labelled, report.skipped) == ("folder", 6, 6, [])
     assert log.info.source == "folder kitchen" and not log.errors and len(log) == 6
     for i, frame in enumerate(log):
         file = src / "color" / f"{i:06d}.{suffix}"
@@ -212,7 +212,7 @@ def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path
 
 def test_a_tum_sequence_gets_matched_depth_and_interpolated_poses(tum: Path) -> None:
     report, log = imported(tum)
-    assert (report.format, report.frames, report.skipped) == ("tum", 6, ())
+    assert (report.format, report.frames, report.skipped) == ("tum", 6, [])
     assert report.info.label_set is None
     first = None
     for i, frame in enumerate(log):
@@ -281,7 +281,7 @@ def test_each_depth_image_is_matched_once_to_its_nearest() -> None:
 
 def test_a_scannet_scene_is_brought_to_the_pixels_of_its_depth(scannet: Path) -> None:
     report, log = imported(scannet)
-    assert (report.format, report.frames, report.labelled, report.skipped) == ("scannet", 6, 6, ())
+    assert (report.format, report.frames, report.labelled, report.skipped) == ("scannet", 6, 6, [])
     assert report.info.label_set == NYU40
     for i, frame in enumerate(log):
         assert frame.rgb.shape == (rec.HEIGHT, rec.WIDTH, 3) and (frame.seq, frame.intrinsics.fx) == (i, 30.0)
@@ -383,7 +383,7 @@ def test_images_of_a_camera_on_its_side_are_turned_with_their_poses(folder: Path
 def test_a_replica_sequence_is_imported_without_loss(tmp_path: Path) -> None:
     sequence = make_replica(tmp_path)
     report = import_recording(sequence, tmp_path / "log.mcap")
-    assert (report.format, report.frames, report.labelled, report.skipped) == ("replica", 3, 3, ())
+    assert (report.format, report.frames, report.labelled, report.skipped) == ("replica", 3, 3, [])
     with LogReader(tmp_path / "log.mcap") as log:
         k = log.info.cameras["camera"]
         assert (k.width, k.height, k.cx, k.cy) == (640, 480, 319.5, 239.5)

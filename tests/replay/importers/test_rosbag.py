@@ -71,7 +71,7 @@ def test_a_bag_of_either_version_gives_the_same_pictures_depth_and_poses(tmp_pat
     src = make(tmp_path, kind)
     assert detect_format(src) == "rosbag"
     report, frames = imported(src)
-    assert (report.format, report.frames, report.with_depth, report.skipped) == ("rosbag", 6, 6, ())
+    assert (report.format, report.frames, report.with_depth, report.skipped) == ("rosbag", 6, 6, [])
     assert report.info.frame_hz == 10.0 and notice(report, f"poses are those of {CAMERA} in map, from tf")
     for n, (frame, truth) in enumerate(zip(frames, FRAMES, strict=True)):
         assert frame.stamp_ns == bags.stamp_of(n) and frame.intrinsics == truth.intrinsics

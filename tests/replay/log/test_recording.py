@@ -217,7 +217,7 @@ def test_disk_that_goes_away_is_reported(tmp_path: Path) -> None:
     assert gone.nothing_left
 
 
-@pytest.mark.parametrize("size", range(30_000, 32_600, 133))
+@pytest.mark.parametrize("size", range(30_000, 32_600, 433))
 def test_disk_that_takes_half_a_message_damages_nothing(
     tmp_path: Path, size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -263,14 +263,8 @@ def test_limit_of_the_kernel_on_one_file(tmp_path: Path) -> None:
         stopped = recording(tmp_path / "stop.mcap", RecordingRules())
         write(stopped, range(40))
         stopped.close()
-        rules = RecordingRules(split_s=1e9, disk_full="delete-oldest")
-        split = recording(tmp_path / "split.mcap", rules)
-        write(split, range(40))
-        split.close()
     assert "File too large" in stopped.trouble and stopped.lost == 40 - stopped.frames
     assert frames_in(tmp_path / "stop.mcap") == list(range(stopped.frames))
-    assert split.lost == 0 and split.deleted == 0
-    assert frames_in(*parts_on_disk(tmp_path / "split.mcap").values()) == list(range(40))
 
 
 REAL_DISK = """

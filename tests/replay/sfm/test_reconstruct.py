@@ -21,7 +21,6 @@ from semantic_mapper.geometry import transform
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
-from semantic_mapper.replay.sfm.refusals import FilmError
 from semantic_mapper.replay.sfm.scale import Mark, MarkedDistance, ScaleHint
 from semantic_mapper.types import Float64
 from tests.nodes.support import run
@@ -93,14 +92,14 @@ def test_films_that_show_nothing_or_stand_still_are_refused_and_leave_nothing(tm
     poses = films.walk(2)
     pictures = films.take(poses)
     cases = {
-        "dark": [np.zeros_like(pictures[0])] * 20,
-        "still": [pictures[0]] * 20,
-        "short": pictures,
+        "are black": [np.zeros_like(pictures[0])] * 20,
+        "does not move": [pictures[0]] * 20,
+        "too short": pictures,
     }
-    for reason, frames in cases.items():
-        with pytest.raises(FilmError) as caught:
-            import_film(films.write_film(tmp_path / f"{reason}.mp4", frames), tmp_path / "a.mcap", FilmOptions(), quiet)
-        assert caught.value.reason == reason
+    for says, frames in cases.items():
+        film = films.write_film(tmp_path / "film.mp4", frames)
+        with pytest.raises(ImportSourceError, match=says):
+            import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
     assert not list(tmp_path.glob("*.mcap*"))
 
 
@@ -108,9 +107,8 @@ def test_a_blurred_film_is_refused(tmp_path: Path) -> None:
     import cv2
 
     pictures = [cv2.GaussianBlur(p, (0, 0), 14) for p in films.take(films.walk(24, step_m=0.12))]
-    with pytest.raises(FilmError) as caught:
+    with pytest.raises(ImportSourceError, match=r"blurred|too short"):
         import_film(films.write_film(tmp_path / "a.mp4", pictures), tmp_path / "a.mcap", FilmOptions(), quiet)
-    assert caught.value.reason in ("blurred", "short")
 
 
 def test_options_that_cannot_be_are_refused_before_anything_is_read(
@@ -171,9 +169,9 @@ def test_a_calibrated_film_gets_its_scale_from_two_marked_points_or_a_height(
 def test_a_calibration_that_the_pictures_contradict_is_refused(tmp_path: Path, walked: tuple[Path, Float64]) -> None:
     wrong = dataclasses.replace(films.CAMERA, fx=0.475 * films.CAMERA.fx, fy=0.475 * films.CAMERA.fy)
     save_calibration(tmp_path / "wrong.toml", wrong, None, {})
-    with pytest.raises(FilmError, match=r"is 129 px of the film, and its pictures fit (1[89]|2\d)\d px") as caught:
+    with pytest.raises(ImportSourceError, match=r"is 129 px of the film, and its pictures fit (1[89]|2\d)\d px"):
         import_film(walked[0], tmp_path / "a.mcap", FilmOptions(tmp_path / "wrong.toml"), quiet)
-    assert caught.value.reason == "calibration" and not list(tmp_path.glob("*.mcap*"))
+    assert not list(tmp_path.glob("*.mcap*"))
 
 
 @pytest.mark.slow
@@ -192,9 +190,8 @@ def test_a_camera_that_turns_on_the_spot_is_refused(tmp_path: Path) -> None:
     start = films.walk(1)[0][:3, 3]
     poses = np.stack([pose_of(start, yaw, -0.1) for yaw in np.linspace(0.0, 1.6, 40)])
     film = films.write_film(tmp_path / "a.mp4", films.take(poses))
-    with pytest.raises(FilmError) as caught:
+    with pytest.raises(ImportSourceError, match="turns on the spot"):
         import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
-    assert caught.value.reason == "turning"
 
 
 @pytest.mark.slow
@@ -205,9 +202,8 @@ def test_a_camera_that_stands_and_looks_around_is_refused(tmp_path: Path) -> Non
     poses = [pose_of(np.array([10, -1.5, 1.55]), 0.35 * np.sin(n / 6), 0.03 * np.sin(n / 3)) for n in range(70)]
     pictures = [take(scene, pinhole(640), pose, 1.5, n) for n, pose in enumerate(poses)]
     film = films.write_film(tmp_path / "a.mp4", pictures, 10.0)
-    with pytest.raises(FilmError) as caught:
+    with pytest.raises(ImportSourceError, match="turns on the spot"):
         import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
-    assert caught.value.reason == "turning"
 
 
 @pytest.mark.slow
@@ -220,7 +216,6 @@ def test_a_drive_straight_ahead_is_reconstructed(tmp_path: Path) -> None:
     path = compare(log, drive.poses)
     assert found.registered >= 0.95 * found.picked and found.frames >= 30
     assert path.rmse_m < 0.002 * path.way_m and path.rotation_deg < 0.5 and path.drift == pytest.approx(1, abs=0.03)
-    assert found.sigmas is not None and path.rmse_m < 3 * found.sigmas.position * path.way_m
     assert "straight ahead" in " ".join(found.notices)
 
 
@@ -229,9 +224,8 @@ def test_two_scenes_are_refused_with_their_times(tmp_path: Path) -> None:
     lengths = {films.SEED: 60, 100_011: 40}  # about as many picks of each: of unequal scenes the larger one is mapped
     parts = [films.take(films.walk(count, seed=seed), seed=seed) for seed, count in lengths.items()]
     film = films.write_film(tmp_path / "a.mp4", [*parts[0], *parts[1]])
-    with pytest.raises(FilmError, match="cut it") as caught:
+    with pytest.raises(ImportSourceError, match="cut it"):
         import_film(film, tmp_path / "a.mcap", FilmOptions(), quiet)
-    assert caught.value.reason == "several-scenes"
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.drivers.poses.board import make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
@@ -13,10 +14,8 @@ from semantic_mapper.replay.sfm.scale import (
     BoardScale,
     Mark,
     MarkedDistance,
-    RegisteredFrame,
     ScaleHint,
     fit_to_scene,
-    floor_under,
     marked_place,
     parse_distance,
     ray_of,
@@ -73,17 +72,12 @@ def test_a_world_is_turned_upright_about_the_first_camera() -> None:
 
 
 def test_the_floor_is_the_lowest_strong_layer(rng: np.random.Generator) -> None:
-    T = np.eye(4)
-    T[2, 3] = 1.5
-    floor = np.column_stack((rng.uniform(-2, 2, (200, 2)), rng.normal(0.0, 0.01, 200)))
-    table = np.column_stack((rng.uniform(-1, 1, (300, 2)), rng.normal(0.75, 0.01, 300)))
-    stray = rng.uniform((-2, -2, -0.5), (2, 2, 2.5), (40, 3))
-    few = floor[:15]
-    frames = [RegisteredFrame(0, T, np.concatenate((floor, table, stray)))]
-    found = floor_under(frames)
+    floor, table = rng.normal(0.0, 0.01, 200), rng.normal(0.75, 0.01, 300)
+    stray = rng.uniform(-0.5, 2.5, 40)
+    found = floor_height(np.concatenate((floor, table, stray)), 1.5)
     assert found is not None and abs(found) < 0.05
-    assert floor_under([RegisteredFrame(0, T, np.concatenate((table, few)))]) is None  # most is on the table
-    assert floor_under([RegisteredFrame(0, T, table + np.array((0, 0, 2.0)))]) is None
+    assert floor_height(np.concatenate((table, floor[:15])), 1.5) is None  # most is on the table
+    assert floor_height(table + 2.0, 1.5) is None
 
 
 def test_up_is_where_upright_edges_meet(rng: np.random.Generator) -> None:

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import DepthConfig, DepthFromMotionConfig
-from semantic_mapper.replay.log_depth import compute_depths
+from semantic_mapper.replay.finetune_log import compute_depths
 from semantic_mapper.types import CameraIntrinsics
+from tests.drawn_room import walk_frames
 
 CAMERA = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
 
 
 def test_frames_of_a_log_get_depth_near_the_truth_at_their_own_size() -> None:
-    frames = list(room_frames(TRAIN_SEEDS[7], 14, CAMERA))
+    frames = list(walk_frames(3, 14, CAMERA))
     dark = replace(frames[9], depth_m=None, rgb=np.zeros_like(frames[9].rgb))
     given = [replace(f, depth_m=None) for f in frames[:9]] + [dark] + [replace(f, depth_m=None) for f in frames[10:]]
     read: list[int] = []
@@ -35,9 +35,3 @@ def test_frames_of_a_log_get_depth_near_the_truth_at_their_own_size() -> None:
         known = (whole.depth_m > 0) & (frame.depth_m > 0)
         error.append(np.median(np.abs(whole.depth_m - frame.depth_m)[known] / frame.depth_m[known]))
     assert np.median(error) < 0.1
-
-
-def test_where_no_depth_is_asked_for_or_the_sensor_has_it_nothing_is_computed() -> None:
-    frames = list(room_frames(TRAIN_SEEDS[7], 3, CAMERA))
-    assert compute_depths(frames, DepthConfig()) == {}
-    assert compute_depths([replace(f, depth_m=None) for f in frames], DepthConfig(source="off")) == {}
