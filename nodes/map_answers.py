@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_scale import scale_name
+from semantic_mapper.mapping.map_types import scale_name
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers

@@ -1,8 +1,9 @@
-"""What a node publishes: to its launch and to others, and what it says of itself."""
+"""Publishing: of what a node says of itself, and at a second endpoint for other programs and machines."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +12,10 @@ import structlog
 from semantic_mapper.errors import CodecError
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.keys import load_keys
-from semantic_mapper.transport.messages import Buffer, Status
+from semantic_mapper.transport.messages import Buffer, NodeState, Status
 from semantic_mapper.transport.sockets import Publisher
+
+STATUS_PERIOD_S = 1.0
 
 _log = structlog.get_logger(__name__)
 
@@ -41,6 +44,34 @@ def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0
         _log.error("status_not_reported", reason=str(error))
         return
     publisher.publish(parts, timeout_s)
+
+
+class StatusReport:
+    """Publishes how a node is, about once a second.
+
+    Args:
+        node: Its name.
+        publisher: Where.
+    """
+
+    def __init__(self, node: str, publisher: Publisher) -> None:
+        self._node = node
+        self._publisher = publisher
+        self._last = 0.0
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to."""
+        return time.monotonic() - self._last >= STATUS_PERIOD_S
+
+    def publish(
+        self, state: NodeState, counters: Mapping[str, int], ages_s: Mapping[str, float], degraded: tuple[str, ...]
+    ) -> Status:
+        """Publish it now; what was published."""
+        self._last = time.monotonic()
+        status = Status(self._node, state, time.monotonic_ns(), dict(counters), dict(ages_s), degraded)
+        publish_status(self._publisher, status)
+        return status
 
 
 class PublicPublisher(Publisher):

@@ -1,4 +1,4 @@
-"""The streams of frames that a node takes in: what they are, which have ended, what is missing, where cameras are."""
+"""The streams of frames that a node takes in: what they are, which have ended, and which frames never came."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class MissingFrames:
 
 
 class MapPoses:
-    """Knows of each world what the mapper has said of it last.
+    """Where cameras are in the map: of each world of theirs, what the mapper has said of it last.
 
     A camera that tracks itself begins its own world; the mapper may have to find that in its map first. Until it has
     mapped a frame of a world, nobody knows where cameras of that world are.

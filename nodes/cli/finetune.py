@@ -80,7 +80,7 @@ def finetune(
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
-    from semantic_mapper.training.fitters import FITTERS
+    from semantic_mapper.training.finetune import FITTERS
 
     if kind is not None and kind not in FITTERS:
         raise typer.BadParameter(f"fitted to one scene are {', '.join(FITTERS)}", param_hint="--kind")
@@ -136,9 +136,8 @@ def _recipe_lines(recipe: dict[str, Any], chosen: int) -> list[str]:
         )
     if boxed := recipe.get("panoptic"):
         lines.append(
-            f"{boxed['seen']} of {boxed['boxes']} boxes seen; pixels that meet one {percent(boxed['covered'])}, "
-            f"with a surface in boxes of several classes {percent(boxed['ambiguous'])}; pseudo labels "
-            f"({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
+            f"{boxed['seen']} of {boxed['boxes']} boxes seen; pixels that meet one {percent(boxed['covered'])}; "
+            f"pseudo labels ({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
             f"{percent(boxed['matched'])}"
         )
         left_out = {

@@ -13,7 +13,7 @@ import typer
 
 from semantic_mapper.config import AtLeastOne, AtLeastZero, load_config
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.mapping.map_scale import length_unit
+from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.nodes.cli.calibrate import board_settings
 from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress

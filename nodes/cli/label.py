@@ -12,8 +12,7 @@ from semantic_mapper.config import AtLeastOne
 from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.verb import JsonOutput, must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
-from semantic_mapper.nodes.labeller.server import LabelServer
-from semantic_mapper.nodes.labeller.session import LabelSession
+from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
 from semantic_mapper.nodes.launcher.running import running_launches
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted

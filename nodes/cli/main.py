@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib import import_module
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from semantic_mapper import __version__
 from semantic_mapper.nodes.cli.verb import Settings
-from semantic_mapper.redaction import without_secrets
 
-_UsageError = cast("type[Exception]", typer.BadParameter.__base__)  # Click's, or Typer's own copy of it
 _MODULES = "semantic_mapper.nodes.cli"
 # By verb: the function or group of verbs (MODULE:NAME), and what it does, as its own help begins.
 VERBS: Mapping[str, tuple[str, str]] = {
@@ -48,7 +45,7 @@ _FREE_ARGUMENTS = ("query", "keys")
 
 
 class _Group(TyperGroup):
-    """Loads a verb when it is used, and shows wrong usage without the secrets of what was typed."""
+    """Loads a verb when it is used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """As of Click."""
@@ -74,25 +71,6 @@ class _Group(TyperGroup):
         """As of Click, from what is known without loading a verb."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in VERBS.items()])
-
-    def make_context(self, *args: Any, **kwargs: Any) -> Any:
-        """As of Click."""
-        with _redacted():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: Any) -> Any:
-        """As of Click."""
-        with _redacted():
-            return super().invoke(ctx)
-
-
-@contextmanager
-def _redacted() -> Iterator[None]:
-    try:
-        yield
-    except _UsageError as error:
-        error.__dict__["message"] = without_secrets(str(error.__dict__["message"]))
-        raise
 
 
 app = typer.Typer(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.table import Table
@@ -17,8 +17,7 @@ from semantic_mapper.client import Correction, MapClient
 from semantic_mapper.config import AtLeastOne, Fraction
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import write_json
-from semantic_mapper.mapping.map_scale import length_unit
-from semantic_mapper.mapping.map_types import ALWAYS
+from semantic_mapper.mapping.map_types import ALWAYS, length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, must_be_there, results_file, verb
@@ -43,24 +42,8 @@ POLL_S = 0.2
 Up = tuple[float, float, float]
 
 
-class Question(StrEnum):
-    """What can be requested."""
-
-    INFO = "info"
-    AT = "at"
-    NEAREST = "nearest"
-    INSTANCES = "instances"
-    GRAPH = "graph"
-    CORRECT = "correct"
-    RELOCALIZE = "relocalize"
-
-
-ARGUMENTS = {
-    Question.AT: "X Y Z",
-    Question.NEAREST: "CLASS X Y Z",
-    Question.CORRECT: "FILE",
-    Question.RELOCALIZE: "LOG",
-}
+Question = Literal["info", "at", "nearest", "instances", "graph", "correct", "relocalize"]
+ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "correct": "FILE", "relocalize": "LOG"}
 
 
 @verb
@@ -107,17 +90,17 @@ def query(
     """
     name, point = _read_arguments(question, arguments or [])
     endpoint = map_endpoint(source)
-    if question is Question.CORRECT:
+    if question == "correct":
         return _correct(output, source, endpoint, Path(name), camera, remote)
-    if gone and not (endpoint and question is Question.INSTANCES):
+    if gone and not (endpoint and question == "instances"):
         raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
-    if picture is not None and question is not Question.GRAPH:
+    if picture is not None and question != "graph":
         raise typer.BadParameter("goes with `graph`", param_hint="--picture")
     written = [path for path in (results_file(out), picture) if path is not None]
     for path in written:
         prepare_file(path)
     code = 0
-    if question is Question.RELOCALIZE:
+    if question == "relocalize":
         found = _relocalize(output, source, endpoint, Path(name), every)
         located = [session["T_map_world"] is not None for session in found["sessions"]]
         code = 0 if located and all(located) else EXIT_FAILED
@@ -190,13 +173,13 @@ def answer(
         MapError, LabelError: a question that cannot be answered.
     """
     match question:
-        case Question.INFO:
+        case "info":
             return map_answers.describe_map(answering.mirror().snapshot())
-        case Question.AT:
+        case "at":
             return map_answers.answer_at(answering.info().label_set, point, answering.at([point]))
-        case Question.NEAREST:
+        case "nearest":
             return map_answers.answer_nearest(class_name, point, answering.nearest(class_name, point, min_confidence))
-        case Question.INSTANCES:
+        case "instances":
             axis = up or (answering.up() if isinstance(answering, SavedMap) else map_answers.UP)
             return map_answers.answer_instances(axis, answering.instances(axis, gone=gone))
         case _:  # the graph
@@ -213,7 +196,7 @@ def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tupl
     expected = ARGUMENTS.get(question, "").split()
     if len(arguments) != len(expected):
         raise typer.BadParameter(
-            f"`{question.value}` takes {' '.join(expected) or 'nothing more'}, got {' '.join(arguments) or 'nothing'}"
+            f"`{question}` takes {' '.join(expected) or 'nothing more'}, got {' '.join(arguments) or 'nothing'}"
         )
     name = arguments.pop(0) if expected and expected[0] != "X" else ""
     try:

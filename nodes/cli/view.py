@@ -14,9 +14,9 @@ from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import ConfigError, TransportError
 from semantic_mapper.nodes.cli.verb import JsonOutput, Remote, WeightsOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
-from semantic_mapper.nodes.launcher.launch_view import LaunchView
 from semantic_mapper.nodes.launcher.running import (
     QUERY_SOCKET,
+    LaunchView,
     launch_folder,
     node_endpoints,
     read_launch_note,

@@ -20,7 +20,7 @@ import psutil
 STARTING, RUNNING, ENDING = b"s", b"r", b"e"
 TURN, FRAME = b"t", b"f"
 PERIOD_S = 0.2
-START_S = STALL_S = 300.0  # without progress: until a node is ready, and for a turn of its main loop (kernels compile)
+START_S = STALL_S = 300.0  # until a node is ready, and for a turn of its main loop (kernels compile)
 BUSY_SILENCE_S = 30.0  # loading packages may hold up all threads, and so may an overloaded machine
 _PR_SET_PDEATHSIG = 1
 _READ_BYTES = 65536
@@ -122,7 +122,6 @@ class HeartbeatMonitor:
     Attributes:
         ready, ending: Whether start-up is over, and whether results are being written.
         frames: Published, where the node counts them.
-        beats: How often something was read.
         turns: How often turns were among it: of the main loop, or steps of writing results.
     """
 
@@ -132,7 +131,7 @@ class HeartbeatMonitor:
         self._last_turn: float | None = None
         self._last_frame: float | None = None
         self.ready = self.ending = False
-        self.frames = self.beats = self.turns = 0
+        self.frames = self.turns = 0
         os.set_blocking(fd, False)
 
     @property
@@ -164,7 +163,6 @@ class HeartbeatMonitor:
         if not beats:  # the process has ended
             return
         self._last_beat = time.monotonic()
-        self.beats += 1
         if TURN in beats:
             self.turns += 1
             self._last_turn = self._last_beat
@@ -237,9 +235,6 @@ class HangDetector:
         self._heartbeat_s = heartbeat_s
         self._cpu_s: float | None = None  # when the silence was noticed
         self._busy_s = max(heartbeat_s, BUSY_SILENCE_S)
-        self._silence, self._start, self._stall = (
-            ProgressLimit(limit_s, lambda: cpu_seconds(pid)) for limit_s in (self._busy_s, START_S, STALL_S)
-        )
 
     def find_hang(self, *, stopping: bool) -> str:
         """Why the process has to be killed; empty where it need not be.
@@ -249,24 +244,26 @@ class HangDetector:
         """
         beat = self._heartbeat
         beat.poll()
-        if beat.silent_s <= self._heartbeat_s / 2:
-            self._cpu_s = None
-        elif self._cpu_s is None:
-            self._cpu_s = cpu_seconds(self._pid)
-        running = beat.ready and not beat.ending
-        frozen = running and beat.silent_s > self._heartbeat_s and self._cpu_s is not None and self._is_frozen()
-        silence_s = self._heartbeat_s if frozen else self._busy_s
-        if frozen or (self._silence.exceeded(beat.beats) and beat.silent_s > silence_s):
-            return f"it gave no sign of life for {silence_s:g} s and was killed"
-        if self._start.exceeded(beat.ready) and not beat.ready and not stopping and beat.age_s > START_S:
+        frozen = self._is_frozen()
+        if frozen or beat.silent_s > self._busy_s:
+            return f"it gave no sign of life for {self._heartbeat_s if frozen else self._busy_s:g} s and was killed"
+        if not beat.ready and not stopping and beat.age_s > START_S:
             return f"it was not ready after {START_S:g} s and was killed"
-        stalled = self._stall.exceeded(beat.turns)
-        if stalled and beat.stalled_s is not None and beat.stalled_s > STALL_S:
+        if beat.stalled_s is not None and beat.stalled_s > STALL_S:
             return f"its main loop made no turn for {STALL_S:g} s, and it was killed"
         return ""
 
     def _is_frozen(self) -> bool:
-        return cpu_seconds(self._pid) == self._cpu_s and not is_active(self._pid)
+        """Whether a node that runs is silent, and neither has had nor wants processor time meanwhile."""
+        beat = self._heartbeat
+        if beat.silent_s <= self._heartbeat_s / 2:
+            self._cpu_s = None
+            return False
+        if self._cpu_s is None:
+            self._cpu_s = cpu_seconds(self._pid)
+        running = beat.ready and not beat.ending
+        is_silent = running and beat.silent_s > self._heartbeat_s
+        return is_silent and cpu_seconds(self._pid) == self._cpu_s and not is_active(self._pid)
 
 
 def cpu_seconds(pid: int) -> float:

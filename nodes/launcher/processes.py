@@ -27,7 +27,6 @@ from semantic_mapper.nodes.launcher.liveness import (
     ProgressLimit,
     cpu_seconds,
 )
-from semantic_mapper.nodes.launcher.systemd import SYSTEMD_VARIABLES
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT, STOP_SIGNAL
 from semantic_mapper.plain_text import visible
@@ -39,13 +38,12 @@ from semantic_mapper.transport.messages import NodeState
 STOP_S, FINISH_S = 15.0, 300.0
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
+SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")  # for the launcher alone, not for its nodes
 ORPHAN_TIMEOUT_S = 120  # see ``NodeJob.orphan_timeout_s``
 # Of a process that somebody has requested to end, whether or not it was old enough to do so in order.
 TERMINATED = {code: s for s in (signal.SIGTERM, signal.SIGINT) for code in (128 + s, -s)}
-# Pauses before restarts: doubled with each failure in the window. They leave no room for so many restarts of a node
-# that was ever ready, which is thus restarted for as long as the launch runs.
-BACKOFF_S, BACKOFF_MAX_S = 0.1, 10.0
-MAX_RESTARTS, WINDOW_S = 20, 60.0
+# Pauses before restarts: doubled with each failure in the window.
+BACKOFF_S, BACKOFF_MAX_S, WINDOW_S = 0.1, 10.0, 60.0
 
 _log = structlog.get_logger(__name__)
 
@@ -87,11 +85,9 @@ class RestartBackoff:
         self._failures: deque[float] = deque()
         self.count = 0
 
-    def delay_s(self, now: float) -> float | None:
-        """Note a failure: seconds to wait before the next start, None where the limit is reached."""
+    def delay_s(self, now: float) -> float:
+        """Note a failure: seconds to wait before the next start."""
         before = self.recent(now)
-        if before >= MAX_RESTARTS:
-            return None
         self._failures.append(now)
         self.count += 1
         return min(BACKOFF_MAX_S, BACKOFF_S * 2.0**before)
@@ -419,19 +415,15 @@ class ManagedProcess:
         self._hopeless |= hopeless
         if last or hopeless or self._entry.restart == "never":
             self._give_up(text)
-        elif self._restart_later(text, why or process.describe_exit()):
+        else:
+            self._restart_later(text, why or process.describe_exit())
             self.close()
 
-    def _restart_later(self, text: str, reason: str) -> bool:
-        """Note a failure; False where that was one too many."""
+    def _restart_later(self, text: str, reason: str) -> None:
         delay = self._backoff.delay_s(time.monotonic())
-        if delay is None:
-            self._give_up(f"{text}; it was restarted {MAX_RESTARTS} times within {WINDOW_S:g} s, and is not any more")
-            return False
         self._last_end, self._last_reason = text, reason
         self._due = time.monotonic() + delay
         _log.warning("node_restarts", node=self.name, in_s=delay, restarts=self.restarts)
-        return True
 
     def _give_up(self, why: str) -> None:
         self.failure = why

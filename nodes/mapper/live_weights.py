@@ -15,7 +15,7 @@ import structlog
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.mapper import Mapper, make_field
-from semantic_mapper.mapping.views.weights_check import FieldTrial
+from semantic_mapper.mapping.pipeline import FieldTrial
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER, file_of_version, keep_offer, read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions

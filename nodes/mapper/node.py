@@ -14,7 +14,7 @@ from msgspec import to_builtins
 from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.map_scale import FIX
+from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.mapping.moving import KEPT_S
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
@@ -329,9 +329,9 @@ class MapperNode:
             }
             warnings.append(sessions.warning)
         if not pipeline.voxel_map.scale_known:
-            warnings.append(f"scale: unknown; lengths of the map are not metres: {FIX}")
+            warnings.append(f"scale: unknown; lengths of the map are not metres: {SCALE_FIX}")
         counters |= pipeline.picture_check.counters
-        warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning, pipeline.moving.warning]
+        warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning]
         return PartStatus(counters, tuple(filter(None, warnings)))
 
 

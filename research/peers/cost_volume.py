@@ -9,9 +9,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.source_views import MIN_DEPTH_M, gather, reproject, scaled_camera
-from semantic_mapper.fields.volume import sample_inverse_depth, weighted_moments
+from research.peers.rendering import weighted_moments
+from semantic_mapper.fields.base import MIN_DEPTH_M, EncodedViews, gather, reproject, scaled_camera
+from semantic_mapper.fields.volume import sample_inverse_depth
 from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.types import RayBatch
 

@@ -28,14 +28,22 @@ from research.peers.cost_volume import (
     cost_volume,
     nearest_views,
 )
+from research.peers.rendering import composite_render, density_from
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
+from semantic_mapper.fields.base import (
+    MAX_SOURCE_VIEWS,
+    EncodedViews,
+    Reprojection,
+    check_views,
+    encoded_views,
+    gather,
+    reproject,
+)
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.scene.grid import density_from, encode_frequencies, encoded_size, relu_layers
-from semantic_mapper.fields.source_views import Reprojection, check_views, encoded_views, gather, reproject
-from semantic_mapper.fields.volume import composite, composite_render, compositing_weights, interval_lengths
+from semantic_mapper.fields.scene.grid import encode_frequencies, encoded_size, relu_layers
+from semantic_mapper.fields.volume import composite, compositing_weights, interval_lengths
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 

@@ -100,7 +100,7 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
         assert eventually(lambda: running.text.count("map_saved") > saves), running.text  # it maps on
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 1, running.text  # frames that were sent while there was no recorder are lost
-        assert "of camera 'rooms' the recorder was restarted" in error_line(running.text)
+        assert "the recorder was restarted, and what was sent meanwhile is missing" in error_line(running.text)
         assert not any(map(is_alive, running.all_pids()))
     with capsys.disabled():
         print("\nback after:", ", ".join(f"{case} {seconds:.2f} s" for case, seconds in took.items()))  # noqa: T201
@@ -141,15 +141,14 @@ def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
-def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path, signum: signal.Signals) -> None:
+def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path) -> None:
     with Running("up", alone(tmp_path, long_log)) as running:
         running.wait_for_line(r"\beye\].* playing ")
-        os.kill(wait_for_start(running, "eye", 0), signum)
+        os.kill(wait_for_start(running, "eye", 0), signal.SIGTERM)
         pid = wait_for_start(running, "eye", 1)
         assert eventually(lambda: len(re.findall(r"\beye\].* playing ", running.text)) == 2)
         for process in (running.process.pid, pid):  # as a service manager may, and terminals
-            os.kill(process, signum)
+            os.kill(process, signal.SIGTERM)
         assert running.wait() == 0, running.text
         assert not any(map(is_alive, running.all_pids()))
 
@@ -215,12 +214,6 @@ def test_top_shows_a_running_launch(watched: Running) -> None:
     assert shown["launch"]["pid"] == watched.process.pid and shown["launch"]["counters"]["restarts"] == 1
     table = run("view", "--status", f"ipc://{sockets}/launch", "--once").stdout
     assert re.search(rf"eye +\w+ +{pid} ", table)
-
-
-@pytest.mark.slow
-def test_top_says_where_there_is_nothing_to_see(tmp_path: Path) -> None:
-    assert "no socket folder of a launch" in error_line(run("view", "--status", str(tmp_path), "--once").stderr)
-    assert run("view", "--status", "--json").returncode == 2
 
 
 def test_systemd_hears_of_start_life_and_end(long_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

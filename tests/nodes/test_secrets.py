@@ -44,10 +44,6 @@ FORMS = (
         ("up", "{}"),
         ("up", "replay", "--set", "camera.log={}", "--set", "camera.mode={}"),
         ("record", "a.mcap", "--launch", "{}"),
-        ("{}",),
-        ("info", "--{}"),
-        ("query", "map.npz", "{}"),
-        ("query", "map.npz", "at", "1", "2", "{}"),
     ],
 )
 def test_no_verb_shows_the_secret_of_an_address(

@@ -5,14 +5,15 @@ import torch
 
 from research.peers.cost_volume import Sweep, cost_volume, nearest_views
 from research.peers.mvsnerf import MVSNeRF
+from research.tests.peers.tiny_peers import tiny_peer
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.scene.grid import encoded_size
 from tests.fields.scene import INTRINSICS, WALL_M, pose_at, wall_rays, wall_sources
-from tests.fields.tiny_fields import POSES, assert_gradients_are_right, tiny
+from tests.fields.tiny_fields import POSES, assert_gradients_are_right
 
 
 def mvsnerf() -> MVSNeRF:
-    field = tiny("mvsnerf")
+    field = tiny_peer("mvsnerf")
     assert isinstance(field, MVSNeRF)
     return field
 
@@ -64,7 +65,7 @@ def test_a_sample_looks_up_the_volume_at_its_own_place():
 
     The wall is at another depth in every column, so that a volume which is mirrored or shifted agrees elsewhere.
     """
-    field = tiny("mvsnerf")
+    field = tiny_peer("mvsnerf")
     assert isinstance(field, MVSNeRF)
     field.sweep = Sweep(planes=64, near_m=1.0, far_m=8.0)
     field.volume_net = _CostItself()  # pyright: ignore[reportAttributeAccessIssue]

@@ -9,6 +9,7 @@ import torch
 from safetensors import safe_open
 from torch.nn import functional
 
+from research.peers.kinds import build_field
 from research.tests.train.small_run import POOL, small_run
 from research.train.images import ImageStepConfig, images_loss
 from research.train.recipe import rooms_before
@@ -17,7 +18,6 @@ from research.train.start import take_over_encoder
 from research.train.train import IMAGES_FILE, STATE_FILE, WEIGHTS_FILE, train
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint
-from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.training.fit import cosine_rate

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -12,7 +12,6 @@ import pytest
 
 from semantic_mapper.nodes.launcher import fork_server
 from semantic_mapper.nodes.launcher.fork_server import ForkServer
-from semantic_mapper.nodes.launcher.liveness import ProgressLimit
 from semantic_mapper.nodes.launcher.processes import NodeProcess, node_environment
 from semantic_mapper.nodes.options import NodeJob
 from tests.nodes.support import eventually
@@ -59,25 +58,6 @@ def test_forked_nodes_are_children_of_the_launcher_and_the_server_may_die(tmp_pa
     assert second.wait(60) and second.exit_code() == -signal.SIGKILL and second.has_failed()
     first.close()
     second.close()
-
-
-@pytest.mark.slow
-def test_a_server_that_imports_with_a_fiftieth_of_a_core_is_waited_for(
-    tmp_path: Path, server: ForkServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ends: list[float] = []
-
-    def starved(limit_s: float, cpu_s: Callable[[], float]) -> ProgressLimit:
-        def now_s() -> float:
-            ends.append(50 * cpu_s())
-            return ends[-1]
-
-        return ProgressLimit(limit_s, cpu_s, now_s)
-
-    monkeypatch.setattr(fork_server, "ProgressLimit", starved)
-    monkeypatch.setattr(fork_server, "START_S", 20.0)
-    start(tmp_path, server).close()
-    assert max(ends) - ends[0] > 20.0  # seconds of that clock, of which no more would have been granted at once
 
 
 @pytest.mark.slow

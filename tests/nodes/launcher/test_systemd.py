@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import structlog.testing
 
-from semantic_mapper.nodes.launcher.systemd import Notifier
+from semantic_mapper.nodes.launcher.launcher import Notifier
 from tests.nodes.support import REPLAY_LAUNCH
 
 UNIT = REPLAY_LAUNCH.parent / "systemd" / "semantic-mapper.service"
@@ -40,13 +40,6 @@ def test_what_is_told_is_what_systemd_expects(tmp_path: Path) -> None:
     notifier.stopping(2.5)
     assert manager.hear() == ["STATUS=one"]  # once
     assert manager.hear() == ["STOPPING=1", "EXTEND_TIMEOUT_USEC=2500000"]
-
-
-def test_abstract_socket() -> None:
-    name = f"semantic-mapper-test-{os.getpid()}"
-    manager = Manager("\0" + name)
-    Notifier.from_environment({"NOTIFY_SOCKET": f"@{name}"}).ready("well")
-    assert manager.hear()[0] == "READY=1"
 
 
 def test_watchdog_is_fed_three_times_a_period_and_only_for_this_process(tmp_path: Path) -> None:

@@ -34,18 +34,6 @@ def program(path: Path, *, stuck: bool) -> str:
     return str(path)
 
 
-def test_a_viewer_that_starts_with_a_fiftieth_of_a_core_is_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def starved(limit_s: float, cpu_s: Callable[[], float]) -> ProgressLimit:
-        return ProgressLimit(limit_s, cpu_s, lambda: 50 * cpu_s())  # 75 s of that clock, and the limit is 20
-
-    monkeypatch.setattr(server, "_find_program", lambda: program(tmp_path / "rerun", stuck=False))
-    monkeypatch.setattr(server, "ProgressLimit", starved)
-    with server.WebViewer(0, 0) as viewer:
-        assert viewer.alive
-
-
 def test_a_viewer_that_is_stuck_is_given_up_with_its_last_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

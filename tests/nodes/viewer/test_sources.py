@@ -14,7 +14,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -23,10 +23,9 @@ import numpy as np
 import pytest
 import rerun.chunk
 
-from semantic_mapper.errors import MapError, TransportError
+from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.cli.verb import Remote
-from semantic_mapper.nodes.cli.view import _find_live, _Page
-from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.cli.view import _find_live
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.process import StopRequest
@@ -40,7 +39,7 @@ from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.sockets import Publisher
-from semantic_mapper.types import MapUpdate
+from tests.nodes.foxglove.robot import update_for
 from tests.nodes.mapper.test_query_service import answering
 from tests.nodes.support import error_line, eventually, is_alive, run
 from tests.queries.scene import LABELS, painted, whole_map
@@ -55,24 +54,6 @@ def logged(path: Path) -> Counter[str]:
     for chunk in rerun.chunk.RrdReader(path).stream():
         rows[chunk.entity_path] += chunk.num_rows
     return rows
-
-
-def update_for(frame, label) -> MapUpdate:
-    size = frame.rgb.shape[:2]
-    return MapUpdate(
-        stamp_ns=frame.stamp_ns,
-        seq=frame.seq,
-        camera_id=frame.camera_id,
-        fused=True,
-        is_keyframe=False,
-        source_seqs=(),
-        label=np.full(size, label, np.uint8),
-        confidence=np.ones(size, np.float32),
-        depth_m=np.ones(size, np.float32),
-        blocks=1,
-        blocks_touched=1,
-        stage_ms={"render": 3.0, "fuse": 1.0},
-    )
 
 
 def listening(port: int) -> set[str]:
@@ -125,21 +106,6 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
         done = run("view", source, "--port", "0")
         assert done.returncode == 1 and reason in error_line(done.stderr)
         assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
-
-
-def test_an_error_while_something_is_shown_is_the_only_one(capfd: pytest.CaptureFixture[str]) -> None:
-    def show_and_fail() -> None:
-        with _Page(0, Output.guarded()) as page:
-            log = RerunLog(page.begin(), LABELS)
-            assert page.alive
-            for _ in range(20):
-                log.log_map(whole_map().points())
-            raise MapError("ours")
-
-    with pytest.raises(MapError, match="ours"):
-        show_and_fail()
-    said = capfd.readouterr()
-    assert said.out.startswith("watch at http://127.0.0.1:") and not said.err
 
 
 def test_a_viewer_that_is_killed_leaves_no_server() -> None:
@@ -212,27 +178,6 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
     camera = f"/world/cameras/{frames[0].camera_id}/image"
     assert 1 <= rows[f"{camera}/rgb"] <= 3 and 1 <= rows[f"{camera}/semantics"] <= 3, "the newest of what came"
     assert rows["/world/map/class"] == rows["/world/map/age"] == 1, "a map that has not changed is not sent again"
-
-
-def test_several_cameras_are_shown_until_the_last_one_ends(tmp_path: Path) -> None:
-    frame, cameras = tiny_frames()[0], ("left", "right")
-    told: list[str] = []
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder, ExitStack() as stack:
-        live = Live(f"ipc://{folder}/query", tuple(f"ipc://{folder}/{name}" for name in cameras), streams=2)
-        left, right = (stack.enter_context(Publisher(endpoint)) for endpoint in live.nodes)
-        stack.enter_context(answering(live.query, whole_map()))
-        stack.enter_context(watching_live(live, tmp_path / "live.rrd", told))
-        assert eventually(lambda: bool(left.subscribers("frame") and right.subscribers("frame")), WARM_S)
-        left.publish(encode_frame(dataclasses.replace(frame, camera_id="left")))
-        left.publish(encode(EndOfStream("left", "end", 1)))
-        left.remind("end")  # said again, it is still one camera's
-        assert not eventually(lambda: not right.subscribers("frame"), 0.7) and not told, "it goes on"
-        right.publish(encode_frame(dataclasses.replace(frame, camera_id="right")))
-        right.publish(encode(EndOfStream("right", "end", 1)))
-        assert eventually(lambda: "the stream has ended" in told, 60)
-    rows = logged(tmp_path / "live.rrd")
-    assert rows["/world/cameras/left/image/rgb"] == rows["/world/cameras/right/image/rgb"] == 1
-    assert not rows["/world/cameras/left"] + rows["/world/cameras/left/image"], "where in the map it was is not known"
 
 
 def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:
