@@ -64,6 +64,8 @@ class SourceOptions(Options, frozen=True):
         Raises:
             ConfigError: values that cannot be, or that exclude each other.
         """
+        if sum(map(bool, (self.scale, self.distance, self.square_mm, self.camera_height))) > 1:
+            raise ConfigError("the scale comes from one source only: leave out all but one of the options that say it")
         hint = ScaleHint(
             factor=self.scale or None,
             distance=parse_distance(self.distance) if self.distance else None,

@@ -34,8 +34,7 @@ from semantic_mapper.config import (
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.nodes.console import Output, stderr_console
 from semantic_mapper.nodes.process import failure_message, prepare_process
-from semantic_mapper.plain_text import visible
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import visible, without_secrets
 from semantic_mapper.setting_docs import comments_of, comments_of_parameters, settings_of, without_bounds
 
 if TYPE_CHECKING:

@@ -154,17 +154,7 @@ def _show_log(path: Path, weights: Path | None, config: Path | None, page: _Page
 
     settings = load_mapper_config(config)
     with frame_progress("map", None) as bar:
-        show_log(
-            path,
-            weights,
-            settings,
-            0,
-            page.begin,
-            REFRESH_S,
-            going=lambda: not stop and page.alive,
-            on_start=bar.start,
-            on_frame=bar.set,
-        )
+        show_log(path, weights, settings, 0, page.begin, REFRESH_S, lambda: not stop and page.alive, bar)
 
 
 def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> None:

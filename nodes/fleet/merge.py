@@ -19,7 +19,7 @@ from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.store import Store, is_store
 from semantic_mapper.nodes.fleet.urls import is_url, open_url, reaching
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX
 from semantic_mapper.types import Float64
 

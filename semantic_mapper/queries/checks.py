@@ -61,6 +61,14 @@ def check_direction(direction: ArrayLike, name: str) -> Float64:
     return array / length
 
 
+def check_up(up: ArrayLike) -> Float64:
+    """One direction (3,) -> of unit length; see ``check_direction``."""
+    unit = check_direction(up, "up")
+    if unit.shape != (3,):
+        raise MapError(f"up: expected shape (3,), got {unit.shape}")
+    return unit
+
+
 def check_box(lower: ArrayLike, upper: ArrayLike, snapshot: MapSnapshot) -> tuple[Float64, Float64]:
     """Corners (3,) of a box in metres -> units of voxels.
 

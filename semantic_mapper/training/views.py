@@ -11,12 +11,11 @@ import torch
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import UNSURE_SPREAD
 from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
-from semantic_mapper.geometry import camera_matrix, transform, unproject
+from semantic_mapper.geometry import GUESSED_DEPTHS_M, camera_matrix, transform, unproject, visible_points
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.rays import pixel_rays
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, RayBatch, SourceViews
-from semantic_mapper.view_selection import GUESSED_DEPTHS_M, visible_points
 
 PROBE = 24  # pixels a row of a view that overlap is found with
 
