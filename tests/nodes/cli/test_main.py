@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -11,7 +9,7 @@ import pytest
 from semantic_mapper import __version__
 from semantic_mapper.nodes.cli.main import VERBS as VERBS_AND_TEXTS
 from tests.contract import entry_points as api
-from tests.nodes.support import COMMAND, run, run_here, run_process
+from tests.nodes.support import run, run_here, run_process
 
 VERBS = sorted(name for name in VERBS_AND_TEXTS if not hasattr(api.verb_of(name), "commands"))
 
@@ -72,20 +70,3 @@ def test_wrong_usage_exits_with_2_and_says_so_on_stderr(arguments: tuple[str, ..
 def test_numbers_that_nothing_can_be_computed_with_are_wrong_usage(number: str, tmp_path: Path) -> None:
     code, said = run_here("record", tmp_path / "x.mcap", "--duration", number)
     assert code == 2 and "--duration" in said
-
-
-def test_completion_of_bash_knows_verbs_and_options(tmp_path: Path) -> None:
-    def complete(line: str, **more: str) -> list[str]:
-        words = {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split(" ")) - 1)}
-        environment = {**os.environ, "_SEMANTIC_MAPPER_COMPLETE": "complete_bash", **words, **more}
-        done = subprocess.run([str(COMMAND)], env=environment, capture_output=True, text=True, check=False)
-        return done.stdout.split()
-
-    assert complete("semantic-mapper re") == ["replay", "record", "refine"]
-    assert "--voxel-size" in complete("semantic-mapper replay --vo")
-    script = complete("", _SEMANTIC_MAPPER_COMPLETE="source_bash")
-    assert "complete" in script and "semantic-mapper" in script
-    home = {**os.environ, "HOME": str(tmp_path), "SHELL": "/bin/bash"}
-    install = '"$0" --install-completion bash; exit $?'  # inside a shell, which it looks for among its parents
-    subprocess.run(["/bin/bash", "-c", install, str(COMMAND)], env=home, capture_output=True, check=True)
-    assert "semantic-mapper" in (tmp_path / ".bashrc").read_text()
