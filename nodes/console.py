@@ -9,7 +9,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
@@ -21,6 +21,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
@@ -71,7 +72,7 @@ class Output:
 
     def __init__(self, stream: TextIO) -> None:
         self.console = PlainConsole(stream)
-        self.quiet = False  # ``print`` shows nothing: for verbs that were requested JSON alone
+        self.quiet = False  # JSON alone was requested: ``json`` writes it, and ``print`` shows nothing
         self._stream = stream
 
     @classmethod
@@ -98,6 +99,13 @@ class Output:
             self._stream.write("\n".join(line.rstrip(" ") for line in printed.get().split("\n")))
         self._stream.flush()
 
+    def lines(self, lines: Sequence[str], most: int = 10) -> None:
+        """Show the first of many lines, and how many more there are."""
+        for line in lines[:most]:
+            self.print(line)
+        if len(lines) > most:
+            self.print(f"and {len(lines) - most} more")
+
     def address(self, said: str, url: str) -> None:
         """Show an address of this machine that people are to open, whole; ``print`` hides its parameters."""
         if not self.quiet:
@@ -105,9 +113,35 @@ class Output:
             self._stream.flush()
 
     def json(self, data: Any) -> None:
-        """Write one JSON document, without secrets of the addresses in it."""
+        """Write one JSON document where it was requested, without secrets of the addresses in it."""
+        if not self.quiet:
+            return
         self._stream.write(json.dumps(plain_without_secrets(data), indent=1, allow_nan=False) + "\n")
         self._stream.flush()
+
+
+def table(
+    rows: Iterable[Sequence[object]],
+    names: Sequence[str] = (),
+    *,
+    title: str = "",
+    caption: str = "",
+    numbers: Collection[str] = (),
+) -> Table:
+    """A table for ``Output.print``.
+
+    Args:
+        rows: Cells; None is an empty one.
+        names: Of the columns; without any the first column names the rows.
+        title, caption: Above and below it.
+        numbers: Names of the columns that end at the right.
+    """
+    found = Table(title=title, caption=caption, title_justify="left", show_header=bool(names))
+    for name in names:
+        found.add_column(name, justify="right" if name in numbers else "left", overflow="fold")
+    for row in rows:
+        found.add_row(*("" if cell is None else cell if isinstance(cell, Text) else str(cell) for cell in row))
+    return found
 
 
 def stderr_console() -> PlainConsole:
@@ -164,29 +198,18 @@ def frame_progress(
 ) -> Iterator[FrameProgress]:
     """Show progress while inside; ``total`` None where nobody knows it. ``stop`` is what ends the job early."""
     columns = (
-        _TextColumn(lambda task: task.description, "bold"),
+        TextColumn("{task.description}", "bold", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         _RateColumn(unit),
-        _TextColumn(lambda task: "eta"),
+        TextColumn("eta"),
         TimeRemainingColumn(),
         TimeElapsedColumn(),
-        _TextColumn(lambda task: task.fields["note"]),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     console = stderr_console()
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit, stop)
-
-
-class _TextColumn(ProgressColumn):
-    """Rich's own reads markup."""
-
-    def __init__(self, text: Callable[[Task], str], style: str = "") -> None:
-        super().__init__()
-        self._text, self._style = text, style
-
-    def render(self, task: Task) -> Text:
-        return Text(visible(self._text(task)), style=self._style)
 
 
 class _RateColumn(ProgressColumn):

@@ -1,28 +1,23 @@
-"""Answers about a map, as plain data and as tables."""
+"""Answers about a map, as plain data."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_types import length_unit, scale_name
-from semantic_mapper.plain_text import counted
+from semantic_mapper.mapping.map_types import scale_name
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
-from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
 
 DIGITS = 4  # 0.1 mm
-MIN_CLASS_WIDTH = 8  # of their column, on a narrow terminal
 
 
 def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
@@ -75,18 +70,16 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
 
 UP = (0.0, 0.0, 1.0)  # of the boxes of instances, where nothing else is given
 NO_FLOOR = "no floor was found: too little level surface, or another way is up (--up)"
-CONNECTED = "connected pieces of one class"
 
 
-def answer_instances(up: Sequence[float], instances: Sequence[Instance], separated_by: str = "") -> dict[str, Any]:
-    """The things in a map, the surest first, and by which means they were separated; empty = not known.
+def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict[str, Any]:
+    """The things in a map, the surest first.
 
     Those that have gone are ``gone``, the latest first; the key is left out while nothing has gone.
     """
     there = sorted((t for t in instances if t.gone_ns is None), key=lambda thing: -thing.rank)
     gone = sorted((t for t in instances if t.gone_ns is not None), key=lambda thing: thing.gone_ns or 0, reverse=True)
     found: dict[str, Any] = {"question": "instances", "up": list(up)}
-    found |= {"separated_by": separated_by} if separated_by else {}
     found["instances"] = [_describe_thing(thing) for thing in there]
     found |= {"gone": [{**_describe_thing(t), "gone_ns": t.gone_ns} for t in gone]} if gone else {}
     return found
@@ -134,86 +127,6 @@ def _describe_thing(thing: Instance) -> dict[str, Any]:
             "R_world_box": np.round(thing.box.R_world_box, 6).tolist(),
         },
     }
-
-
-def answer_table(found: dict[str, Any], width: int) -> Table:
-    """An answer, for people, on a terminal of ``width`` characters."""
-    if found["question"] == "instances":
-        return _instance_table(found, width)
-    if found["question"] == "graph":
-        return _graph_table(found)
-    unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
-    table = Table(title=found["map"], title_justify="left", show_header=False)
-    for key, value in found.items():
-        if key not in ("map", "question", "classes"):
-            unnamed = key == "class" and value is None and found["surface_distance_m"] is not None
-            table.add_row(key.replace("_", " "), "unknown" if unnamed else _text(value, unit))
-    if "classes" in found:
-        table.add_section()
-        for name, count in sorted(found["classes"].items(), key=lambda item: -item[1]):
-            if count:
-                table.add_row(name, counted(count, "surface voxel"))
-    return table
-
-
-def _instance_table(found: dict[str, Any], width: int) -> Table:
-    by = found.get("separated_by")
-    table = Table(title=f"{found['map']}, things by {by}" if by else found["map"], title_justify="left")
-    rows = [
-        (
-            str(thing["id"]),
-            thing["class"],
-            f"{thing['confidence']:.2f}",
-            str(thing["voxels"]),
-            f"{thing['measured'] * 100:.0f} %",
-            _joined(thing["centroid"]),
-            _joined(thing["box"]["size"]),
-            f"{thing['gone_ns'] / 1e9:.2f}" if "gone_ns" in thing else "",
-        )
-        for thing in (*found["instances"], *found.get("gone", ()))
-    ]
-    names = ("id", "class", "confidence", "voxels", "measured", "centroid, m", "box, m", "gone at, s")
-    if not found.get("gone"):
-        names, rows = names[:-1], [row[:-1] for row in rows]
-    widths = [max(map(len, column)) for column in zip(names, *rows, strict=True)]
-    for name, widest in zip(names, widths, strict=True):
-        if name == "class":
-            table.add_column(name, overflow="fold")
-        else:
-            table.add_column(name, no_wrap=True, min_width=widest)
-    widths[names.index("class")] = MIN_CLASS_WIDTH
-    # Numbers are never cut: one that lacks digits is another one. A terminal that is too narrow breaks the lines.
-    narrowest = sum(widths) + 3 * len(widths) + 1
-    if width < narrowest:
-        table.width = narrowest
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-def _graph_table(found: dict[str, Any]) -> Table:
-    table = Table(title=found["map"], title_justify="left")
-    if not found["floors"]:
-        table.caption = NO_FLOOR
-    for name in ("room", "floor", "area, m2", "doors to", "objects"):
-        table.add_column(name, overflow="fold", min_width=len(name))
-    class_of = {thing["id"]: thing["class"] for thing in found["objects"]}
-    for room in found["rooms"]:
-        counts = Counter(class_of[number] for number in room["objects"])
-        objects = ", ".join(name if count == 1 else f"{count} {name}" for name, count in sorted(counts.items()))
-        doors = " ".join(map(str, room["neighbours"]))
-        table.add_row(str(room["id"]), str(room["floor"]), f"{room['area_m2']:.1f}", doors, objects)
-    return table
-
-
-def _text(value: Any, unit: str) -> str:
-    if isinstance(value, list):
-        return f"{_joined(value)} {unit}"
-    return "none" if value is None else str(value)
-
-
-def _joined(xyz: list[float]) -> str:
-    return " ".join(f"{x:.2f}" for x in xyz)
 
 
 def _rounded(xyz: Float64) -> list[float]:

@@ -15,7 +15,6 @@ import structlog
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
 from semantic_mapper.nodes.process import (
@@ -25,6 +24,7 @@ from semantic_mapper.nodes.process import (
     LOSS_EVENT,
     STOP_SIGNAL,
     StopRequest,
+    failure_message,
     prepare_process,
 )
 from semantic_mapper.transport.endpoints import default_endpoint
@@ -60,9 +60,7 @@ class NodeContext:
 
     def endpoint(self, name: str) -> str:
         """Where a node publishes."""
-        if name in self.endpoints:
-            return self.endpoints[name]
-        return default_endpoint(name)
+        return self.endpoints.get(name) or default_endpoint(name)
 
     def leave_note(self, what: str, text: str) -> None:
         """Leave word to the process that takes over when this one is killed; in a launch only.
@@ -74,16 +72,7 @@ class NodeContext:
             write_bytes(self.folder / f"{self.name}.{what}.note", text.encode(), sync="none")
 
     def try_to_leave_note(self, what: str, text: str, then: str) -> bool:
-        """As ``leave_note``, for those who go on where it cannot be written.
-
-        Args:
-            what: As there.
-            text: As there.
-            then: What comes of it, for people.
-
-        Returns:
-            Whether it was written.
-        """
+        """As ``leave_note``; whether it was written. Else a warning says what comes of it (``then``)."""
         try:
             self.leave_note(what, text)
         except OSError as error:

@@ -79,7 +79,6 @@ class CameraOptions(Config, frozen=True):
     mapper: str = "mapper"  # lockstep: the node whose answers are waited for
     rate: Annotated[float, msgspec.Meta(ge=0.001, le=1000)] = 1.0  # realtime: 2 = twice as fast as recorded
     max_frames: Count = 0  # 0 = all
-    subscriber_timeout_s: Positive = 180.0  # how long the others may take to start
     # How long a mapper that is waited for (lockstep, fast, a video) may take for one frame; the first one compiles.
     ack_timeout_s: Positive = 300.0
     # Where the mapper answers (its `query`), for poses that close loops (`rgbd`): it moves its map with them, if it
@@ -116,8 +115,6 @@ class MapperOptions(Config, frozen=True):
     # known (30 at most); empty = a new map.
     map: str = ""
     history_frames: Count = 0  # kept on disk for closed loops, where the config does not say how many
-    eval_exclude: str = ""  # weights whose finetuning frames are left out of the scores, too
-    rerun: str = ""  # write a Rerun recording there; empty = none
     # Also write the map of the moment to ``map.npz`` in ``out`` every n seconds, while mapping goes on: what a killed
     # process leaves. It costs one frame the time to copy what it touches (some 20 ms), and the next ones up to half of
     # a core while it is written. 0 = only at the end.

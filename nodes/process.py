@@ -14,6 +14,7 @@ from typing import Any, Self
 
 import structlog
 
+from semantic_mapper.memory import is_out_of_memory, memory_message
 from semantic_mapper.plain_text import visible, without_secrets
 
 STOP_SIGNAL = signal.SIGUSR1  # by which a launcher asks its nodes to end: SIGTERM may come from anybody
@@ -67,6 +68,22 @@ def run_when_idle() -> None:
     except (AttributeError, OSError) as error:  # not Linux, or forbidden
         niceness = os.getpriority(os.PRIO_PROCESS, 0)
         structlog.get_logger(__name__).info("no_idle_scheduling", reason=str(error), niceness=niceness)
+
+
+def failure_message(error: BaseException) -> str:
+    """What a failure that is no bug of ours says to people: out of memory, or an error of the system.
+
+    Args:
+        error: None of ours, which say all that is to be said.
+
+    Returns:
+        One line; empty where it is a bug, whose traceback is worth more.
+    """
+    if is_out_of_memory(error):  # native packages raise whatever they like then
+        return memory_message(error)
+    if isinstance(error, OSError):  # disk full, permission denied: the system's own words and the file
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    return ""
 
 
 class StopRequest:

@@ -12,8 +12,6 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.types import Float64
 
-MAX_MISSED = 2**53  # numbers may jump by anything; beyond this, sums of counts would not be exact in every reader
-
 
 class Streams:
     """Camera nodes whose frames go into one map or one log.
@@ -92,11 +90,7 @@ class Streams:
 
 
 class MissingFrames:
-    """Counts the frames that are missing between others by their numbers, camera by camera.
-
-    Attributes:
-        missed: Frames, ``MAX_MISSED`` at most.
-    """
+    """Counts the frames that are missing between others by their numbers, camera by camera."""
 
     def __init__(self) -> None:
         self.missed = 0
@@ -112,7 +106,7 @@ class MissingFrames:
         if seq <= last:
             self.restarts += 1
         else:
-            self.missed = min(self.missed + seq - last - 1, MAX_MISSED)
+            self.missed += seq - last - 1
 
 
 class MapPoses:

@@ -136,7 +136,7 @@ def refuse_overwriting(out: Path, *sources: Path) -> None:
         ConfigError: naming the file.
     """
     if out.resolve() in {source.resolve() for source in sources}:
-        raise ConfigError(f"{out}: is the map itself; choose another name for the result")
+        raise ConfigError(f"{out}: the result is made from it; choose another name")
 
 
 def is_map(source: Path) -> bool:

@@ -11,7 +11,7 @@ import inspect
 import io
 import textwrap
 import tokenize
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -58,7 +58,7 @@ def settings_of(kind: type[msgspec.Struct], prefix: str = "") -> Iterator[Settin
     texts = comments_of(kind)
     hints = get_type_hints(kind, include_extras=True)
     for item in msgspec.structs.fields(kind):
-        declared, low, high = _without_bounds(hints[item.name])
+        declared, low, high = without_bounds(hints[item.name])
         if isinstance(declared, type) and issubclass(declared, msgspec.Struct) and not item.required:
             yield from settings_of(declared, f"{prefix}{item.name}.")
             continue
@@ -68,7 +68,8 @@ def settings_of(kind: type[msgspec.Struct], prefix: str = "") -> Iterator[Settin
         yield Setting(prefix + item.name, declared, low, high, default, texts.get(item.name, ""))
 
 
-def _without_bounds(declared: Any) -> tuple[Any, float | None, float | None]:
+def without_bounds(declared: Any) -> tuple[Any, float | None, float | None]:
+    """A declared type without its bounds and ``None``, and these bounds; None = none."""
     low = high = None
     while get_origin(declared) is Annotated:
         declared, *notes = get_args(declared)
@@ -79,7 +80,7 @@ def _without_bounds(declared: Any) -> tuple[Any, float | None, float | None]:
     if get_origin(declared) in (Union, UnionType):
         inner = [part for part in get_args(declared) if part is not type(None)]
         if len(inner) == 1:
-            return _without_bounds(inner[0])
+            return without_bounds(inner[0])
     return declared, low, high
 
 
@@ -90,22 +91,41 @@ def comments_of(kind: type[msgspec.Struct]) -> dict[str, str]:
     for part in reversed(kind.__mro__):
         if part is msgspec.Struct or not issubclass(part, msgspec.Struct):
             continue
-        source = textwrap.dedent(inspect.getsource(part))
-        comments = {
-            token.start[0]: token.string.lstrip("#").strip()
-            for token in tokenize.generate_tokens(io.StringIO(source).readline)
-            if token.type == tokenize.COMMENT
-        }
-        lines = source.splitlines()
-        (body,) = ast.parse(source).body
-        assert isinstance(body, ast.ClassDef)
-        for node in body.body:
-            if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-                continue
-            above = node.lineno - 1
-            while above in comments and lines[above - 1].lstrip().startswith("#"):
-                above -= 1
-            numbers = range(above + 1, (node.end_lineno or node.lineno) + 1)
-            if text := " ".join(comments[number] for number in numbers if number in comments):
-                found[node.target.id] = text
+        source, declared = _parse(part)
+        assert isinstance(declared, ast.ClassDef)
+        for node in declared.body:
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                found |= _comment(source, node, node.target.id)
     return found
+
+
+def comments_of_parameters(function: Callable[..., Any]) -> dict[str, str]:
+    """The comments above and behind the parameters of a function, by parameter."""
+    source, declared = _parse(function)
+    assert isinstance(declared, ast.FunctionDef)
+    found: dict[str, str] = {}
+    for node in (*declared.args.args, *declared.args.kwonlyargs):
+        found |= _comment(source, node, node.arg)
+    return found
+
+
+def _parse(declared: Any) -> tuple[str, ast.stmt]:
+    source = textwrap.dedent(inspect.getsource(declared))
+    return source, ast.parse(source).body[0]
+
+
+def _comment(source: str, node: ast.AnnAssign | ast.arg, name: str) -> dict[str, str]:
+    """What the comments above and behind a declaration say, by its name."""
+    comments, lines = _comments_by_line(source), source.splitlines()
+    above = node.lineno - 1
+    while above in comments and lines[above - 1].lstrip().startswith("#"):
+        above -= 1
+    numbers = range(above + 1, (node.end_lineno or node.lineno) + 1)
+    text = " ".join(comments[number] for number in numbers if number in comments)
+    return {name: text} if text else {}
+
+
+@functools.cache
+def _comments_by_line(source: str) -> dict[int, str]:
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    return {t.start[0]: t.string.lstrip("#").strip() for t in tokens if t.type == tokenize.COMMENT}

@@ -12,10 +12,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import typer.main
 from rich.console import Console
 from rich.table import Table
+from typer.core import TyperGroup
 
 from semantic_mapper.nodes.cli.main import app
 
@@ -159,8 +161,11 @@ def _imports(tree: ast.AST, *, in_function: bool) -> Iterator[tuple[ast.Import |
 
 
 def _commands(command: object) -> int:
-    below = getattr(command, "commands", {})
-    return sum(_commands(each) for each in below.values()) if below else 1
+    if not isinstance(command, TyperGroup):
+        return 1
+    context: Any = None
+    names = command.list_commands(context)
+    return sum(_commands(command.get_command(context, name)) for name in names)
 
 
 if __name__ == "__main__":

@@ -10,19 +10,18 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 DRAIN_S = 600.0  # how long subscribers may take to work off what waits for them after the last frame
 WAIT_SLICE_S = 0.2
+START_S = 180.0  # how long subscribers may take to start
 STOP_DRAIN_S = 3.0  # the same after a stop request
 REMIND_S = 2.0  # how often the end is said again meanwhile
 
 
-def wait_for_listeners(
-    context: NodeContext, publisher: Publisher, timeout_s: float, acks: LosslessSubscriber | None = None
-) -> bool:
+def wait_for_listeners(context: NodeContext, publisher: Publisher, acks: LosslessSubscriber | None = None) -> bool:
     """Wait until all others are there, in slices: False where a stop request came first.
 
     Raises:
         TransportError: too few within the time.
     """
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + START_S
     while not context.stop:
         try:
             publisher.wait_for_subscribers("frame", context.subscribers, WAIT_SLICE_S)

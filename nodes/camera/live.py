@@ -155,7 +155,7 @@ def _pause(context: NodeContext, seconds: float) -> None:
 def _listeners(context: NodeContext, options: CameraOptions, publisher: Publisher) -> None:
     """Give the others time to start; a camera does not end because one of them does not come."""
     try:
-        wait_for_listeners(context, publisher, options.subscriber_timeout_s)
+        wait_for_listeners(context, publisher)
     except TransportError as error:
         _log.warning("some_do_not_listen", reason=str(error))
 

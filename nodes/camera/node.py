@@ -11,7 +11,7 @@ from typing import NoReturn
 import structlog
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
+from semantic_mapper.nodes.camera.listeners import START_S, drain, wait_for_listeners
 from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import CameraOptions, NodeJob
@@ -57,7 +57,7 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
         rate=options.rate,
         max_frames=options.max_frames or None,
         subscribers=context.subscribers,
-        subscriber_timeout_s=options.subscriber_timeout_s,
+        subscriber_timeout_s=START_S,
         ack_timeout_s=options.ack_timeout_s,
         source=context.name,
     )
@@ -74,7 +74,7 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
                 acks = LosslessSubscriber(context.endpoint(options.mapper), ACK_TOPICS)
             total = min(len(log), options.max_frames or len(log))
             try:
-                if not wait_for_listeners(context, publisher, options.subscriber_timeout_s, acks):
+                if not wait_for_listeners(context, publisher, acks):
                     _log.info("played", published=0, stopped=True)
                     return
                 with frame_progress("played", total) as bar:

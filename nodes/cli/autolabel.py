@@ -3,53 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from semantic_mapper.config import load_mapper_config
+from semantic_mapper.config import Fraction, load_mapper_config
 from semantic_mapper.nodes.cli.info import autolabel_rows
-from semantic_mapper.nodes.cli.options import MaxFramesOption
-from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
-from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.cli.verb import LISTED, JsonOutput, MaxFramesOption, must_be_there, verb
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.run_folder import prepare_file
-
-LISTED = 10  # frames without a label, and damages, that are shown one by one
 
 
 @verb
 def autolabel(
-    log: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG...", help="Recorded log (.mcap), the parts of one, or a folder with them."),
-    ],
-    weights: Annotated[
-        Path, typer.Option("--weights", help="Weights file of any kind, or a name of weights in the package (`rooms`).")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="NEW", help="New log to write (.mcap).")],
-    depth: Annotated[
-        bool,
-        typer.Option("--depth", help="Also give frames without depth what was computed from the pictures."),
-    ] = False,
-    min_confidence: Annotated[
-        float, typer.Option("--min-confidence", min=0, max=1, help="Pixels that are less sure are unknown.")
-    ] = 0.0,
-    overwrite_labels: Annotated[
-        bool, typer.Option("--overwrite-labels", help="Replace labels that are there, too; without it they stay.")
-    ] = False,
-    instances: Annotated[
-        Path | None,
-        typer.Option(
-            "--instances",
-            metavar="DIR",
-            help="Weights with boxes (`finetune --kind panoptic`): also write CAMERA/NNNNNN.png, ids of boxes in 16 "
-            "bits, and instances.json.",
-        ),
-    ] = None,
+    output: JsonOutput,
+    log: list[Path],  # recorded log (.mcap), the parts of one, or a folder with them
+    *,
+    weights: Path,  # weights file of any kind, or a name of weights in the package (`rooms`)
+    out: Path,  # new log to write (.mcap)
+    depth: bool = False,  # also give frames without depth what was computed from the pictures
+    min_confidence: Fraction = 0.0,  # pixels that are less sure are unknown
+    overwrite_labels: bool = False,  # replace labels that are there, too; without it they stay
+    # weights with boxes (`finetune --kind panoptic`): also write CAMERA/NNNNNN.png, ids of boxes in 16 bits, and
+    # instances.json
+    instances: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     max_frames: MaxFramesOption = 0,
-    json: JsonOption = False,
-) -> int:
+) -> None:
     """Label every frame of a log with weights, into a new log.
 
     A frame is rendered as `replay` and `eval` render it. All else of the log stays: images, poses, stamps, other
@@ -60,8 +40,6 @@ def autolabel(
     Example: semantic-mapper autolabel kitchen.mcap --weights kitchen.safetensors --out labelled.mcap
     """
     must_be_there(*log)
-    output = Output.guarded()
-    output.quiet = json
     from semantic_mapper.replay.jobs import OFFLINE, AutolabelRequest, autolabel_log
 
     prepare_file(out)
@@ -71,24 +49,15 @@ def autolabel(
     )
     with StopRequest() as stop, frame_progress("autolabel", None, stop=stop) as bar:
         report = autolabel_log(request, bar)
-    found: dict[str, Any] = {
-        "files": [str(file) for file in report.files],
-        **report.note.plain(),
-        "reasons": list(report.unlabelled[:LISTED]),
-        "damage": list(report.damage),
-    }
-    output.print(", ".join(found["files"]))
+    files, note = [str(file) for file in report.files], report.note
+    output.print(", ".join(files))
     if instances is not None:
         output.print(f"  things: {instances}")
-    for name, text in autolabel_rows(found):
+    for name, text in autolabel_rows(note.plain()):
         output.print(f"  {name}: {text}")
-    for what, lines in (("without a rendering", report.unlabelled), ("damaged, left out", report.damage)):
-        for line in lines[:LISTED]:
-            output.print(f"  {what}: {line}")
-        if len(lines) > LISTED:
-            output.print(f"  and {len(lines) - LISTED} more")
-    if report.note.kept == report.note.frames:
+    output.lines([f"  without a rendering: {line}" for line in report.unlabelled])
+    output.lines([f"  damaged, left out: {line}" for line in report.damage])
+    if note.kept == note.frames:
         output.print("  note: every frame has a label of its own, which stays; --overwrite-labels replaces them")
-    if json:
-        output.json(found)
-    return 0
+    reasons = list(report.unlabelled[:LISTED])
+    output.json({"files": files, **note.plain(), "reasons": reasons, "damage": list(report.damage)})

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import platform
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-import typer
-
-from semantic_mapper.nodes.cli.options import MapperSettings, WeightsOption
-from semantic_mapper.nodes.cli.verb import JsonOption, must_be_there, verb
-from semantic_mapper.nodes.console import Output
+from semantic_mapper.config import AtLeastOne
+from semantic_mapper.nodes.cli.verb import JsonOutput, MapperSettings, WeightsOption, must_be_there, verb
 from semantic_mapper.replay.log import demo_log
 
 
 @verb
 def bench(
+    output: JsonOutput,
     mapper: MapperSettings,
-    part: Annotated[Literal["fusion", "pipeline"], typer.Argument(help="What to measure.")] = "pipeline",
-    log: Annotated[Path | None, typer.Option(help="Log with depth to measure on; without it that of `demo`.")] = None,
-    frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 20,
+    part: Literal["fusion", "pipeline"] = "pipeline",  # what to measure
+    *,
+    log: Path | None = None,  # log with depth to measure on; without it that of `demo`
+    frames: AtLeastOne = 20,  # frames that count
     weights: WeightsOption = None,
-    json: JsonOption = False,
 ) -> None:
     """Measure speed on this machine, on frames of 640x480.
 
@@ -32,13 +30,10 @@ def bench(
     Example: semantic-mapper bench fusion --json
     """
     must_be_there(*(path for path in (log, mapper.path) if path is not None))
-    output = Output.guarded()
     from semantic_mapper.replay.artifacts import versions
     from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
 
-    output.quiet = json
     log = log or demo_log()
-    found: dict[str, Any]
     if part == "fusion":
         found = bench_fusion(log, frames)
         output.print(
@@ -56,8 +51,7 @@ def bench(
         )
     found["machine"] = {"cpu": cpu_name(), "versions": versions()}
     output.print(f"on {found['machine']['cpu']}")
-    if json:
-        output.json(found)
+    output.json(found)
 
 
 def cpu_name() -> str:

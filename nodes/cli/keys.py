@@ -7,22 +7,19 @@ from typing import Annotated, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli.verb import JsonOption, verb
-from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.cli.verb import JsonOutput, verb
 from semantic_mapper.transport import keys as security
-
-Action = Literal["make", "show", "allow", "forget"]
 
 
 @verb
 def keys(
-    action: Annotated[Action, typer.Argument(help="make, show, allow NAME KEY, or forget NAME.")],
-    name: Annotated[str, typer.Argument(metavar="[NAME]", help="What to call the other machine.")] = "",
-    key: Annotated[
-        str, typer.Argument(metavar="[KEY]", help="Its public key, as `semantic-mapper keys show` there says.")
-    ] = "",
-    folder: Annotated[Path | None, typer.Option("--keys", help="Folder of the keys; without it this user's.")] = None,
-    json: JsonOption = False,
+    output: JsonOutput,
+    action: Literal["make", "show", "allow", "forget"],  # make, show, allow NAME KEY, or forget NAME
+    name: str = "",  # what to call the other machine
+    key: str = "",  # its public key, as `semantic-mapper keys show` there says
+    *,
+    # folder of the keys; without it this user's
+    folder: Annotated[Path | None, typer.Option("--keys")] = None,
 ) -> None:
     """Make, show or exchange the keys by which machines know each other.
 
@@ -35,30 +32,19 @@ def keys(
     """
     if bool(name) != (action in ("allow", "forget")) or bool(key) != (action == "allow"):
         raise typer.BadParameter("write make, show, allow NAME KEY, or forget NAME", param_hint="ACTION")
-    output = Output.guarded()
     folder = folder or security.user_key_folder()
     if action == "make":
-        public = security.make_keys(folder).public.decode()
-        output.print(public)
-        output.print(f"is this machine's public key; on another one: semantic-mapper keys allow NAME '{public}'")
-    elif action == "show":
-        _show(output, folder, json)
+        security.make_keys(folder)
     elif action == "allow":
         security.allow(folder, name, key)
-        output.print(f"'{name}' is a peer")
-    else:
+    elif action == "forget":
         security.forget(folder, name)
-        output.print(f"'{name}' is no peer any more")
-
-
-def _show(output: Output, folder: Path, json: bool) -> None:
     own = security.load_keys(folder)
-    peers = {name: key.decode() for name, key in own.peers().items()}
-    if json:
-        output.json({"folder": str(folder), "public": own.public.decode(), "peers": peers})
-        return
-    output.print(f"{own.public.decode()}  this machine ({folder})")
-    for name, key in peers.items():
-        output.print(f"{key}  {name}")
+    public, peers = own.public.decode(), {peer: key.decode() for peer, key in own.peers().items()}
+    if action in ("make", "show"):
+        output.print(f"{public}  this machine; on another one: semantic-mapper keys allow NAME '{public}'")
+    for peer, key in peers.items():
+        output.print(f"{key}  {peer}")
     if not peers:
-        output.print("no peers yet: semantic-mapper keys allow NAME KEY")
+        output.print("no peers: semantic-mapper keys allow NAME KEY")
+    output.json({"folder": str(folder), "public": public, "peers": peers})

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib import import_module
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from semantic_mapper import __version__
-from semantic_mapper.nodes.cli.verb import Settings, VerbCommand
-from semantic_mapper.plain_text import without_secrets
+from semantic_mapper.nodes.cli.verb import Settings
 
-_UsageError = cast("type[Exception]", typer.BadParameter.__base__)  # Click's, or Typer's own copy of it
 _MODULES = "semantic_mapper.nodes.cli"
 # By verb: the function or group of verbs (MODULE:NAME), and what it does, as its own help begins.
 VERBS: Mapping[str, tuple[str, str]] = {
-    "demo": ("demo:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
+    "demo": ("replay:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
     "replay": ("replay:replay", "Map a recording: a log, a film, or a folder or bag that `import` takes."),
     "compare": ("compare:compare", "Compare two runs of one log: counts, scores, and how far the maps are apart."),
     "up": ("up:up", "Start the nodes of a launch file as processes and watch over them until they end."),
@@ -47,72 +44,33 @@ VERBS: Mapping[str, tuple[str, str]] = {
 _FREE_ARGUMENTS = ("query", "keys")
 
 
-class _Commands(MutableMapping[str, Any]):
-    """The verbs as Click has them, each loaded when it is looked up."""
-
-    def __init__(self) -> None:
-        self._loaded: dict[str, Any] = {}
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._loaded:
-            module, _, attribute = VERBS[name][0].partition(":")
-            found = getattr(import_module(f"{_MODULES}.{module}"), attribute)
-            if not isinstance(found, typer.Typer):
-                settings = {"ignore_unknown_options": True} if name in _FREE_ARGUMENTS else {}
-                function, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
-                found.command(name, cls=VerbCommand, context_settings=settings)(function)
-            command = typer.main.get_command(found)
-            command.name = name
-            self._loaded[name] = command
-        return self._loaded[name]
-
-    def __setitem__(self, name: str, command: Any) -> None:
-        self._loaded[name] = command
-
-    def __delitem__(self, name: str) -> None:
-        del self._loaded[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(VERBS)
-
-    def __len__(self) -> int:
-        return len(VERBS)
-
-
 class _Group(TyperGroup):
-    """Loads a verb when it is used, and shows wrong usage without the secrets of what was typed."""
-
-    def __init__(self, **attributes: Any) -> None:
-        super().__init__(**attributes)
-        self.commands = cast("Any", _Commands())
+    """Loads a verb when it is used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """As of Click."""
         return list(VERBS)
 
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """As of Click."""
+        if cmd_name not in VERBS:
+            return None
+        if cmd_name not in self.commands:
+            module, _, attribute = VERBS[cmd_name][0].partition(":")
+            found = getattr(import_module(f"{_MODULES}.{module}"), attribute)
+            if not isinstance(found, typer.Typer):
+                settings = {"ignore_unknown_options": True} if cmd_name in _FREE_ARGUMENTS else {}
+                function, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
+                found.command(cmd_name, context_settings=settings)(function)
+            command = typer.main.get_command(found)
+            command.name = cmd_name
+            self.commands[cmd_name] = command
+        return self.commands[cmd_name]
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """As of Click, from what is known without loading a verb."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in VERBS.items()])
-
-    def make_context(self, *args: Any, **kwargs: Any) -> Any:
-        """As of Click."""
-        with _redacted():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: Any) -> Any:
-        """As of Click."""
-        with _redacted():
-            return super().invoke(ctx)
-
-
-@contextmanager
-def _redacted() -> Iterator[None]:
-    try:
-        yield
-    except _UsageError as error:
-        error.__dict__["message"] = without_secrets(str(error.__dict__["message"]))
-        raise
 
 
 app = typer.Typer(

@@ -9,11 +9,10 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 
-from semantic_mapper.config import convert_config, read_toml
+from semantic_mapper.config import AtLeastZero, convert_config
 from semantic_mapper.errors import ConfigError, LogError
-from semantic_mapper.nodes.cli.options import SettingOptions
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
-from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, OverwriteOption, SettingOptions, verb
+from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.launcher.running import launch_folder, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
@@ -38,31 +37,20 @@ class RecorderSettings(SettingOptions):
         "--reserve-mb": "reserve_mb",
     }
 
-    def table(self) -> dict[str, Any]:
-        """As a launch file has them.
-
-        Raises:
-            ConfigError: a file that is no TOML.
-        """
-        return {**(read_toml(self.path) if self.path else {}), **self.given}
-
 
 @verb
 def record(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap); further parts: -1, -2, ...")],
+    output: Output,
+    log: Path,  # log to write (.mcap); further parts: -1, -2, ...
     recorder: RecorderSettings,
-    launch: Annotated[str, typer.Option(help="Socket folder of the launch; by default the one that runs here.")] = "",
-    source: Annotated[
-        list[str] | None, typer.Option(help="Node to record, may be repeated; by default cameras and mappers.")
-    ] = None,
-    topic: Annotated[
-        list[str] | None, typer.Option(help="May be repeated; by default info, frame, refused and status; or map.")
-    ] = None,
-    duration: Annotated[float, typer.Option(min=0, help="Seconds; 0 = to the end of the stream, or Ctrl-C.")] = 0.0,
-    jpeg: Annotated[
-        int, typer.Option(min=0, max=100, help="Colour images as JPEG of this quality; 0 = as they are, lossless.")
-    ] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there.")] = False,
+    *,
+    launch: str = "",  # socket folder of the launch; by default the one that runs here
+    source: list[str] | None = None,  # node to record, may be repeated; by default cameras and mappers
+    topic: list[str] | None = None,  # may be repeated; by default info, frame, refused and status; or map
+    duration: AtLeastZero = 0.0,  # seconds; 0 = to the end of the stream, or Ctrl-C
+    # colour images as JPEG of this quality; 0 = as they are, lossless
+    jpeg: Annotated[int, typer.Option(min=0, max=100)] = 0,
+    overwrite: OverwriteOption = False,
 ) -> int:
     """Record what the nodes of a running launch publish, from outside.
 
@@ -75,8 +63,6 @@ def record(
 
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
-    output = Output.guarded()
-
     prepare_file(log)
     wanted = {
         "out": str(log),
@@ -87,8 +73,19 @@ def record(
         **({"rgb": "jpeg", "jpeg_quality": jpeg} if jpeg else {}),
     }
     with StopRequest() as stop, frame_progress("record", None) as bar:
+        began = 0.0
+
+        def is_enough(recorder: Recorder) -> bool:
+            nonlocal began
+            recording = recorder.recording
+            if recording is None:
+                return False
+            began = began or time.monotonic()
+            bar.set(recording.frames, recording.trouble)
+            return recording.ended or bool(duration and time.monotonic() - began >= duration)
+
         context, options = _join(launch_folder(launch), tuple(source or ()), wanted, stop)
-        done = record_until_end(context, options, _Watch(bar, duration).follow)
+        done = record_until_end(context, options, is_enough)
     return _report(output, log, done)
 
 
@@ -107,10 +104,8 @@ def _report(output: Output, log: Path, recorder: Recorder) -> int:
         raise LogError(f"{log}: its files were removed while it was recorded; record again")
     parts = f" in {done.parts} parts" if done.parts > 1 else ""
     output.print(f"{log}: {counted(done.frames, 'frame')}, {counted(done.messages, 'message')}{parts}")
-    if recorder.missing_frames.missed:
-        output.print(
-            f"  note: {counted(recorder.missing_frames.missed, 'frame')} never came: sent too early, or lost on the way"
-        )
+    if missed := recorder.missing_frames.missed:
+        output.print(f"  note: {counted(missed, 'frame')} never came: sent too early, or lost on the way")
     if done.deleted:
         output.print(f"  note: {counted(done.deleted, 'part')} deleted to make room")
     if not recorder.losses:
@@ -119,33 +114,14 @@ def _report(output: Output, log: Path, recorder: Recorder) -> int:
     return EXIT_FAILED
 
 
-class _Watch:
-    """Shows how recording goes, and says when it is enough."""
-
-    def __init__(self, bar: FrameProgress, duration_s: float) -> None:
-        self._bar = bar
-        self._duration_s = duration_s
-        self._began: float | None = None
-
-    def follow(self, recorder: Recorder) -> bool:
-        """True where recording is to end."""
-        recording = recorder.recording
-        if recording is None:
-            return False
-        now = time.monotonic()
-        self._began = now if self._began is None else self._began
-        self._bar.set(recording.frames, recording.trouble)
-        return recording.ended or bool(self._duration_s and now - self._began >= self._duration_s)
-
-
 def _join(
     folder: Path, sources: tuple[str, ...], wanted: dict[str, Any], stop: StopRequest
 ) -> tuple[NodeContext, RecorderOptions]:
-    """What the launcher would give a recorder node.
+    """A recorder node in a launch that runs, but without its launcher.
 
     Raises:
-        TransportError: the launch does not say what it is.
-        ConfigError: a source that is not one of its nodes, or options that do not go together.
+        TransportError: no launch runs there.
+        ConfigError: a source is no node of the launch, no camera is among them, or options that do not go together.
     """
     note = read_launch_note(folder)
     names = [node.name for node in note.nodes]

@@ -1,59 +1,46 @@
-"""``semantic-mapper replay``: a recording becomes a map, in this process."""
+"""The verbs ``replay`` and ``demo``: a recording becomes a map, in this process."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from semantic_mapper.nodes.cli.film import FilmFlags, RotateOption
-from semantic_mapper.nodes.cli.importing import import_source
-from semantic_mapper.nodes.cli.options import MapperSettings, MaxFramesOption, OutOption, WeightsOption
-from semantic_mapper.nodes.cli.verb import EXIT_UNTRUSTED, must_be_there, verb
+from semantic_mapper.nodes.cli.importing import SourceOptions, import_source
+from semantic_mapper.nodes.cli.verb import (
+    EXIT_UNTRUSTED,
+    JsonOutput,
+    MapperSettings,
+    MaxFramesOption,
+    WeightsOption,
+    must_be_there,
+    verb,
+)
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, is_log
+from semantic_mapper.replay.log import demo_log
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, is_log, prepare_folder
 from semantic_mapper.replay.summary import dig, notes, result_lines, summary_table
 
 
 @verb
 def replay(
-    source: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SOURCE...",
-            help="Recorded log (.mcap), the parts of one, or a folder with them; or a film, pictures or recording that "
-            "`import` takes.",
-        ),
-    ],
-    out: OutOption,
+    output: JsonOutput,
+    # Recorded log (.mcap), its parts, or a folder with them; or a film, pictures or recording that `import` takes
+    source: list[Path],
     mapper: MapperSettings,
-    film: FilmFlags,
+    options: SourceOptions,
+    *,
+    out: Path,  # folder for the results; made if missing
     weights: WeightsOption = None,
     max_frames: MaxFramesOption = 0,
-    rotate: RotateOption = "0",
-    eval_exclude: Annotated[
-        Path | None,
-        typer.Option(hidden=True, help="Leave frames that these weights were finetuned on out of the scores, too."),
-    ] = None,
-    rerun: Annotated[Path | None, typer.Option(help="Also write a Rerun recording (.rrd).")] = None,
-    corrections: Annotated[
-        Path | None,
-        typer.Option(help="Corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end."),
-    ] = None,
-    accept_contradictions: Annotated[
-        bool,
-        typer.Option(
-            "--accept-contradictions",
-            hidden=True,
-            help="Exit code 0 although poses and depth contradict each other (else 3).",
-        ),
-    ] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the summary as JSON, and nothing else, on stdout.")
-    ] = False,
+    rerun: Path | None = None,  # also write a Rerun recording (.rrd)
+    # corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end
+    corrections: Path | None = None,
+    accept_contradictions: bool = False,  # exit code 0 although poses and depth contradict each other (else 3)
 ) -> int:
     """Map a recording: a log, a film, or a folder or bag that `import` takes.
 
@@ -68,8 +55,6 @@ def replay(
     Example: semantic-mapper replay film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
     must_be_there(*source)
-    output = Output.guarded()
-    output.quiet = json
     from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
     from semantic_mapper.replay.jobs import OFFLINE, replay_log
 
@@ -81,17 +66,17 @@ def replay(
             load_checkpoint(weights)  # what is wrong with them is said before the long work
         log = out / f"{source[0].resolve().stem}{LOG_SUFFIX}"
         with hold_folder(out):
-            with_depth = import_source(output, source[0], log, film, int(rotate) // 90, overwrite=True)
+            with_depth = import_source(output, source[0], log, options, overwrite=True)
         source, weights = [log], weights or (None if with_depth else COMPUTED_DEPTH)
-    elif film.given() or rotate != "0":
+    elif options.given:
         raise typer.BadParameter("a log is mapped as it is; options of films go with films", param_hint="SOURCE")
-    more = {"exclude": eval_exclude, "rerun": rerun, "corrections": corrections}
     with StopRequest() as stop:
         with frame_progress("replay", None, stop=stop) as bar:
-            summary = replay_log(source, out, weights, config, max_frames, **more, monitor=bar).summary
+            summary = replay_log(
+                source, out, weights, config, max_frames, rerun=rerun, corrections=corrections, monitor=bar
+            ).summary
         show_replay(output, summary, out)
-        if json:
-            output.json(summary)
+        output.json(summary)
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
         untrusted = dig(summary, "pose_check.warning") and not accept_contradictions
@@ -99,8 +84,35 @@ def replay(
         return stop.exit_code or (EXIT_UNTRUSTED if untrusted or empty else 0)
 
 
+@verb
+def demo(
+    output: Output,
+    mapper: MapperSettings,
+    *,
+    out: Path = Path("runs/demo"),  # folder for the results; made if missing
+    weights: WeightsOption = None,
+) -> int:
+    """Map a recorded log that comes with the package: a depth camera in a furnished room.
+
+    Ends with a map, a picture and a summary in OUT. Needs no camera, no data and no network.
+
+    Example: semantic-mapper demo --out runs/demo
+    """
+    from semantic_mapper.replay.jobs import replay_log
+
+    began = time.monotonic()
+    prepare_folder(out)
+    with StopRequest() as stop:
+        with frame_progress("map", None, stop=stop) as bar:
+            summary = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar).summary
+        show_replay(output, summary, out)
+        output.print(f"  {demo_log()}  (the log it was made from)")
+        ended = "stopped after" if stop else "done in"
+        stderr_console().print(f"{ended} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`")
+        return stop.exit_code
+
+
 def show_replay(output: Output, summary: Mapping[str, Any], out: Path) -> None:
     """Table, notes and files of one replay, for people."""
-    output.print(summary_table({out.name: summary}))
-    for line in (*notes(summary), *result_lines(out)):
-        output.print(line)
+    for part in (summary_table({out.name: summary}), *notes(summary), *result_lines(out)):
+        output.print(part)

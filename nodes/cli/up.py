@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.eval import print_results
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import SetOption, verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
 from semantic_mapper.nodes.launcher.launcher import Launcher, Notifier
@@ -19,32 +16,18 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.run_folder import hold_folder
 
-LaunchArgument = Annotated[
-    Path,
-    typer.Argument(
-        metavar="LAUNCH",
-        help="Launch file, or the name of one of the package: camera, replay, ...; an unknown name lists all.",
-    ),
-]
-
 
 @verb
 def up(
-    launch: LaunchArgument,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NODE.OPTION=VALUE",
-            help="Set an option of a node, or `out`, `restart`, ...; may be repeated.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the results; the same as --set out=DIR.")
-    ] = None,
+    output: Output,
+    launch: Path,  # launch file, or the name of one of the package: camera, replay, ...; an unknown name lists all
+    *,
+    set_: SetOption = None,
+    out: Path | None = None,  # folder for the results; the same as --set out=DIR
 ) -> None:
     """Start the nodes of a launch file as processes and watch over them until they end.
 
+    --set NODE.OPTION=VALUE sets an option of a node, --set NAME=VALUE one of the launch (`out`, `restart`, ...).
     Ctrl-C ends all nodes in order, the map so far is written, and the exit code is 0; a second Ctrl-C kills them. When
     a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1;
     where the launch file says so it is restarted first (`restart`). The exit code is 1, too, where a recorder knows at
@@ -53,9 +36,7 @@ def up(
     Example: semantic-mapper up replay --set camera.log=kitchen.mcap --out runs/up
     Example: semantic-mapper up camera --set camera.kind=oak
     """
-    output = Output.guarded()
-
-    checked = load_launch(find_launch(launch), settings or (), out)
+    checked = load_launch(find_launch(launch), set_ or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
     before = [_written(f) for f in folders]
     with StopRequest() as stop, ExitStack() as stack:

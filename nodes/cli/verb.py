@@ -1,4 +1,7 @@
-"""What all verbs of the command line share: process set-up, groups of options, one clear line for an error, exit codes.
+"""What all verbs of the command line share: options, process set-up, one clear line for an error, exit codes.
+
+The parameters of a verb's function are what it takes: those before ``*`` are arguments, those behind it options. What
+the help says of one is the comment at it, its bounds are those of its type (``msgspec.Meta``), as of any setting.
 
 0 done; 1 failed; 2 wrong usage; 3 a map that cannot be trusted; 130 after Ctrl-C, 143 after SIGTERM (what was done so
 far is written where a verb says so); 1 too where a result is negative (``doctor`` finds something missing).
@@ -11,29 +14,60 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_type_hints
 
+import msgspec
 import structlog
 import typer
 from rich.text import Text
-from typer.core import TyperCommand, TyperOption
+from typer.models import ParameterInfo
 
+from semantic_mapper.config import (
+    Config,
+    MapperConfig,
+    assign,
+    convert_config,
+    load_mapper_config,
+    parse_assignments,
+    read_toml,
+)
 from semantic_mapper.errors import LogError, SemanticMapperError
-from semantic_mapper.nodes.cli.options import OptionGroup
-from semantic_mapper.nodes.console import stderr_console
-from semantic_mapper.nodes.failures import failure_message
-from semantic_mapper.nodes.process import prepare_process
+from semantic_mapper.nodes.console import Output, stderr_console
+from semantic_mapper.nodes.process import failure_message, prepare_process
 from semantic_mapper.plain_text import visible, without_secrets
+from semantic_mapper.setting_docs import comments_of, comments_of_parameters, settings_of, without_bounds
+
+if TYPE_CHECKING:
+    from semantic_mapper.transport.keys import ServerIdentity
 
 EXIT_FAILED = 1
+EXIT_USAGE = 2
 EXIT_UNTRUSTED = 3  # poses and depth of a recording contradict each other, so that its map cannot be trusted
 EXIT_INTERRUPTED = 130
 MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
-MIN_OPTION = 1e-9  # of the same, but for 0: one divided by it must be a number
+LISTED = 10  # lines of one kind that are shown one by one
 
 _log = structlog.get_logger(__name__)
 
+ConfigT = TypeVar("ConfigT", bound=Config)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
+JsonOutput = Annotated[Output, JsonOption]  # of a verb that has this option
+WeightsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--weights",
+        help="Weights file, or `rooms-computed-depth` for cameras without a depth sensor; without it the small one in "
+        "the package.",
+    ),
+]
+MaxFramesOption = Annotated[int, typer.Option("--max-frames", min=0, help="Stop after this many; 0 = all.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; may be repeated.")
+]
+UpOption = Annotated[
+    str, typer.Option("--up", help="Up in the world: x, -y, ..., or three numbers; auto = away from the floor.")
+]
 
 
 class Settings:
@@ -42,49 +76,154 @@ class Settings:
     verbose = False
 
 
-class VerbCommand(TyperCommand):
-    """A command whose rare options are hidden: ``--help-all`` shows them, too."""
+class Options(msgspec.Struct, frozen=True):
+    """Options that several verbs share: a field each, with its help in the comment there."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As of Click."""
-        if "--help-all" in args:
-            for parameter in self.params:
-                if isinstance(parameter, TyperOption):
-                    parameter.hidden = False
-            args = ["--help"]
-        return super().parse_args(ctx, args)
+    @classmethod
+    def parameters(cls) -> list[inspect.Parameter]:
+        """The options, as parameters of a command."""
+        hints, texts = get_type_hints(cls, include_extras=True), comments_of(cls)
+        return [
+            _option(field.name, hints[field.name], field.default, texts[field.name])
+            for field in msgspec.structs.fields(cls)
+        ]
 
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Says that there are more options."""
-        if any(getattr(parameter, "hidden", False) for parameter in self.params):
-            formatter.write_paragraph()
-            formatter.write_text("--help-all shows more options.")
+
+class SettingOptions:
+    """Options that set settings of ``kind``, with ``--config`` and ``--set`` for the others.
+
+    What they say, their bounds and their defaults are those of the declaration. Made with their values by name.
+    """
+
+    kind: ClassVar[type[Config]]
+    options: ClassVar[Mapping[str, str]]  # names of settings by option
+
+    def __init__(self, *, config: Path | None = None, set: list[str] | None = None, **values: Any) -> None:  # noqa: A002
+        self.path = config
+        named = {name: values.get(_parameter_name(option)) for option, name in self.options.items()}
+        self._named = {name: value for name, value in named.items() if value is not None}
+        self._assigned = set or []
+
+    @classmethod
+    def parameters(cls) -> list[inspect.Parameter]:
+        """As of ``Options``."""
+        declared = {setting.name: setting for setting in settings_of(cls.kind)}
+        found: list[inspect.Parameter] = []
+        for option, name in cls.options.items():
+            setting = declared[name]
+            default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
+            text = f"{_sentence(setting.text)}  [default: {default}]"
+            info = typer.Option(option, help=text, show_default=False, min=setting.low, max=setting.high)
+            found.append(_parameter(_parameter_name(option), setting.type | None, info, None))
+        listed = typer.Option("--config", help="TOML file with settings; docs/settings.md lists all.")
+        return [
+            *found,
+            _parameter("config", Path | None, listed, None),
+            _parameter("set", SetOption, typer.Option(), None),
+        ]
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """What the command line says, by names of settings.
+
+        Raises:
+            ConfigError: ``--set`` is not of the form NAME=VALUE.
+        """
+        return self._named | parse_assignments(self._assigned)
+
+    def table(self) -> dict[str, Any]:
+        """File and command line together, as a TOML file would have them.
+
+        Raises:
+            ConfigError: a file that is no TOML, or ``given`` is not.
+        """
+        data = read_toml(self.path) if self.path else {}
+        for name, value in self.given.items():
+            assign(data, name, value, "--set")
+        return data
+
+    def convert(self, kind: type[ConfigT]) -> ConfigT:
+        """The settings.
+
+        Raises:
+            ConfigError: one that is not valid.
+        """
+        return convert_config(self.table(), kind, str(self.path or "command line"))
+
+
+class MapperSettings(SettingOptions):
+    """Settings of the mapper."""
+
+    kind = MapperConfig
+    options: ClassVar = {
+        "--voxel-size": "voxel_map.voxel_size_m",
+        "--quality": "quality",
+        "--depth": "depth.source",
+        "--seed": "seed",
+    }
+
+    def load(self, defaults: Mapping[str, Any] | None = None) -> MapperConfig:
+        """The config; see ``load_mapper_config``.
+
+        Raises:
+            ConfigError: a setting that is not valid.
+        """
+        return load_mapper_config(self.path, self.given, defaults)
+
+
+class Remote(Options, frozen=True):
+    """By which a verb knows a mapper on another machine."""
+
+    server: str = ""  # name, among the peers of `semantic-mapper keys`, of the machine of a mapper with keys
+    keys: Path | None = None  # with --server: folder of the keys; without it this user's
+
+    def identity(self) -> ServerIdentity | None:
+        """Whom to expect at the other end; None where no server is named.
+
+        Raises:
+            TransportError: no keys.
+        """
+        from semantic_mapper.transport.keys import ServerIdentity, load_keys, user_key_folder
+
+        if not self.server:
+            return None
+        return ServerIdentity(load_keys(self.keys or user_key_folder()), self.server)
 
 
 def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     """Make a command of a function that returns an exit code (None = 0) and raises ``SemanticMapperError``.
 
-    A parameter whose type is an ``OptionGroup`` stands for the options of the group.
+    A parameter whose type is ``Options`` or ``SettingOptions`` stands for the options of the group; ``output`` is where
+    to print. As a ``JsonOutput`` it brings the option ``--json``.
     """
     signature = inspect.signature(function, eval_str=True)
-    groups: dict[str, tuple[type[OptionGroup], list[str]]] = {}
+    texts = comments_of_parameters(function)
+    groups: dict[str, type[Options | SettingOptions]] = {}
     parameters: list[inspect.Parameter] = []
-    for parameter in signature.parameters.values():
-        if isinstance(parameter.annotation, type) and issubclass(parameter.annotation, OptionGroup):
-            options = parameter.annotation.parameters()
-            groups[parameter.name] = parameter.annotation, [option.name for option in options]
-            parameters += options
-        else:
-            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+    for name, parameter in signature.parameters.items():
+        kind = parameter.annotation
+        if isinstance(kind, type) and issubclass(kind, Options | SettingOptions):
+            groups[name] = kind
+            parameters += kind.parameters()
+        elif name != "output":
+            make = _option if parameter.kind is inspect.Parameter.KEYWORD_ONLY else _argument
+            parameters.append(make(name, kind, parameter.default, texts.get(name, "")))
+    output = signature.parameters.get("output")
+    with_json = output is not None and output.annotation == JsonOutput
+    if with_json:
+        parameters.append(_parameter("json", JsonOption, typer.Option(), False))
 
     @functools.wraps(function)
-    def command(**kwargs: Any) -> None:
+    def command(**values: Any) -> None:
         prepare_process(verbose=Settings.verbose)
-        _check_values(kwargs)
+        _check_values(values)
         try:
-            for name, (group, options) in groups.items():
-                kwargs[name] = group(**{option: kwargs.pop(option) for option in options})
-            code = function(**kwargs)
+            for name, group in groups.items():
+                values[name] = group(**{option.name: values.pop(option.name) for option in group.parameters()})
+            if output is not None:
+                values["output"] = Output.guarded()
+                values["output"].quiet = with_json and values.pop("json")
+            code = function(**values)
         except SemanticMapperError as error:
             if Settings.verbose:
                 _log.exception("failed", error=str(error))
@@ -112,6 +251,38 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     return command
 
 
+def _option(name: str, kind: Any, default: Any, text: str) -> inspect.Parameter:
+    declared, low, high = without_bounds(kind)
+    said = "--" + name.rstrip("_").replace("_", "-")
+    if declared is bool and default:
+        said += f"/--no-{said[2:]}"
+    return _parameter(name, kind, typer.Option(said, help=_sentence(text), min=low, max=high), default)
+
+
+def _argument(name: str, kind: Any, default: Any, text: str) -> inspect.Parameter:
+    return _parameter(name, kind, typer.Argument(help=_sentence(text)), default)
+
+
+def _parameter(name: str, kind: Any, info: ParameterInfo, default: Any) -> inspect.Parameter:
+    """A parameter as Typer wants it; what its type says to Typer goes before ``info``."""
+    given = next((note for note in get_args(kind) if isinstance(note, ParameterInfo)), None)
+    if given is not None:
+        given.help = given.help or info.help
+    else:
+        declared = without_bounds(kind)[0]
+        kind = Annotated[declared | None if default is None else declared, info]
+    default = inspect.Parameter.empty if default is msgspec.NODEFAULT else default
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+
+
+def _parameter_name(option: str) -> str:
+    return option.removeprefix("--").replace("-", "_")
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
 def results_file(out: Path | None) -> Path | None:
     """The file that ``--out`` names.
 
@@ -137,20 +308,16 @@ def must_be_there(*paths: Path) -> None:
 
 
 def _check_values(options: Mapping[str, object]) -> None:
-    """Options know lower bounds only, and NaN passes these; programs that call a verb may name anything.
+    """Options know lower bounds only, and NaN passes these.
 
     Raises:
-        typer.BadParameter: a number that nothing can be computed with, or a NUL character.
+        typer.BadParameter: a number that nothing can be computed with.
     """
     for name, value in options.items():
-        hint = f"--{name.replace('_', '-')}"
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, float) and not -MAX_OPTION <= item <= MAX_OPTION:
+                hint = f"--{name.replace('_', '-')}"
                 raise typer.BadParameter(f"{item:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
-            if isinstance(item, float) and 0 < abs(item) < MIN_OPTION:
-                raise typer.BadParameter(f"{item:g}: give 0, or at least {MIN_OPTION:g}", param_hint=hint)
-            if isinstance(item, str | Path) and "\0" in str(item):
-                raise typer.BadParameter("holds a NUL character, which no name may", param_hint=hint)
 
 
 def show_error(message: str) -> None:

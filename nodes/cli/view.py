@@ -5,18 +5,17 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated
 
 import rich.live
 import typer
 
 from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import ConfigError, TransportError
-from semantic_mapper.nodes.cli.options import MaxFramesOption, Remote, WeightsOption
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, Remote, WeightsOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.running import (
+    QUERY_SOCKET,
     LaunchView,
     launch_folder,
     node_endpoints,
@@ -24,7 +23,7 @@ from semantic_mapper.nodes.launcher.running import (
     status_endpoint,
 )
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.viewer.server import WebViewer
+from semantic_mapper.nodes.viewer.server import DATA_PORT, WEB_PORT, WebViewer
 from semantic_mapper.replay.run_folder import is_log, is_map, map_path
 from semantic_mapper.transport.sockets import NewestSubscriber
 
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from semantic_mapper.nodes.viewer.sources import Live
 
-LEAST_MEMORY_MB = 64
+REFRESH_S = 2.0  # between two maps
 POLL_S = 0.2
 ANSWER_S = 5.0  # how long the launcher may take to say anything
 STATUS_REFRESH_S = 0.5
@@ -42,33 +41,18 @@ FILE_WIDTH = 140  # columns of the table where nothing says how many there are
 
 @verb
 def view(
+    output: JsonOutput,
     remote: Remote,
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="A log (.mcap, or a folder with the parts of one), a saved map (.npz, or a folder with map.npz), the "
-            "socket folder of a running launch, or where a mapper answers (tcp://...); by default the one launch that "
-            "runs here."
-        ),
-    ] = "",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the web page; 0 = any that is free.")] = 9090,
-    data_port: Annotated[
-        int, typer.Option(min=0, max=65535, hidden=True, help="Of the data that the page shows; 0 = any that is free.")
-    ] = 9876,
-    memory: Annotated[
-        int,
-        typer.Option(metavar="MB", min=LEAST_MEMORY_MB, hidden=True, help="For what is shown; then the oldest goes."),
-    ] = 512,
-    refresh: Annotated[float, typer.Option(metavar="S", min=0.2, hidden=True, help="Seconds between two maps.")] = 2.0,
-    query: Annotated[str, typer.Option(hidden=True, help="Launch: name of the mapper's `query` endpoint.")] = "query",
+    # A log (.mcap, or a folder with the parts of one), a saved map (.npz, or a folder with map.npz), the socket folder
+    # of a running launch, or where a mapper answers (tcp://...); by default the one launch that runs here
+    source: str = "",
+    *,
+    # of the web page; 0 = any that is free
+    port: Annotated[int, typer.Option(min=0, max=65535)] = WEB_PORT,
     weights: WeightsOption = None,
-    config: Annotated[Path | None, typer.Option(help="Log: TOML file with settings of the mapper.")] = None,
-    max_frames: MaxFramesOption = 0,
-    status: Annotated[
-        bool, typer.Option("--status", help="Launch: show how its nodes are, as a table in this terminal.")
-    ] = False,
-    once: Annotated[bool, typer.Option("--once", help="--status: show it once and end.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="--status --once: one JSON document instead.")] = False,
+    config: Path | None = None,  # log: TOML file with settings of the mapper
+    status: bool = False,  # launch: show how its nodes are, as a table in this terminal
+    once: bool = False,  # --status: show it once and end; also as --json
 ) -> None:
     """Show a running launch, a log or a saved map in a browser, until Ctrl-C.
 
@@ -87,47 +71,46 @@ def view(
     Example: semantic-mapper view --status
     Example: ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 robot semantic-mapper view
     """
-    if (once and not status) or (json and not once):
-        raise typer.BadParameter("goes with --status --once" if json else "goes with --status", param_hint="--once")
+    if (once and not status) or (output.quiet and not once):
+        raise typer.BadParameter("goes with --status", param_hint="--once and --json")
     if status:
-        _show_status(source, remote, once=once, json=json)
+        _show_status(output, source, remote, once=once)
         return
     path = Path(source)
     log = bool(source) and is_log(path)
-    if not log and (weights or config or max_frames):
-        raise typer.BadParameter("go with a log", param_hint="--weights, --config, --max-frames")
+    saved = map_path(path) if source and not log and is_map(path) else None
+    if not log and (weights or config):
+        raise typer.BadParameter("go with a log", param_hint="--weights and --config")
     if remote.server and "://" not in source:
         raise typer.BadParameter("goes with an endpoint such as tcp://robot:5570", param_hint="--server")
-    output = Output.guarded()
-    saved = None if log else _saved_map(path, source)
     if source and "://" not in source and not path.exists():
         other = "" if log or saved else ", and no socket folder of a launch"
         raise ConfigError(f"{path}: no such file{other}; without a name, `view` shows the one launch that runs here")
-    live = None if log or saved else _find_live(source, query, remote)
-    with StopRequest() as stop, _Page(port, data_port, memory, output) as page:
+    live = None if log or saved else _find_live(source, remote)
+    with StopRequest() as stop, _Page(port, output) as page:
         if saved is not None:
             from semantic_mapper.nodes.viewer.sources import show_saved
 
             show_saved(saved, page.begin)
         elif live is None:
-            _show_log(path, weights, config, max_frames, page, refresh, stop)
+            _show_log(path, weights, config, page, stop)
         else:
             from semantic_mapper.nodes.viewer.sources import show_live
 
-            show_live(live, page.begin, refresh, stop, output.print)
+            show_live(live, page.begin, REFRESH_S, stop, output.print)
         while not stop:
             if not page.alive:
                 raise TransportError("the process that serves the viewer has ended; start `view` again")
             time.sleep(POLL_S)
 
 
-class _Page:
-    """The page, served from when there is something to show on it; a context manager."""
+class _Page(ExitStack):
+    """The page, served from when there is something to show on it until the context ends."""
 
-    def __init__(self, port: int, data_port: int, memory_mb: int, output: Output) -> None:
-        self._settings = port, data_port, memory_mb
+    def __init__(self, port: int, output: Output) -> None:
+        super().__init__()
+        self._port = port
         self._output = output
-        self._ends = ExitStack()
         self._viewer: WebViewer | None = None
 
     @property
@@ -143,27 +126,14 @@ class _Page:
         """
         from semantic_mapper.replay.exporters.rerun_log import recording_server
 
-        self._viewer = self._ends.enter_context(WebViewer(*self._settings))
+        self._viewer = self.enter_context(WebViewer(self._port, DATA_PORT if self._port else 0))
         self._output.address("watch at", self._viewer.page_url)
         stream = recording_server(self._viewer.data_url)
-        self._ends.callback(stream.disconnect)  # before its server ends, which it would complain of at length
+        self.callback(stream.disconnect)  # before its server ends, which it would complain of at length
         return stream
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ends.close()
-
-
-def _saved_map(path: Path, source: str) -> Path | None:
-    """The file of a saved map, where the source is one."""
-    return map_path(path) if source and is_map(path) else None
-
-
-def _find_live(source: str, query: str, remote: Remote) -> Live:
+def _find_live(source: str, remote: Remote) -> Live:
     """Endpoints of a running launch, or of a mapper anywhere.
 
     Raises:
@@ -176,59 +146,40 @@ def _find_live(source: str, query: str, remote: Remote) -> Live:
         return Live(source, (), remote.identity())
     nodes = node_endpoints(folder)
     streams = sum(camera in nodes for camera in read_launch_note(folder).names("camera"))
-    return Live(f"ipc://{folder}/{query}", tuple(nodes.values()), streams=streams)
+    return Live(f"ipc://{folder}/{QUERY_SOCKET}", tuple(nodes.values()), streams=streams)
 
 
-def _show_log(
-    path: Path,
-    weights: Path | None,
-    config: Path | None,
-    max_frames: int,
-    page: _Page,
-    refresh: float,
-    stop: StopRequest,
-) -> None:
+def _show_log(path: Path, weights: Path | None, config: Path | None, page: _Page, stop: StopRequest) -> None:
     from semantic_mapper.nodes.viewer.mapped_log import show_log
 
     settings = load_mapper_config(config)
     with frame_progress("map", None) as bar:
-        show_log(path, weights, settings, max_frames, page.begin, refresh, lambda: not stop and page.alive, bar)
+        show_log(path, weights, settings, 0, page.begin, REFRESH_S, lambda: not stop and page.alive, bar)
 
 
-def _show_status(place: str, remote: Remote, *, once: bool, json: bool) -> None:
+def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> None:
     """A running launch as a table.
 
     Raises:
         TransportError: none runs here, several do, or nobody answers.
     """
-    output = Output.guarded()
     if not output.console.is_terminal:
         output.console.width = FILE_WIDTH
     endpoint = status_endpoint(place)
     view = LaunchView()
     with NewestSubscriber(endpoint, ("status",), identity=remote.identity()) as subscriber:
-        _wait_for_all(view, subscriber, endpoint)
-        if json:
-            output.json(view.to_json())
-        elif once:
-            output.print(view.table())
-        else:
-            _follow(view, subscriber, output)
-
-
-def _wait_for_all(view: LaunchView, subscriber: NewestSubscriber, endpoint: str) -> None:
-    waited = 0.0
-    while not view.complete:
-        if waited > ANSWER_S:
-            raise TransportError(f"{endpoint}: no launcher has reported its nodes for {ANSWER_S:g} s; does it run?")
-        view.listen(subscriber, STATUS_REFRESH_S)
-        waited += STATUS_REFRESH_S
-
-
-def _follow(view: LaunchView, subscriber: NewestSubscriber, output: Output) -> None:
-    with StopRequest() as stop, rich.live.Live(view.table(), console=output.console, auto_refresh=False) as live:
-        while not stop and not view.ended and view.silent_s < ANSWER_S:
+        deadline = time.monotonic() + ANSWER_S
+        while not view.complete:
+            if time.monotonic() > deadline:
+                raise TransportError(f"{endpoint}: no launcher has reported its nodes for {ANSWER_S:g} s; does it run?")
             view.listen(subscriber, STATUS_REFRESH_S)
-            live.update(view.table(), refresh=True)
-    if not stop:
-        output.print("the launch has ended" if view.ended else "the launcher says nothing any more")
+        if once:
+            output.print(view.table())
+            output.json(view.to_json())
+            return
+        with StopRequest() as stop, rich.live.Live(view.table(), console=output.console, auto_refresh=False) as live:
+            while not stop and not view.ended and view.silent_s < ANSWER_S:
+                view.listen(subscriber, STATUS_REFRESH_S)
+                live.update(view.table(), refresh=True)
+        if not stop:
+            output.print("the launch has ended" if view.ended else "the launcher says nothing any more")

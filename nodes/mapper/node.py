@@ -12,7 +12,6 @@ from msgspec import to_builtins
 
 from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.mapping.moving import KEPT_S
@@ -37,7 +36,7 @@ from semantic_mapper.nodes.publishing import PartStatus, PublicPublisher, publis
 from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.run_folder import MAP_NAME, map_path, prepare_folder
-from semantic_mapper.replay.session import MapSession, open_recording
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.keys import load_keys
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused, NodeState, Status, StreamInfo
@@ -90,8 +89,6 @@ class MapperNode:
         self._out = Path(options.out)
         self._bundle, self._resumed = _load(context, options)
         self._pipeline = self._bundle.pipeline
-        excluded = options.eval_exclude
-        self._exclude = load_checkpoint(Path(excluded)).train_stamps_ns if excluded else frozenset[int]()
 
         self._session: MapSession | None = None
         self._streams = Streams(len(options.cameras))
@@ -186,13 +183,10 @@ class MapperNode:
         if self._options.delivery == "newest":
             keep_earlier(self._context, self._out / MAP_NAME)
         clear_results(self._out)
-        rerun = Path(self._options.rerun) if self._options.rerun else None
         self._session = MapSession(
             self._bundle,
             stream_labels=info.label_set,
-            exclude_stamps=self._exclude,
             source=info.source,
-            rerun=open_recording(rerun, self._pipeline),
             own_first=not self._options.map,
         )
         if self._bundle.voxel_map.frames:

@@ -122,7 +122,7 @@ class WebViewer:
         # All three are held until all are chosen: a port that was let go may be given out again.
         with (
             _hold_port(self._ports[0], "--port") as page,
-            _hold_port(self._ports[1], "--data-port") as data,
+            _hold_port(self._ports[1], "--port") as data,
             _hold_port(0, "") as web,
         ):
             pass

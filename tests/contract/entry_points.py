@@ -58,6 +58,11 @@ def command_tree() -> Any:
     return typer.main.get_command(cli.app)
 
 
+def verb_of(name: str) -> Any:
+    """The click command of a verb."""
+    return command_tree().get_command(None, name)
+
+
 @contextmanager
 def short_folder() -> Iterator[Path]:
     """A folder for sockets, whose paths are short."""

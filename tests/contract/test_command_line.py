@@ -113,8 +113,8 @@ def _walk(command: Any, path: str, found: dict[str, Any]) -> None:
         "options": {name: entry for names, entry in parameters for name in names if entry["kind"] == "option"},
         "arguments": [entry for _, entry in parameters if entry["kind"] == "argument"],
     }
-    for name, inner in getattr(command, "commands", {}).items():
-        _walk(inner, f"{path} {name}".strip(), found)
+    for name in command.list_commands(None) if hasattr(command, "list_commands") else ():
+        _walk(command.get_command(None, name), f"{path} {name}".strip(), found)
 
 
 def _describe(parameter: Any) -> tuple[list[str], dict[str, Any]]:

@@ -7,10 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from research.train.folder_lock import LOCK_FILE, sole_use_of
-from semantic_mapper.replay.log.format import AtomicFile
 from semantic_mapper.replay.run_folder import hold_folder
 from tests.nodes.support import run_here
 
@@ -37,17 +33,6 @@ def test_no_result_is_written_through_a_link(
         assert target.read_bytes() == b"precious", arguments
     assert not (tmp_path / "made").exists()
     assert all((out / name).is_file() and not (out / name).is_symlink() for name in RESULTS)
-
-
-def test_locks_logs_and_lists_follow_no_link(tmp_path: Path) -> None:
-    target = tmp_path / "precious"
-    target.write_bytes(b"precious")
-    (tmp_path / LOCK_FILE).symlink_to(target)
-    with pytest.raises(OSError, match="link"), sole_use_of(tmp_path):
-        pass
-    (tmp_path / "log.mcap").symlink_to(target)
-    AtomicFile(tmp_path / "log.mcap", overwrite=True).close()
-    assert target.read_bytes() == b"precious" and not (tmp_path / "log.mcap").is_symlink()
 
 
 def test_a_run_removes_what_a_killed_one_left_in_its_folder(tmp_path: Path) -> None:

@@ -70,6 +70,7 @@ print("python print")
 os.write(1, b"raw write\\n")
 ctypes.CDLL(None).puts(b"c print")
 atexit.register(os.write, 1, b"at exit\\n")
+output.quiet = True
 output.json({"a": 1})
 """
     done = _python(code)

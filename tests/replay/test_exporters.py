@@ -247,7 +247,5 @@ def test_the_verb_takes_logs_and_tells_them_from_maps(log: Path, tmp_path: Path)
     (tmp_path / "run" / "map.npz").touch()
     assert not is_log(tmp_path / "run")
     told = io.StringIO()
-    export_recording(Output(told), log, tmp_path / "poses.txt", None, "", 2, [])
+    export_recording(Output(told), log, tmp_path / "poses.txt", "trajectory", "", 2)
     assert f"{tmp_path / 'poses.txt'}: 2 frames (trajectory)" in told.getvalue()
-    with pytest.raises(ConfigError, match="--color: for saved maps only"):
-        export_recording(Output(told), log, tmp_path / "x.rrd", None, "", 0, ["--color"])

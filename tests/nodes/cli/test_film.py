@@ -8,10 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer
 
-from semantic_mapper.nodes.cli.film import FilmFlags, is_film, write_film_report
-from semantic_mapper.replay.sfm.film import FilmNote, read_left_out
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.nodes.cli.importing import SourceOptions, is_film, write_film_report
 from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from tests.nodes.support import run, run_process
@@ -19,14 +18,13 @@ from tests.replay import recordings as rec
 
 
 def test_options_become_one_source_of_scale() -> None:
-    assert FilmFlags().film_options(0).scale.factor is None
-    assert FilmFlags(focal_prior=500.0, scale=1.5).film_options(1).scale.factor == 1.5
-    board = FilmFlags(square_mm=39.6).film_options(0).scale.board
+    assert SourceOptions().film_options().scale.factor is None
+    found = SourceOptions(scale=1.5, rotate="90").film_options()
+    assert found.scale.factor == 1.5 and found.quarters == 1
+    board = SourceOptions(square_mm=39.6).film_options().scale.board
     assert board is not None and board.square_m == pytest.approx(0.0396)
-    with pytest.raises(typer.BadParameter, match=r"--scale and --camera-height: .* one source"):
-        FilmFlags(scale=1.5, camera_height=1.2).film_options(0)
-    with pytest.raises(typer.BadParameter, match="--calibration and --focal-prior"):
-        FilmFlags(calibration=Path("a.toml"), focal_prior=500.0).film_options(0)
+    with pytest.raises(ConfigError, match="one source"):
+        SourceOptions(scale=1.5, camera_height=1.2).film_options()
 
 
 def test_a_folder_of_pictures_is_a_film_unless_it_is_a_recording(tmp_path: Path) -> None:
@@ -85,16 +83,6 @@ def test_options_of_films_are_refused_for_recordings(tmp_path: Path) -> None:
     folder = rec.make_folder(tmp_path / "kitchen")
     done = run("import", folder, tmp_path / "a.mcap", "--camera-height", "1.4")
     assert done.returncode == 2 and "for films" in " ".join(done.stderr.split())
-
-
-def test_a_log_keeps_how_many_frames_of_its_film_it_lacks() -> None:
-    note = FilmNote(10, {"blurred": 4, "moved too little": 3}, 4, 3, 0.6, 800.0)
-    assert read_left_out({"film.json": note.attachment()}) == 7
-    assert read_left_out({}) == 0
-
-
-def test_a_stream_is_metric_unless_it_says_otherwise() -> None:
-    assert StreamInfo("a").scale_known and not report().info.scale_known
 
 
 def test_what_is_no_film_is_refused_by_the_verb(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ import pytest
 
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.nodes.cli.labelling import page_order
 from semantic_mapper.replay.label_folder import make_label_folder
 from semantic_mapper.replay.log.sequence import open_log
 from tests.nodes.support import COMMAND, Running, error_line, run, run_here, write_log, write_weights
@@ -71,6 +70,8 @@ def test_what_is_labelled_is_not_suggested_again(log: Path, tmp_path: Path) -> N
     all_of_them = label_folder(log, tmp_path / "all", *range(6))
     assert suggested(log, "--suggest", "2", "--images", all_of_them)["frames"] == []
     assert "show all that it shows" in run("label", log, "--suggest", "2", "--images", all_of_them).stdout
+    done = run("label", log, "--suggest", "2", "--images", tmp_path / "nowhere")
+    assert done.returncode == 1 and "no such folder" in error_line(done.stderr)
 
 
 @pytest.mark.parametrize(
@@ -79,14 +80,11 @@ def test_what_is_labelled_is_not_suggested_again(log: Path, tmp_path: Path) -> N
         (("--suggest", "0"), 2, "--suggest"),
         (("--json",), 2, "goes with --suggest"),
         (("--serve", "--json"), 2, "goes with --suggest"),
-        (("--classes", "x.txt"), 2, "goes with --serve"),
-        (("--suggest", "2", "--out", "x"), 2, "goes with --serve"),
+        (("--classes", "x.txt"), 2, "go with --serve"),
+        (("--suggest", "2", "--out", "x"), 2, "go with --serve"),
         (("--weights", "x"), 2, "goes with --suggest or --serve"),
         (("--serve", "--images", "x"), 2, "goes on with what is in --out"),
-        (("--suggest", "2", "--frames", "1"), 2, "named or suggested, not both"),
-        (("--serve", "--suggest", "2", "--frames", "1"), 2, "named or suggested, not both"),
         (("--suggest", "2", "--to", "x"), 2, "nothing is sent"),
-        (("--serve", "--frames", "99", "--port", "0"), 1, "has no frame 99; it has 6"),
         (("--serve", "--classes", "none.txt"), 1, "none.txt"),
         (("--suggest", "2", "--weights", "none.safetensors"), 1, "none.safetensors"),
     ],
@@ -128,10 +126,6 @@ def test_the_page_is_served_until_it_is_stopped_and_says_what_came_of_it(log: Pa
     assert (written == 1).all()
 
 
-def test_frames_that_have_labels_stay_on_the_page() -> None:
-    assert page_order([5, 2], [7, 2, 1]) == [5, 2, 1, 7]
-
-
 def test_finetuning_learns_from_strokes_of_a_folder(log: Path, weights: Path, tmp_path: Path) -> None:
     plain = write_log(tmp_path / "plain.mcap", [dataclasses.replace(f, label=None) for f in FRAMES])
     folder = label_folder(plain, tmp_path / "labels", 1, 4, 5)
@@ -167,10 +161,5 @@ def test_label_folders_that_cannot_be_learned_from_are_refused(log: Path, weight
     done = run("finetune", log, "--labels", tmp_path / "none", *out)
     assert done.returncode == 1 and "has no label images" in error_line(done.stderr)
     done = run("finetune", log, "--kind", "grid", "--labels", one, "--out", tmp_path / "w.safetensors")
-    assert done.returncode == 2 and "learns no classes" in done.stderr
+    assert done.returncode == 2 and "learns from no keyframes" in done.stderr
     assert not (tmp_path / "w.safetensors").exists()
-
-
-def test_a_folder_of_labels_that_is_not_there_is_refused(log: Path, tmp_path: Path) -> None:
-    done = run("label", log, "--suggest", "2", "--images", tmp_path / "nowhere")
-    assert done.returncode == 1 and "no such folder" in error_line(done.stderr)

@@ -8,16 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.replay.importers.run import FORMATS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_voxel_map import fuse_sphere
-from tests.nodes.support import error_line, run
+from tests.nodes.support import run
 from tests.small import INTRINSICS, tiny_frames
 
 
@@ -41,15 +39,6 @@ def _write_sequence(folder: Path, frames: tuple[PosedFrame, ...]) -> Path:
     return folder
 
 
-def test_info_as_json_names_the_log_as_it_is_called(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (name := Path("run:2026-11-27@lab.mcap")).symlink_to(log)
-    done = run("info", name, "--json")
-    found = json.loads(done.stdout)
-    assert done.returncode == 0, done.stderr
-    assert (found["log"], found["parts"]) == (str(name), [str(name)])
-
-
 def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(tmp_path: Path) -> None:
     source = _write_sequence(tmp_path / "sequence", tiny_frames(4))
     poses = (source / "poses.txt").read_text().splitlines()
@@ -65,14 +54,6 @@ def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(tmp_path: P
     assert found["frames"] == found["frames_with_depth"] == found["frames_with_labels"] == 3
     assert found["cameras"]["camera"]["width"] == 96
     assert found["damage"] == []
-
-
-def test_what_is_no_recording_is_refused_by_name(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    done = run("import", tmp_path / "empty", tmp_path / "out.mcap")
-    assert done.returncode == 1
-    assert "empty" in error_line(done.stderr)
-    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_info_shows_topics_frames_and_classes(log: Path) -> None:
@@ -126,16 +107,6 @@ def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
     assert found["config"]["voxel_size_m"] == 0.03 and found["size_bytes"] == path.stat().st_size
 
 
-def test_info_of_a_damaged_map_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "map.npz"
-    small_map().save(path)
-    assert "blocks" in run("info", path).stdout
-    path.write_bytes(path.read_bytes()[:-1])
-    done = run("info", path)
-    assert done.returncode == 1
-    assert "map.npz: damaged: it is cut off" in error_line(done.stderr)
-
-
 def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> None:
     content = bytearray(log.read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -151,18 +122,3 @@ def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> Non
     found = json.loads(run("info", clean, "--json").stdout)
     assert 3 <= found["frames"] <= 5
     assert found["damage"] == [] and found["finished"]
-
-
-def test_recover_never_writes_over_a_log(log: Path, tmp_path: Path) -> None:
-    taken = tmp_path / "taken.mcap"
-    taken.write_text("mine")
-    done = run("import", log, taken)
-    assert done.returncode == 1
-    assert "taken.mcap: exists already" in error_line(done.stderr)
-    assert taken.read_text() == "mine"
-
-
-def test_every_format_can_be_named(tmp_path: Path) -> None:
-    for name in FORMATS:
-        done = run("import", tmp_path / "missing", tmp_path / "log.mcap", "--format", name)
-        assert done.returncode == 1 and "missing" in error_line(done.stderr), name

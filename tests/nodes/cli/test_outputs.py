@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.replay.run_folder import free_name, hold_folder
+from semantic_mapper.replay.run_folder import hold_folder
 from tests.nodes.support import REPLAY_LAUNCH, error_line, run, run_here
 
 
@@ -39,10 +39,3 @@ def test_a_stopped_run_keeps_what_it_has_written(tmp_path: Path) -> None:
         (tmp_path / "out" / "map.npz").touch()
         (tmp_path / "out" / "map.npz").touch(exist_ok=False)
     assert (tmp_path / "out" / "map.npz").exists()
-
-
-def test_a_free_name_is_one_where_nothing_is(tmp_path: Path) -> None:
-    assert free_name(tmp_path / "map.npz") == tmp_path / "map.npz"
-    for name in ("map.npz", "map-1.npz"):
-        (tmp_path / name).touch()
-    assert free_name(tmp_path / "map.npz") == tmp_path / "map-2.npz"

@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
 
 import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.config import load_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
-from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.nodes.cli.finetune import finetune_lines
-from semantic_mapper.nodes.console import frame_progress
-from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.boxes import load_boxes
 from semantic_mapper.replay.finetune_log import FrameSource, choose_frames, match_boxes, open_pseudo_labels
-from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.replay.job_monitor import JobMonitor
-from semantic_mapper.replay.jobs import AutolabelRequest, FinetuneRequest, FinetuneResult, autolabel_log, finetune_log
+from semantic_mapper.replay.jobs import AutolabelRequest, FinetuneRequest, autolabel_log
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.config import FinetuneConfig
 from tests.nodes.cli.test_autolabel import StopsAfter
 from tests.nodes.support import error_line, run
-from tests.replay.test_boxes import kitti_xml
 from tests.small import tiny_frames
 
 BOXED, MOVING = 9, 10  # ids of boxes
@@ -85,7 +75,6 @@ def test_boxes_become_labels_and_things_that_never_score(
 ) -> None:
     (out, said), new = fitted, tmp_path / "labelled.mcap"
     assert "1 of 1 boxes seen" in said and "own label images) of 6 of 6 frames" in said
-    assert "1 boxes that move, with grids of their own" in said
     assert "boxes left out: 1 that no frame sees" in said, "of the one that moves later, no frame is of its time"
     checkpoint = load_checkpoint(out)
     assert checkpoint.train_stamps_ns == {f.stamp_ns for f in tiny_frames(6)}  # their labels are true ones
@@ -132,32 +121,6 @@ def test_a_stop_leaves_no_images_of_things(log: Path, fitted: tuple[Path, str], 
         )
 
 
-def test_ctrl_c_while_geometry_is_fitted_leaves_what_the_boxes_say(
-    log: Path, boxes: Path, settings: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "w.safetensors"
-    config = load_config(settings, FinetuneConfig)
-    request = FinetuneRequest(log, out, config=config, kind="panoptic", boxes=boxes)
-
-    def fit_and_press_at(note: str, stop: StopRequest) -> FinetuneResult:
-        def set_and_press(done: int, said: str = "") -> None:
-            if said.startswith(note):
-                os.kill(os.getpid(), signal.SIGINT)
-
-        with frame_progress("fit", None, stop=stop) as bar, patch.object(bar, "set", set_and_press):
-            return finetune_log(request, bar)
-
-    with StopRequest() as stop, pytest.raises(KeyboardInterrupt):
-        fit_and_press_at("reading", stop)
-    assert not out.exists()
-    with StopRequest() as stop:
-        result = fit_and_press_at("step 3", stop)
-    checkpoint = result.checkpoint
-    assert (checkpoint.recipe["grid_steps"], checkpoint.recipe["steps"]) == (3, 0)
-    assert "those of the boxes alone" in " ".join(finetune_lines(result, request))
-    assert load_checkpoint(out).model.config.classes == "fixed"
-
-
 def test_frames_with_labels_go_before_others() -> None:
     assert choose_frames(10, 4, None) == choose_frames(10, 4, frozenset(range(10))) == [0, 3, 6, 9]
     assert choose_frames(10, 4, frozenset((1, 2, 3))) == [0, 1, 2, 3]
@@ -180,69 +143,13 @@ def test_boxes_by_frame_of_a_drive_are_refused_for_another_log(log: Path, boxes:
     assert done.returncode == 1 and "give the log that `import` made of the drive" in error_line(done.stderr)
 
 
-def write_drive(root: Path, boxes: Path) -> Path:
-    """The frames of the log as a drive of KITTI-360 with scans and labels, the boxed thing a truck, all else building;
-    and XML: this truck, two that move, one of them at a frame that is not in the drive, and a lamp out of view."""
-    drive, camera = "2013_05_28_drive_0000_sync", "image_00"
-    still = json.loads(boxes.read_text())["boxes"][0]
-    thing = ROOMS.id_of(still["class"])
-    files: dict[str, str] = {}
-    for number, frame in enumerate(tiny_frames(6)):
-        k, name = frame.intrinsics, f"{100 + number:010d}"
-        assert frame.label is not None and frame.depth_m is not None
-        points = unproject(frame.depth_m, k)[frame.depth_m > 0]
-        label = np.where(frame.label == thing, LABELS.id_of("truck"), LABELS.id_of("building")).astype(np.uint8)
-        for folder, image in (
-            (f"data_2d_raw/{drive}/{camera}/data_rect", frame.rgb[..., ::-1]),
-            (f"data_2d_semantics/train/{drive}/{camera}/semantic", label),
-        ):
-            (root / folder).mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(root / folder / f"{name}.png"), image)
-        scans = root / f"data_3d_raw/{drive}/velodyne_points/data"
-        scans.mkdir(parents=True, exist_ok=True)
-        ahead_left_up = np.stack((points[:, 2], -points[:, 0], -points[:, 1], np.ones(len(points))), axis=1)
-        ahead_left_up.astype("<f4").tofile(scans / f"{name}.bin")
-        rows = f"P_rect_00: {k.fx} 0 {k.cx} 0 0 {k.fy} {k.cy} 0 0 0 1 0\nS_rect_00: {k.width} {k.height}\n"
-        files["calibration/perspective.txt"] = f"{rows}R_rect_00: 1 0 0 0 1 0 0 0 1\n"
-        row = " ".join(map(str, (100 + number, *frame.T_world_camera.ravel())))
-        files["poses"] = files.get("poses", "") + row + "\n"
-    files[f"data_poses/{drive}/cam0_to_world.txt"] = files.pop("poses")
-    files["calibration/calib_cam_to_velo.txt"] = "0 0 1 0 -1 0 0 0 0 -1 0 0\n"
-    T = np.array(still["T_world_box"])
-    T[:3, :3] = np.diag(still["size"])
-    far = T + np.array([[0, 0, 0, 5000.0]] + 3 * [[0, 0, 0, 0]])
-    objects = ((8, "truck", -1, T), (9, "truck", 100 + WHEN, T), (10, "truck", 4000, T), (11, "lamp", -1, far))
-    files["boxes.xml"] = kitti_xml(*objects)
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-    return root / "boxes.xml"
-
-
-def test_a_drive_of_kitti360_and_its_boxes_are_used_as_they_are(boxes: Path, settings: Path, tmp_path: Path) -> None:
-    xml, log, out = write_drive(tmp_path / "drive", boxes), tmp_path / "drive.mcap", tmp_path / "w.safetensors"
-    done = run("import", tmp_path / "drive", log)
-    assert done.returncode == 0, done.stderr
-    arguments = ("--kind", "panoptic", "--boxes", xml, "--steps", "10", "--seconds", "0", "--config", settings)
-    done = run("finetune", log, *arguments, "--out", out)
-    assert done.returncode == 0, done.stderr
-    said = " ".join(done.stdout.split())
-    assert "1 of 1 boxes seen" in said and "own label images) of 6 of 6 frames" in said
-    assert "1 boxes that move" in said and "left out: 1 that no frame sees; 1 that move, which no frame shows" in said
-    field = load_checkpoint(out).model
-    assert isinstance(field, Panoptic) and {(b.id, b.class_name) for b in field.shape.boxes} == {
-        (9, "truck"),
-        (10, "truck"),
-    }
-
-
 def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights: Path, tmp_path: Path) -> None:
     out = tmp_path / "w.safetensors"
     for arguments, said in (
         (("--kind", "panoptic"), "--kind panoptic and --boxes FILE go together"),
         (("--boxes", boxes, "--keyframes", "2"), "--kind panoptic and --boxes FILE go together"),
-        (("--kind", "panoptic", "--boxes", boxes, "--keyframes", "2"), "give them with --pseudo"),
-        (("--keyframes", "2", "--uncovered", "empty"), "goes with --kind panoptic only"),
+        (("--kind", "panoptic", "--boxes", boxes, "--keyframes", "2"), "panoptic learns from no keyframes"),
+        (("--keyframes", "2", "--pseudo", "rooms"), "goes with --kind panoptic only"),
     ):
         done = run("finetune", log, *arguments, "--out", out)
         assert done.returncode == 2 and said in " ".join(done.stderr.split())

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.query import Question, Request, ask_file, ask_mapper
+from semantic_mapper.nodes.cli.query import SavedMap, answer
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import eventually, run, run_here
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
-from tests.queries.test_measured import part_measured
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +40,8 @@ def test_info(map_file: Path) -> None:
 
 
 def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
-    info = Request(Question.INFO)
-    assert ask_file(str(map_file.parent), info) == ask_file(str(map_file), info)
+    folder, file = SavedMap(str(map_file.parent)), SavedMap(str(map_file))
+    assert answer(folder, "info") == answer(file, "info")
     code, said = run_here("info", map_file.parent)
     assert code == 0 and "blocks" in said
     code, said = run_here("query", map_file.parent, "correct", map_file)
@@ -60,31 +58,6 @@ def test_at_points_below_zero_too(map_file: Path) -> None:
     assert found["state"] == "occupied" and "table" in shown
     found, _ = ask(map_file, "at", "-1e1", "-2", ".5")
     assert (found["class"], found["state"], found["surface_distance_m"]) == (None, "unknown", None)
-
-
-def test_at_a_surface_that_the_map_is_unsure_of(map_file: Path, tmp_path: Path) -> None:
-    strict = VoxelMap(replace(whole_map().config, unknown_below=1.0), whole_map().label_set)
-    strict.merged(whole_map(), np.eye(4)).save(tmp_path / "map.npz")
-    point = BOX + np.array([0.0, 0.0, HALF[2]])
-    found, shown = ask(tmp_path / "map.npz", "at", *point)
-    sure, _ = ask(map_file, "at", *point)
-    assert found["class"] is None and found["surface_distance_m"] is not None and "unknown" in shown
-    assert found["confidence"] == sure["confidence"]
-    info, _ = ask(tmp_path / "map.npz", "info")
-    assert info["without_class"] == info["surface_voxels"] > 1000
-    assert ask(tmp_path / "map.npz", "nearest", "table", *point)[0]["found"] is False
-
-
-def test_answers_tell_computed_from_measured(tmp_path: Path) -> None:
-    part_measured().save(tmp_path / "map.npz")
-    assert 0.5 < ask(tmp_path / "map.npz", "info")[0]["computed"] < 1
-    for name, measured in (("table", False), ("cup", True)):
-        found, shown = ask(tmp_path / "map.npz", "nearest", name, *BALL)
-        assert found["measured"] is measured and "measured" in shown
-        assert ask(tmp_path / "map.npz", "at", *found["xyz"])[0]["measured"] is measured
-    found, shown = ask(tmp_path / "map.npz", "instances")
-    fraction = {thing["class"]: thing["measured"] for thing in found["instances"]}
-    assert fraction["cup"] > 0.9 and fraction["table"] < 0.1 and "measured" in shown
 
 
 def test_nearest(map_file: Path) -> None:
@@ -113,14 +86,15 @@ def test_instances_of_a_saved_map_stand_as_its_floor_says(tmp_path: Path) -> Non
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # z becomes x
     VoxelMap(plain.config, plain.label_set).merged(plain, T).save(tmp_path / "map.npz")
-    found = ask_file(str(tmp_path), Request(Question.INSTANCES))
+    found = answer(SavedMap(str(tmp_path)), "instances")
     np.testing.assert_allclose(found["up"], (1, 0, 0), atol=0.02)
     assert {thing["class"] for thing in found["instances"] if thing["voxels"] > 200} == {"table", "cup"}
 
 
 def answers(endpoint: str) -> bool:
     try:
-        ask_mapper(endpoint, Request(Question.INFO, "", ()))
+        with MapClient(endpoint) as client:
+            answer(client, "info")
     except TransportError:
         return False
     return True
@@ -130,14 +104,14 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
     with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
         assert eventually(lambda: answers(service.endpoint), 120), "no answer, not even once kernels are compiled"
         for question, name, point in (
-            (Question.INFO, "", ()),
-            (Question.AT, "", (*BOX[:2], 0.4)),
-            (Question.NEAREST, "cup", (0.0, 0.0, 1.0)),
-            (Question.NEAREST, "lamp", (0.0, 0.0, 1.0)),
-            (Question.INSTANCES, "", ()),
+            ("info", "", ()),
+            ("at", "", (*BOX[:2], 0.4)),
+            ("nearest", "cup", (0.0, 0.0, 1.0)),
+            ("nearest", "lamp", (0.0, 0.0, 1.0)),
+            ("instances", "", ()),
         ):
-            asked = Request(question, name, point)
-            assert ask_mapper(service.endpoint, asked) == ask_file(str(map_file), asked)
+            with MapClient(service.endpoint) as client:
+                assert answer(client, question, name, point) == answer(SavedMap(str(map_file)), question, name, point)
         done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--out", folder / "live.json")
         assert done.returncode == 0 and "cup" in done.stdout, done.stderr
         assert json.loads((folder / "live.json").read_text())["map"] == service.endpoint
@@ -174,10 +148,3 @@ def test_a_map_without_a_floor_has_no_picture_of_its_graph(map_file: Path, tmp_p
     code, said = run_here("query", map_file, "graph", "--up", "1", "0", "0", "--picture", tmp_path / "rooms.png")
     assert code == 1 and "there is nothing to draw: no floor was found" in said
     assert not (tmp_path / "rooms.png").exists()
-
-
-def test_graph_of_a_running_mapper_keeps_its_ids() -> None:
-    with a_folder() as folder, answering(f"ipc://{folder}/query", whole_map()), MapClient(f"ipc://{folder}/query") as c:
-        first, again = c.graph(), c.graph()
-        assert [room.id for room in first.rooms] == [room.id for room in again.rooms] == [1]
-        assert first.room_of == again.room_of and [t.id for t in first.things] == [t.id for t in c.instances()]

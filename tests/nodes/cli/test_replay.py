@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semantic_mapper.types import CameraIntrinsics
 from tests.nodes.support import Running, error_line, repeated_frames, run, write_log, write_weights
 from tests.small import tiny_frames
 
@@ -37,28 +36,12 @@ def test_missing_weights_are_named(log: Path, tmp_path: Path) -> None:
     assert done.stdout == ""
 
 
-def test_missing_and_foreign_logs_are_named(tmp_path: Path) -> None:
-    for name, content in (("gone.mcap", None), ("noise.mcap", b"\x89 no log" * 999)):
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        done = run("replay", tmp_path / name, "--out", tmp_path / "out")
-        assert done.returncode == 1
-        assert name in error_line(done.stderr)
-
-
 def test_unknown_setting_is_named_with_the_nearest(log: Path, tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.toml"
     wrong.write_text("[voxel_map]\nvoxel_sise_m = 0.05\n")
     done = run("replay", log, "--out", tmp_path / "out", "--config", wrong)
     assert done.returncode == 1
     assert "did you mean `voxel_size_m`?" in error_line(done.stderr)
-
-
-def test_folder_that_cannot_be_made_is_named(log: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    done = run("replay", log, "--out", tmp_path / "file" / "out")
-    assert done.returncode == 1
-    assert "cannot hold the results" in error_line(done.stderr)
 
 
 def test_impossible_and_damaged_frames_are_named_and_the_rest_is_mapped(
@@ -68,14 +51,6 @@ def test_impossible_and_damaged_frames_are_named_and_the_rest_is_mapped(
     skewed = frames[1].T_world_camera.copy()
     skewed[:3, :3] *= 1.5
     frames[1] = dataclasses.replace(frames[1], T_world_camera=skewed)
-    small = CameraIntrinsics(33.0, 33.0, 23.5, 17.5, 48, 36)
-    frames[2] = dataclasses.replace(
-        frames[2],
-        rgb=np.ascontiguousarray(frames[2].rgb[::2, ::2]),
-        depth_m=None,
-        label=None,
-        intrinsics=small,
-    )
     assert frames[3].label is not None
     strange = frames[3].label.copy()
     strange[0, 0] = 200
@@ -88,29 +63,13 @@ def test_impossible_and_damaged_frames_are_named_and_the_rest_is_mapped(
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary["frames"]["published"] == 6
-    assert summary["frames"]["fused"] == 3
+    assert summary["frames"]["fused"] == 4
     reasons = [r["reason"] for r in summary["refusals"]]
     assert "frame seq=1" in reasons[0] and "rotation" in reasons[0]
-    assert "frame seq=2" in reasons[1] and "48x36" in reasons[1] and "96x72" in reasons[1]
-    assert "frame seq=3" in reasons[2] and "200" in reasons[2]  # mapped, not scored
-    assert "mixed.mcap" in reasons[3] and "frame 5" in reasons[3]
+    assert "frame seq=3" in reasons[1] and "200" in reasons[1]  # mapped, not scored
+    assert "mixed.mcap" in reasons[2] and "frame 5" in reasons[2]
     for reason in reasons:
         assert reason.removeprefix("mapped, but not scored: ")[:40] in done.stderr
-
-
-def test_a_frame_whose_intrinsics_do_not_fit_is_refused_and_the_rest_is_mapped(
-    tmp_path: Path, weights: Path, config: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames = list(tiny_frames(3))
-    with monkeypatch.context() as patch:
-        patch.setattr("semantic_mapper.types._check_lens", lambda k: None)  # as written before intrinsics were checked
-        frames[1] = dataclasses.replace(frames[1], intrinsics=dataclasses.replace(frames[1].intrinsics, cy=1e19))
-        log = write_log(tmp_path / "wild.mcap", frames)
-    done = run("replay", log, "--out", tmp_path / "out", "--weights", weights, "--config", config, "--json")
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
-    assert (summary["frames"]["published"], summary["frames"]["fused"], summary["frames"]["refused"]) == (3, 2, 1)
-    assert "cy=1e+19" in summary["refusals"][0]["reason"]
 
 
 @pytest.mark.slow
@@ -127,15 +86,11 @@ def test_interrupted_replay_still_writes_the_map_so_far(tmp_path: Path, weights:
     assert (out / "map.ply").exists()
 
 
-@pytest.mark.parametrize("how", ["--weights", "--eval-exclude"])
-def test_frames_that_weights_were_finetuned_on_are_never_scored(
-    how: str, log: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
+def test_frames_that_weights_were_finetuned_on_are_never_scored(log: Path, config: Path, tmp_path: Path) -> None:
     stamps = [f.stamp_ns for f in tiny_frames(6)[:2]]
     tuned = write_weights(tmp_path / "tuned.safetensors", stamps)
-    chosen = () if how == "--weights" else ("--weights", weights)
-    arguments = ("replay", log, "--out", tmp_path / "out", how, tuned, *chosen, "--config", config, "--max-frames", "3")
-    done = run(*arguments)
+    options = ("--weights", tuned, "--config", config, "--max-frames", "3")
+    done = run("replay", log, "--out", tmp_path / "out", *options)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["frames"]["fused"] == 3

@@ -276,11 +276,14 @@ def test_a_round_that_gets_no_processor_holds_up_neither_messages_nor_the_end(
 
 
 def test_a_mapper_learns_while_it_maps_from_what_the_command_line_labels(start: Path, tmp_path: Path) -> None:
-    log = write_log(tmp_path / "room.mcap", FRAMES)
+    log, images = write_log(tmp_path / "room.mcap", FRAMES), tmp_path / "images"
+    images.mkdir()
+    for number in (4, 5, 6, 7):
+        cv2.imwrite(str(images / f"{number:06d}.png"), FRAMES[number].label)
     with running_robot(start, tmp_path / "out", 0, learner="finetuner") as robot:
         with finetuning(start, robot.endpoints) as heard:
             robot.send(list(FRAMES[:2]))
-            code, text = run_here("label", log, "--frames", "4,5,6,7", "--to", robot.endpoints["labels"])
+            code, text = run_here("label", log, "--images", images, "--to", robot.endpoints["labels"])
             assert code == 0 and "4 labelled keyframes sent: frames 4, 5, 6, 7 of room.mcap" in text, text
             assert eventually(lambda: robot.status[-1].counters.get("weights_version") == 1)
             assert eventually(lambda: heard.counters().get("taken") == 1)

@@ -182,7 +182,7 @@ def test_foxglove_is_one_more_listener_and_queries_the_mapper() -> None:
         ([], ('name = "brain"', 'name = "launch"'), "the launcher's own"),
         ([], ("[[node]]", "heartbeat_s = 0.2\n[[node]]"), "heartbeat_s"),
         ([], ("[[node]]", "x = " + "[" * 20000 + "\n[[node]]"), "not valid TOML"),
-        ([], ('mode = "realtime"', "subscriber_timeout_s = nan"), "options.subscriber_timeout_s = nan"),
+        ([], ('mode = "realtime"', "ack_timeout_s = nan"), "options.ack_timeout_s = nan"),
         (["eye.rate=" + "9" * 4094], ("", ""), "rate = a number of"),
         (["eye.log=a\udcff"], ("", ""), "log is not UTF-8"),
         ([], ('out = "{out}/map"', 'out = "a\\u0000"'), "out holds a NUL character"),

@@ -99,7 +99,7 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
         "tcp://10.1.2.3:5570": "without keys",
     }
     for source, reason in words.items():
-        done = run("view", source, "--port", "0", "--data-port", "0")
+        done = run("view", source, "--port", "0")
         assert done.returncode == 1 and reason in error_line(done.stderr)
         assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
 
