@@ -153,15 +153,11 @@ def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, Packed
 
 
 def oldest_first(versions: Int64, limit: int, newest: int) -> tuple[Int64, int]:
-    """Which of the changed blocks come first: whole versions, at least one, and else at most ``limit`` blocks.
-
-    Args:
-        versions: (B,) when each block last changed.
-        limit: 0 = all.
-        newest: Version of the map.
+    """Which of the changed blocks (B,) come first: whole versions, at least one, and else at most ``limit`` blocks (0
+    = all).
 
     Returns:
-        Positions of the blocks in ``versions``, ascending, and the version that they complete.
+        Their positions, ascending, and the version that they complete; ``newest`` is the map's.
     """
     if not limit or len(versions) <= limit:
         return np.arange(len(versions)), newest

@@ -127,13 +127,8 @@ def _between(a: Float64, b: Float64, fraction: float, T_world_camera: Float64) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedFrame:
-    """What fusing a frame once more needs.
-
-    Args:
-        frame: With the pose that it was fused at, without the depth that was left out; its label image is not kept.
-        probabilities: (h, w, L) float32 rendered class probabilities, before they are upsampled.
-        known: (h, w) bool.
-        rendered_depth_m: (h, w) float32; looked at only where the frame has no depth.
+    """What fusing a frame once more needs: the frame at the pose that it was fused at, without the depth that was left
+    out, and the rendered view (h, w) before it was upsampled; its depth is looked at only where the frame has none.
     """
 
     frame: PosedFrame

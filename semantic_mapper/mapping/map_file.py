@@ -97,10 +97,7 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """What is known of a saved map without reading its blocks.
 
     Args:
-        format, version: Of the file.
-        config, label_set: Of the map.
-        frames: Frames fused so far.
-        last_stamp_ns: Stamp of the last of them, 0 before the first.
+        frames, last_stamp_ns: Frames fused so far, and stamp of the last of them, 0 before the first.
         blocks: Blocks of 8^3 voxels.
         bounds_m: Lowest and highest corner of all blocks, metres in the world; None of an empty map.
         chunks: In the order of the file.
@@ -166,16 +163,13 @@ def write_map(
     parts: Iterable[BlockPart],
     places: Sequence[Place] = (),
 ) -> MapManifest:
-    """Write a map, replacing a file of that name in one step.
+    """Write a map, replacing a file of that name in one step; returns the manifest as written.
 
     Args:
         path: The file.
         manifest: Its settings, classes and counters; what depends on the blocks is filled in here.
         parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
         places: What the map is found again by.
-
-    Returns:
-        The manifest as written.
 
     Raises:
         MapError: the file cannot be written; one that was there before is untouched.

@@ -120,11 +120,7 @@ def add_values(target: BlockGrid, packed: Int64, added: BlockValues, cap: float,
 
 
 def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
-    """Make ``target``, which is empty, hold what ``source`` has measured.
-
-    Args:
-        target, source: Grids of the same classes.
-        version: That the blocks are marked as changed at.
+    """Make ``target``, which is empty and of the same classes, hold what ``source`` has measured, as of ``version``.
 
     Raises:
         MapError: the target has no room.

@@ -54,15 +54,7 @@ T = TypeVar("T")
 
 
 class _FullSize(NamedTuple):
-    """A rendered view at the size of its frame.
-
-    Args:
-        views: The frame, without what moves.
-        depth_m: (H, W) to fuse.
-        rows: (H, W) which coarse pixel each pixel takes its probabilities from, -1 = unknown.
-        trust: (H, W) in depth; None = full.
-        moving: (H, W) what was left out because it moves; None = nothing was looked for.
-    """
+    """A rendered view at the size (H, W) of its frame."""
 
     views: FrameViews
     depth_m: Float32
@@ -165,20 +157,18 @@ class MappingPipeline:
         return self.frame_depth.finish()
 
     def render_virtual_views(self, views: int = 1) -> tuple[VirtualView, ...]:
-        """Render the map from where no camera stood, the views of most gain, and fuse what they say of classes.
+        """Render the map from where no camera stood, at most so many views of most gain, and fuse what they say of
+        classes.
 
         For when there is time to spare; every view takes about that of a frame. Nothing is measured: TSDF, colours and
-        ``frames`` stay as they are. Deterministic, as part of the sequence of steps and virtual views.
-
-        The history keeps frames alone: a correction of poses rebuilds the map without the votes of these views, and
-        all may be looked at again.
-
-        Args:
-            views: At most this many.
+        ``frames`` stay as they are. Deterministic, as part of the sequence of steps and virtual views. The history
+        keeps frames alone: a correction of poses rebuilds the map without the votes of these views, and all may be
+            looked at again.
 
         Returns:
             What was rendered, empty where no view is worth its time: no frame mapped yet, too few keyframes, or all
-            that they see is clear or was looked at.
+                that they
+            see is clear or was looked at.
         """
         rendered: list[VirtualView] = []
         with self.corrector.lock:
@@ -198,9 +188,8 @@ class MappingPipeline:
     def exchange_field(self, field: SemanticField, anchors: Sequence[Keyframe]) -> None:
         """Go on with other weights. What is in the map stays, with the weight that it has.
 
-        Args:
-            field: Encodes as the present one does (``fields.learned.encode_alike``): keyframes keep their features.
-            anchors: Of ``encode_anchor``; they take the place of those of the weights before.
+        The field encodes as the present one does (``fields.learned.encode_alike``): keyframes keep their features.
+        Anchors of ``encode_anchor`` take the place of those of the weights before.
 
         Raises:
             WeightsError: it renders other classes than the map holds; nothing has changed.
@@ -210,12 +199,10 @@ class MappingPipeline:
         self.keyframes.exchange_labelled(anchors)
 
     def agreement(self, frame: PosedFrame, renderer: ViewRenderer, keyframes: KeyframeStore) -> tuple[int, int]:
-        """How far another field agrees with the map where that is sure of itself. Changes nothing.
+        """How far another field, which encodes as the present one does, agrees with the map where that is sure of
+        itself.
 
-        Args:
-            frame: One that was mapped.
-            renderer: Of a field that encodes as the present one does.
-            keyframes: It renders from these and, where the config says so, the frame itself.
+        Changes nothing. It renders a mapped frame from ``keyframes`` and, where the config says so, the frame itself.
 
         Returns:
             Pixels of the coarse view that it names as the map does, and those that are compared.

@@ -89,12 +89,9 @@ class ViewRenderer:
         computed: bool = False,
         stamp_ns: int | None = None,
     ) -> RenderedView:
-        """Render one view.
+        """Render one view, (h, w), from sources at a pose (4, 4).
 
         Args:
-            sources: Views to render from.
-            intrinsics: Of the view, (h, w).
-            T_world_camera: (4, 4).
             prior_m: (h, w) float32 depth prior, 0 = none.
             rgb: (h, w, 3) uint8 colours of the view.
             measured: (h, w), where the prior is not filled in; None = wherever there is one.

@@ -420,18 +420,14 @@ class VoxelMap:
         return joined
 
     def add(self, other: VoxelMap, T_self_other: Float64) -> None:
-        """Add all that another map has measured; see ``merge``.
+        """Add all that another map, which lies at ``T_self_other`` (4, 4) in this one, has measured; see ``merge``.
 
         Where voxels coincide (no rotation but quarter turns, a shift by whole voxels) measurements add up exactly;
         else those of ``other`` are interpolated. After an error of the disk the map holds a part of ``other``.
 
-        Args:
-            other: Of the same voxel size, truncation and classes; is read.
-            T_self_other: (4, 4) float64, where its frame lies in this map's.
-
         Raises:
-            MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or this one
-                would grow past ``max_blocks``.
+            MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or this
+                one would grow past ``max_blocks``.
             PoseError: the pose is not a rigid transform.
         """
         check_pose(T_self_other, "merge")

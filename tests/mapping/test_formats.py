@@ -12,7 +12,7 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
-from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.floor_plan import find_up
 from semantic_mapper.mapping.formats import (
     colored,
@@ -159,20 +159,6 @@ def test_points_and_meshes_say_what_was_measured_where_something_was_computed(tm
             write_ply(tmp_path / "map.ply", replace(surface, measured=measured), LABELS)
             point = load_open3d().t.io.read_point_cloud(str(tmp_path / "map.ply")).point
             assert ("measured" in point) == said and (not said or (point["measured"].numpy().ravel() == some).all())
-
-
-@pytest.mark.parametrize("name", ["Tür", "a\nend_header", "a\r\x00\x1b[31m", "back\\slash", "椅" * 128])
-def test_any_class_name_is_one_readable_comment_of_a_ply(tmp_path: Path, name: str) -> None:
-    """Open3D ends the process at lines of more than 1,000 characters."""
-    write_ply(tmp_path / "map.ply", POINTS, LabelSet("odd", (7, 9), (name, "table"), ((1, 2, 3), (4, 5, 6))))
-    header = (tmp_path / "map.ply").read_bytes().split(b"\nend_header\n")[0].decode("ascii").split("\n")
-    assert all(line.isprintable() for line in header)
-    number, text = header[2].removeprefix("comment label ").split(" ", 1)
-    assert number == "7" and header[3] == "comment label 9 table"
-    shown = text.encode().decode("unicode_escape")
-    assert name.startswith(shown) and (shown == name or 190 < len(text) <= 200)
-    cloud = load_open3d().t.io.read_point_cloud(str(tmp_path / "map.ply"))
-    assert (cloud.point["label"].numpy().ravel() == POINTS.label).all()
 
 
 def test_colours_and_confidence_choose_what_is_seen() -> None:

@@ -42,21 +42,6 @@ def random_weights(label_set: LabelSet = ROOMS, spread: float = 0.5) -> NesfWeig
     return NesfWeights(model, {}, "ab" * 32)
 
 
-def untrained(label_set: LabelSet = ROOMS) -> NesfWeights:
-    return NesfWeights(Nesf(label_set, NesfConfig(width=2)).eval(), {}, "cd" * 32)
-
-
-def test_untrained_weights_leave_the_map_as_it_is() -> None:
-    voxel_map = make_map()
-    before = voxel_map.points()
-    report = refine(voxel_map, untrained(), up=UP)
-    after = voxel_map.points()
-    assert report.relabelled == report.filled == 0
-    assert report.surface > 1000
-    assert (after.label == before.label).mean() > 0.999
-    np.testing.assert_allclose(after.confidence, before.confidence, atol=1e-5)
-
-
 def test_geometry_and_colour_stay_bit_for_bit_and_evidence_does_not() -> None:
     voxel_map = make_map()
     before = voxel_map.block_state()

@@ -85,27 +85,6 @@ def test_tsdf_and_colour_equal_open3ds_own_integrate(shape: str) -> None:
         assert difference.max() < 0.05 and np.quantile(np.abs(mine["color"] - color)[both], 0.999) < 0.01
 
 
-def test_one_vote_a_voxel_a_frame_near_the_surface_where_known() -> None:
-    voxel_map = small_map()
-    known = np.zeros((120, 160), bool)
-    known[:, :80] = True
-    depth = np.full((120, 160), 1.2, np.float32)
-    for seq in range(3):
-        voxel_map.integrate(frame(seq=seq), depth, sure(1), known)
-    state = voxel_map.block_state()
-    assert 2.9 < state["votes"].max() <= 3
-    k, _, i = np.indices((8, 8, 8))
-    z = (state["keys"][:, 2, None, None, None] * 8 + k) * 0.02
-    x = (state["keys"][:, 0, None, None, None] * 8 + i) * 0.02
-    voted = state["votes"] > 0
-    assert np.abs(z[voted] - 1.2).max() <= 2 * 0.02 + 1e-6
-    assert x[voted].max() <= 0.005  # columns 0..79 look left of the optical axis
-    points = voxel_map.points()
-    assert (points.label[points.xyz[:, 0] < -0.05] == 9).all()
-    right = points.xyz[:, 0] > 0.05
-    assert (points.label[right] == 0).all() and (points.confidence[right] == 0).all()
-
-
 def test_what_the_map_is_unsure_of_is_unknown_wherever_it_is_read(tmp_path: Path) -> None:
     """Left half of the view p = 0.5, right half p = 0.9; threshold between the two."""
     probabilities = np.concatenate((sure(2, 0.5)[:, :80], sure(1, 0.9)[:, 80:]), axis=1)
