@@ -197,7 +197,7 @@ class VoxelMapConfig(Config, frozen=True):
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
     unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
-    clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``fusion/clearing.py``)
+    clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``mapping/clearing.py``)
 
     # The same for all maps:
     truncation_voxels: ClassVar[float] = 4.0

@@ -9,7 +9,7 @@ import typer
 
 from semantic_mapper.config import Fraction, NotNegative
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.verb import UpOption, verb

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import to_plain
-from semantic_mapper.mapping.files.map_file import describe_map
+from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit, voxel_size_text
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table

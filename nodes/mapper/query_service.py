@@ -20,9 +20,9 @@ from typing import Any, Self
 import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.map_types import PoseInMap
 from semantic_mapper.mapping.moving import MovingSpace
-from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights

@@ -15,8 +15,8 @@ import structlog
 
 from semantic_mapper.config import MapperConfig, read_toml
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.map_file import open_map
+from semantic_mapper.mapping.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.publishing import PartStatus

@@ -19,8 +19,8 @@ from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.imaging import resize_label, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.mapping.map_types import MapView
-from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.snapshot import MapMirror

@@ -24,7 +24,7 @@ from mcap.opcode import Opcode
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.labels import NYU40
-from semantic_mapper.mapping.storage.changes import NONE_CLEARED
+from semantic_mapper.mapping.changes import NONE_CLEARED
 from semantic_mapper.queries.questions import (
     QUESTIONS,
     MapState,

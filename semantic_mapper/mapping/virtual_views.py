@@ -24,8 +24,10 @@ from semantic_mapper.geometry import (
     visible_points,
 )
 from semantic_mapper.kernels import parallel_kernel
-from semantic_mapper.mapping.fusion.allocation import blocks_in_band, make_camera
-from semantic_mapper.mapping.fusion.fuse import (
+from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
+from semantic_mapper.mapping.block_grid import GridBuffers
+from semantic_mapper.mapping.blocks import pack_keys
+from semantic_mapper.mapping.fusion import (
     FULL_TRUST_RANGE_M,
     ProbabilityTable,
     checked_depth,
@@ -35,8 +37,6 @@ from semantic_mapper.mapping.fusion.fuse import (
     vote_into_blocks,
 )
 from semantic_mapper.mapping.keyframes import Keyframe
-from semantic_mapper.mapping.storage.block_grid import GridBuffers
-from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
-from semantic_mapper.mapping.files.floor_plan import find_up
+from semantic_mapper.mapping.floor_plan import find_up
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.plots import CYCLE, SMALL_PT, TITLE_PT, cut, new_figure, rendered
 from semantic_mapper.queries.checks import check_up

@@ -17,10 +17,9 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, pack_keys, unpack_keys
+from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.mapping.map_types import require_metres
-from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
-from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_up
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.storage.block_index import BlockIndex
-from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
+from semantic_mapper.mapping.blocks import BlockIndex
+from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point, check_points, check_positive
 from semantic_mapper.queries.occupancy import read_states
 from semantic_mapper.queries.snapshot import MEASURED, BlockVoxels, MapSnapshot

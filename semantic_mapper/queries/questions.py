@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from semantic_mapper import errors
 from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, CorrectionStatus, MapPoints
-from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField

@@ -18,16 +18,8 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.storage.block_index import (
-    KEY_LIMIT,
-    BlockIndex,
-    make_block_index,
-    pack_keys,
-    unpack_keys,
-)
-from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
-from semantic_mapper.mapping.storage.changes import (
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, KEY_LIMIT, BlockIndex, make_block_index, pack_keys, unpack_keys
+from semantic_mapper.mapping.changes import (
     CONFIDENCE_STEPS,
     NONE_CLEARED,
     TSDF_STEPS,
@@ -35,6 +27,7 @@ from semantic_mapper.mapping.storage.changes import (
     ClearedBlocks,
     oldest_first,
 )
+from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.blocks import BlockIndex
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.checks import (
     as_numbers,
     check_box,

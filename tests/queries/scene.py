@@ -8,8 +8,8 @@ import numpy as np
 
 from semantic_mapper.geometry import look_at
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.mapping.storage.block_index import pack_keys
-from semantic_mapper.mapping.storage.changes import UNOBSERVED, BlockChanges
+from semantic_mapper.mapping.blocks import pack_keys
+from semantic_mapper.mapping.changes import UNOBSERVED, BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels

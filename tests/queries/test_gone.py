@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.mapping.storage.block_index import pack_keys
+from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels

@@ -12,13 +12,13 @@ import pytest
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LabelError, MapError
-from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS
+from semantic_mapper.mapping.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import snapshot as mirror_module
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from tests.mapping.rendered_views import small_map
-from tests.mapping.storage.test_paging import MEMORY_MB, walk
+from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.mapping.files import map_file
-from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, describe_map
+from semantic_mapper.mapping import map_file
+from semantic_mapper.mapping.map_file import CHUNK_BLOCKS, describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.saved_map import Autosave
 from tests.mapping.rendered_views import small_map
-from tests.mapping.storage.test_paging import walk
+from tests.mapping.test_paging import walk
 from tests.mapping.test_voxel_map import same
 from tests.nodes.support import REPLAY_LAUNCH, Running, eventually, repeated_frames, run, write_config, write_log
 
