@@ -10,7 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_scale import length_unit, scale_name
+from semantic_mapper.mapping.map_types import length_unit, scale_name
 from semantic_mapper.plain_text import counted
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance

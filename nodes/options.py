@@ -210,14 +210,18 @@ class FinetunerOptions(Config, frozen=True):
         return (self.mapper,)
 
 
-class BridgeOptions(Config, frozen=True):
-    """Hands images, map and status on to other tools. It computes only while nobody else wants the processor."""
+class FoxgloveOptions(Config, frozen=True):
+    """Serves images, map and status to Foxglove, while nobody else wants the processor.
+
+    Its protocol knows neither keys nor passwords, so it listens on 127.0.0.1 alone.
+    """
 
     input: Text | Names = "camera"  # whose frames: a node, or several
     mapper: str = "mapper"  # the node that maps them
     query: Annotated[str, msgspec.Meta(pattern=ENDPOINT_NAME_PATTERN)] = "query"  # the mapper's
     refresh_s: Annotated[float, msgspec.Meta(ge=0.1)] = 2.0  # between two maps, at least; one is sent where it changed
     keys: str = ""  # the mapper's
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8765  # 0 = any that is free
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
@@ -227,12 +231,6 @@ class BridgeOptions(Config, frozen=True):
     def cameras(self) -> tuple[str, ...]:
         """Nodes whose frames are handed on."""
         return (self.input,) if isinstance(self.input, str) else self.input
-
-
-class FoxgloveOptions(BridgeOptions, frozen=True):
-    """Serves Foxglove. Its protocol knows neither keys nor passwords, so it listens on 127.0.0.1 alone."""
-
-    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8765  # 0 = any that is free
 
 
 NodeOptions = CameraOptions | MapperOptions | RecorderOptions | FinetunerOptions | FoxgloveOptions
@@ -260,4 +258,3 @@ class NodeJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     restarts: Count = 0  # how often it was restarted
     restartable: bool = False  # it restarts where it fails: its failure is no end of its stream
     folder: str = ""  # of the launch; a node leaves notes there for the process that replaces it
-    orphan_timeout_s: Count = 120  # without its launcher, it has this many seconds to write its results

@@ -1,12 +1,18 @@
-"""The streams of frames that a node takes in: what they are, and which of them have ended."""
+"""The streams of frames that a node takes in: what they are, which have ended, and which frames never came."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+
+import numpy as np
 
 from semantic_mapper.errors import NodeError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
+from semantic_mapper.types import Float64
+
+MAX_MISSED = 2**53  # numbers may jump by anything; beyond this, sums of counts would not be exact in every reader
 
 
 class Streams:
@@ -83,3 +89,47 @@ class Streams:
         """One has ended; True where all have."""
         self._ends[end.source] = end
         return self.ended
+
+
+class MissingFrames:
+    """Counts the frames that are missing between others by their numbers, camera by camera.
+
+    Attributes:
+        missed: Frames, ``MAX_MISSED`` at most.
+    """
+
+    def __init__(self) -> None:
+        self.missed = 0
+        self.restarts = 0  # times that a camera began to count from the start: it was restarted
+        self._last: dict[str, int] = {}
+
+    def note(self, camera_id: str, seq: int) -> None:
+        """A frame has come."""
+        last = self._last.get(camera_id)
+        self._last[camera_id] = seq
+        if last is None:
+            return
+        if seq <= last:
+            self.restarts += 1
+        else:
+            self.missed = min(self.missed + seq - last - 1, MAX_MISSED)
+
+
+class MapPoses:
+    """Where cameras are in the map: of each world of theirs, what the mapper has said of it last.
+
+    A camera that tracks itself begins its own world; the mapper may have to find that in its map first. Until it has
+    mapped a frame of a world, nobody knows where cameras of that world are.
+    """
+
+    def __init__(self) -> None:
+        self._T_map_world: dict[int, Float64] = {}
+
+    def note(self, world: int, T_map_world: Sequence[float] | Float64) -> None:
+        """As a map update says it: (4, 4), 16 numbers, or none where it is no motion."""
+        self._T_map_world[world] = np.reshape(T_map_world, (4, 4)) if len(T_map_world) else np.eye(4)
+
+    def place(self, world: int, T_world_camera: Sequence[float] | Float64) -> Float64 | None:
+        """T_map_camera (4, 4) of a frame; None where its world is not known yet."""
+        T_map_world = self._T_map_world.get(world)
+        return None if T_map_world is None else T_map_world @ np.reshape(T_world_camera, (4, 4))

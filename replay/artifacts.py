@@ -20,8 +20,7 @@ from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats import write_ply
-from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
-from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
+from semantic_mapper.mapping.map_types import MapPoints, computed_fraction, scale_name, voxel_size_text
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import SceneGraph, find_graph
@@ -299,7 +298,7 @@ def _depth_source(session: MapSession) -> dict[str, Any]:
     mapped = session.published - session.dropped - len(session.refusals)
     rendered, computed = (n / mapped if mapped else 0.0 for n in (session.without_depth, session.computed_depth))
     names = {"sensor": rendered + computed < 1, "rendered": rendered > 0, "computed": computed > 0}
-    given_px, refined_px = (_rounded(px, 2) for px in session.pipeline.pose_disagreement_px or (None, None))
+    given_px, refined_px = (_rounded(px, 2) for px in session.pipeline.frame_depth.disagreement_px or (None, None))
     sources = [name for name, used in names.items() if used]
     return {
         "source": sources[0] if len(sources) == 1 else "mixed" if sources else "sensor",

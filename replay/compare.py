@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from semantic_mapper.config import AtLeastZero, Config
-from semantic_mapper.mapping.map_scale import require_same_scale
+from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.run_folder import map_path
 from semantic_mapper.replay.summary import SUMMARY_FILE, dig, read_summary

@@ -98,7 +98,7 @@ def correct_session(session: MapSession, trajectory: Trajectory) -> int:
         )
     if len(poses) < given:
         _log.warning("corrections_without_a_frame", left_out=given - len(poses), used=len(poses), frozen=frozen)
-    poses = session.odometry_sessions.in_map(poses, session.pipeline.corrector.world_by_frame())
+    poses = session.odometry_sessions.in_map(poses)
     session.pipeline.corrector.start(poses, until_ns=ALWAYS)  # the whole log was recorded in the old world
     while session.pipeline.corrector.advance(_PORTION):
         pass

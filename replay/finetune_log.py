@@ -40,11 +40,11 @@ from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.run_folder import prepare_file
-from semantic_mapper.training.boxes import boxes_in_view
 from semantic_mapper.training.config import FinetuneConfig
+from semantic_mapper.training.finetune import FITTERS, finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.fitters import FITTERS, fitter_of
 from semantic_mapper.training.frame_rays import usable_frames
+from semantic_mapper.training.panoptic import boxes_in_view
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
@@ -204,9 +204,10 @@ def _fit(
             note += f" accuracy {progress.held_out_accuracy * 100:.1f} %"
         monitor.set(int(progress.fraction * 100), note)
 
-    checkpoint = fitter_of(kind)(
-        frames, label_set, start, request.config, on_progress, lambda: monitor.stopped_by != "", seen
-    )
+    def stopped() -> bool:
+        return monitor.stopped_by != ""
+
+    checkpoint = finetune(frames, label_set, start, request.config, on_progress, stopped, seen, kind)
     learned = "grid_steps" if kind == Panoptic.kind else "steps"  # boxes need no more than geometry
     if monitor.stopped_by and not checkpoint.recipe[learned]:
         raise KeyboardInterrupt

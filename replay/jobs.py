@@ -18,7 +18,7 @@ from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import find_nesf
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.refine import RefineReport, refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plain_text import counted

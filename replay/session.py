@@ -130,14 +130,7 @@ class MapSession:
         self.pipeline = bundle.pipeline
         self.pipeline.voxel_map.note_scale(scale_known)
         self.source = source
-        self.odometry_sessions = OdometrySessions(
-            self.pipeline.voxel_map,
-            self.pipeline.classify,
-            own_first=own_first,
-            pose_in_map=self.pipeline.pose_in_map,
-            motion=self.pipeline.corrector.motion,
-            correcting=lambda: self.pipeline.corrector.status.running,
-        )
+        self.odometry_sessions = OdometrySessions(self.pipeline, own_first=own_first)
         self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
         self.published = 0
         self.fused = 0

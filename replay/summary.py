@@ -11,7 +11,7 @@ from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import read_regular
-from semantic_mapper.mapping.map_scale import FIX, voxel_size_text
+from semantic_mapper.mapping.map_types import SCALE_FIX, voxel_size_text
 from semantic_mapper.plain_text import counted
 
 SUMMARY_FILE = "summary.json"
@@ -114,7 +114,9 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             "the beginning of a walk"
         )
     if summary.get("scale") == "unknown":
-        lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {FIX}")
+        lines.append(
+            f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {SCALE_FIX}"
+        )
     if frames.get("left_out"):
         lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
     if frames.get("excluded_from_scores"):

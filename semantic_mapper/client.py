@@ -12,8 +12,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError
-from semantic_mapper.mapping.map_types import CorrectedPoses, MapPoints
-from semantic_mapper.mapping.odometry_sessions import CameraPose
+from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses, MapPoints
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance

@@ -221,9 +221,6 @@ class PoseRefinerConfig(Config, frozen=True):
     # pictures ...
     sigma_m: Positive = 0.02
     sigma_deg: Positive = 0.5  # ... and of their rotations
-    window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 20  # keyframes that are adjusted together
-    corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
-    width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
 
 
 class HistoryConfig(Config, frozen=True):
@@ -270,7 +267,6 @@ class DepthFromMotionConfig(Config, frozen=True):
     planes: Annotated[int, msgspec.Meta(ge=16, le=256, multiple_of=16)] = 64  # depths tried, uniform in inverse depth
     near_m: Metres = 0.4
     far_m: Metres = 8.0
-    sources: Annotated[int, msgspec.Meta(ge=1, le=16)] = 4  # other frames that each is matched with
     # A frame waits for this many later ones, which see it from the other side: more accurate. 0 = live.
     delay_frames: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
 

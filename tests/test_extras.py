@@ -47,7 +47,7 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", *FLEET
                 f"""
                 from semantic_mapper.errors import SemanticMapperError
                 try:
-                    import semantic_mapper.nodes.{kind}.sdk
+                    import semantic_mapper.nodes.{kind}.server
                 except SemanticMapperError as error:
                     print(error)
                 """,

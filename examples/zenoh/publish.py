@@ -3,7 +3,7 @@
     semantic-mapper up camera --set camera.kind=oak
     python examples/zenoh/publish.py ipc://FOLDER/query          # FOLDER: as `up` says where its sockets are
 
-Keys: `semantic_mapper/map/points` holds 20 bytes a point (see ``POINT`` in nodes/bridge/packing.py), with the classes
+Keys: `semantic_mapper/map/points` holds 20 bytes a point (see ``POINT`` in nodes/map_feed.py), with the classes
 as JSON in its attachment; `semantic_mapper/graph` holds JSON as of `semantic-mapper query MAP graph`. Zenoh's own
 configuration file says who may connect (TLS, a router): `--config zenoh.json5`; without one, this machine alone.
 """
@@ -21,8 +21,8 @@ import zenoh
 
 from semantic_mapper import MapClient
 from semantic_mapper.errors import MapError, TransportError
-from semantic_mapper.nodes.bridge.packing import describe_map, pack_points, thinned
 from semantic_mapper.nodes.map_answers import answer_graph
+from semantic_mapper.nodes.map_feed import describe_map, pack_points, thinned
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 

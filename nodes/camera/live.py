@@ -27,7 +27,7 @@ from semantic_mapper.nodes.camera.corrections import CorrectionSender, without_l
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions, LiveCamera, table_of
-from semantic_mapper.nodes.status import publish_status
+from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, EndReason, NodeState, Parts, Status
 from semantic_mapper.transport.sockets import Publisher

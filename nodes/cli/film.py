@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.mapping.map_scale import length_unit
+from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.nodes.cli.calibrate import board_settings
 from semantic_mapper.nodes.cli.options import DataOptions
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress

@@ -171,7 +171,7 @@ def finetune(
     must_be_there(log)
     output = Output.guarded()
     from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
-    from semantic_mapper.training.fitters import FITTERS
+    from semantic_mapper.training.finetune import FITTERS
 
     if kind is not None and kind not in FITTERS:
         raise typer.BadParameter(
@@ -216,8 +216,6 @@ def finetune(
 
 def finetune_lines(result: FinetuneResult, request: FinetuneRequest) -> list[str]:
     """What was learned, for a reader."""
-    from semantic_mapper.fields.scene.boxes import MAX_INTERVALS
-
     checkpoint, chosen = result.checkpoint, result.chosen
     recipe, out, log = checkpoint.recipe, request.out, request.log.name
     lines = [f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log}"] if chosen else []
@@ -247,20 +245,14 @@ def finetune_lines(result: FinetuneResult, request: FinetuneRequest) -> list[str
         )
     if boxed := recipe.get("panoptic"):
         lines.append(
-            f"  {boxed['seen']} of {boxed['boxes']} boxes seen; pixels that meet one {percent(boxed['covered'])}, "
-            f"with a surface in boxes of several classes {percent(boxed['ambiguous'])}; pseudo labels "
-            f"({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
+            f"  {boxed['seen']} of {boxed['boxes']} boxes seen; pixels that meet one {percent(boxed['covered'])}; "
+            f"pseudo labels ({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
             f"{percent(boxed['matched'])}"
         )
         if checkpoint.model.config.classes == "fixed":
             lines.append(
                 "  stopped before classes were learned: they are those of the boxes alone; what is in none of them "
                 "(wall or floor) is not separated"
-            )
-        if boxed["crowded"]:
-            lines.append(
-                f"  {percent(boxed['crowded'])} of the pixels meet more than {MAX_INTERVALS} boxes: of these the "
-                "nearest count"
             )
         if boxed["moving"]:
             lines.append(f"  {boxed['moving']} boxes that move, with grids of their own")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv as csv_files
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,16 +18,16 @@ from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, Settings, show_error, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.inputs import find_inputs
 from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.table import Tables
-from semantic_mapper.nodes.fleet.urls import shown
+from semantic_mapper.nodes.fleet.urls import find_inputs
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.run_folder import prepare_file
+from semantic_mapper.redaction import without_secrets
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_SUFFIX, prepare_file
 
 if TYPE_CHECKING:
-    from semantic_mapper.nodes.fleet.compare import Estimate, FleetComparison, LogChange
+    from semantic_mapper.nodes.fleet.compare import FleetComparison, LogChange
 
 EXIT_USAGE = 2
 MAX_SHOWN = 500  # rows that are printed
@@ -38,10 +38,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="Replay, score, label, finetune and merge many logs, on this machine or a Ray cluster.",
 )
-
-StoreArgument = Annotated[
-    str, typer.Argument(metavar="STORE", help="Path or URL of a store, as `fleet run --out` has written it.")
-]
 
 
 @app.command()
@@ -94,28 +90,34 @@ def run(
     """
     output = Output.guarded()
     output.quiet = json
-    inputs = find_inputs(logs, ".npz" if operation == "refine" else ".mcap")  # before what is heavy
+    inputs = find_inputs(logs, MAP_SUFFIX if operation == "refine" else LOG_SUFFIX)  # before what is heavy
     from semantic_mapper.nodes.fleet.operations import OPERATIONS
-    from semantic_mapper.nodes.fleet.run import Resources, make_template, run_fleet
+    from semantic_mapper.nodes.fleet.run import make_task, run_fleet
 
     kind = OPERATIONS[operation]
     on_gpu = ["render.device=cuda"] if gpus and issubclass(kind.settings, MapperConfig) else []
-    template = make_template(operation, out, weights, [*on_gpu, *(settings or ())], config)
-    resources = Resources(cpus, gpus, round((memory or kind.memory_gb) * 1e9))
+    task = make_task(operation, out, weights, [*on_gpu, *(settings or ())], config)
     with (
         StopRequest() as stop,
         connected(address, worker_logs=Settings.verbose),
         frame_progress(f"fleet {operation}", len(inputs), unit="logs") as bar,
     ):
-        report = run_fleet(template, inputs, resources, lambda: stop, lambda now: bar.set(now.over))
-    output.print(
-        f"{shown(out)}: {report.done} done, {report.existing} were there, {len(report.failures)} failed, "
-        f"of {report.total}"
-    )
+        report = run_fleet(
+            task,
+            inputs,
+            cpus=cpus,
+            gpus=gpus,
+            memory_gb=memory or kind.memory_gb,
+            stopped=lambda: stop,
+            on_progress=lambda now: bar.set(now.over),
+        )
+    shown = without_secrets(out)
+    failed = len(report.failures)
+    output.print(f"{shown}: {report.done} done, {report.existing} were there, {failed} failed, of {report.total}")
     for failure in report.failures[:MAX_LOGS]:
         output.print(f"  failed: {failure.log}: {failure.error}")
     if json:
-        output.json({"store": shown(out), **msgspec.to_builtins(report)})
+        output.json({"store": shown, **msgspec.to_builtins(report)})
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the same command continues it", style="yellow")
         return stop.exit_code
@@ -125,7 +127,9 @@ def run(
 @app.command()
 @verb
 def table(
-    store: StoreArgument,
+    store: Annotated[
+        str, typer.Argument(metavar="STORE", help="Path or URL of a store, as `fleet run --out` has written it.")
+    ],
     query: Annotated[
         str | None,
         typer.Argument(
@@ -201,11 +205,18 @@ def compare(
     """
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.nodes.fleet.compare import GateOptions, compare_stores
+    from semantic_mapper.nodes.fleet.compare import compare_stores
 
     try:
-        options = GateOptions(operation, metric, threshold, log_threshold, lower_is_better)
-        found = compare_stores(Store(store_a), Store(store_b), options)
+        found = compare_stores(
+            Store(store_a),
+            Store(store_b),
+            operation,
+            metric,
+            threshold=threshold,
+            log_threshold=log_threshold,
+            lower_is_better=lower_is_better,
+        )
     except SemanticMapperError as error:
         show_error(str(error))
         return EXIT_USAGE
@@ -280,31 +291,19 @@ def _cell(value: Any) -> str:
 
 
 def _show_comparison(output: Output, found: FleetComparison) -> None:
-    shown = [log for log in found.logs if log.status != "same"][:MAX_LOGS] or list(found.logs[:5])
-    names = ("log", "A", "B", "difference", "95 % interval", "")
-    rows = _rows_table(names, [(log.log, *_change_cells(log)) for log in shown])
     direction = "lower" if found.lower_is_better else "higher"
-    output.print(f"{found.operation}, {found.metric} ({direction} is better)", rows)
-    if len(found.logs) > len(shown):
-        output.print(f"{len(found.logs) - len(shown)} more logs; --json gives all")
-    for note in found.notes:
-        output.print(f"note: {note}")
-    if found.new:
-        output.print(f"note: {counted(len(found.new), 'log')} in B only, such as {found.new[0]}")
-    if found.mean_a is not None and found.mean_b is not None:
-        output.print(
-            f"mean over logs: A {found.mean_a:.4f}, B {found.mean_b:.4f}, difference "
-            f"{found.mean_b - found.mean_a:+.4f}, 95 % interval {_interval(found.overall)}; "
-            f"{counted(found.count('worse'), 'log')} worse, {found.count('better')} better"
-        )
+    changed = [log for log in found.logs if log.status != "same"]
+    names = ("log", "A", "B", "difference", "95 % interval", "")
+    rows = [_change_row(change) for change in (*changed[:MAX_LOGS], found.mean)]
+    output.print(f"{found.operation}, {found.metric} ({direction} is better)", _rows_table(names, rows))
+    counts = ", ".join(f"{counted(found.count(status), 'log')} {status}" for status in ("worse", "better", "same"))
+    output.print(f"{counts}; --json gives all")
+    if unknown := sum(log.estimate is None and log.b is not None for log in found.logs):
+        output.print(f"note: {counted(unknown, 'log')} without the same stretches in both: judged together only")
     output.print(f"worse: {'; '.join(found.reasons)}" if found.reasons else "not worse")
 
 
-def _change_cells(log: LogChange) -> Iterable[str]:
-    difference = "-" if log.a is None or log.b is None else f"{log.b - log.a:+.4f}"
-    status = "" if log.status == "same" else log.status
-    return _cell(log.a), _cell(log.b), difference, _interval(log.estimate), f"{status} {log.reason}".strip()
-
-
-def _interval(estimate: Estimate | None) -> str:
-    return "-" if estimate is None else f"{estimate.low:+.4f} .. {estimate.high:+.4f}"
+def _change_row(change: LogChange) -> tuple[Any, ...]:
+    difference = "-" if change.a is None or change.b is None else f"{change.b - change.a:+.4f}"
+    interval = "-" if (found := change.estimate) is None else f"{found.low:+.4f} .. {found.high:+.4f}"
+    return change.log, change.a, change.b, difference, interval, f"{change.status} {change.reason}".strip()

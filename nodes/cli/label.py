@@ -11,8 +11,7 @@ import typer
 from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.verb import must_be_there, verb
 from semantic_mapper.nodes.console import Output, frame_progress
-from semantic_mapper.nodes.labeller.server import LabelServer
-from semantic_mapper.nodes.labeller.session import LabelSession
+from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
 from semantic_mapper.nodes.launcher.running import NOTE, read_launch_note
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted

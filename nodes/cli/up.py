@@ -13,8 +13,7 @@ from semantic_mapper.nodes.cli.eval import print_results
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
-from semantic_mapper.nodes.launcher.launcher import Launcher
-from semantic_mapper.nodes.launcher.systemd import Notifier
+from semantic_mapper.nodes.launcher.launcher import Launcher, Notifier
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted

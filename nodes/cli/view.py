@@ -16,8 +16,13 @@ from semantic_mapper.errors import ConfigError, TransportError
 from semantic_mapper.nodes.cli.options import MaxFramesOption, Remote, WeightsOption
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
-from semantic_mapper.nodes.launcher.launch_view import LaunchView
-from semantic_mapper.nodes.launcher.running import launch_folder, node_endpoints, read_launch_note, status_endpoint
+from semantic_mapper.nodes.launcher.running import (
+    LaunchView,
+    launch_folder,
+    node_endpoints,
+    read_launch_note,
+    status_endpoint,
+)
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.replay.run_folder import is_log, is_map, map_path
@@ -187,17 +192,7 @@ def _show_log(
 
     settings = load_mapper_config(config)
     with frame_progress("map", None) as bar:
-        show_log(
-            path,
-            weights,
-            settings,
-            max_frames,
-            page.begin,
-            refresh,
-            going=lambda: not stop and page.alive,
-            on_start=bar.start,
-            on_frame=bar.set,
-        )
+        show_log(path, weights, settings, max_frames, page.begin, refresh, lambda: not stop and page.alive, bar)
 
 
 def _show_status(place: str, remote: Remote, *, once: bool, json: bool) -> None:

@@ -61,7 +61,7 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
                 load_config(Path(options.config), OnlineConfig)
             return _weights(options.weights)
         case FoxgloveOptions():
-            import_module("semantic_mapper.nodes.foxglove.sdk")
+            import_module("semantic_mapper.nodes.foxglove.server")
             return "its package"
         case _:
             return ""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from dataclasses import dataclass
+from concurrent.futures import CancelledError
 from pathlib import Path
 
 import structlog
+import torch
 
 from semantic_mapper.backoff import backoff_s
 from semantic_mapper.config import load_config
-from semantic_mapper.errors import CodecError, FrameError, LabelError, WeightsError
+from semantic_mapper.errors import CodecError, FrameError, LabelError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import (
     Checkpoint,
     checkpoint_bytes,
@@ -19,16 +21,16 @@ from semantic_mapper.fields.checkpoint import (
     load_checkpoint,
 )
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
 from semantic_mapper.nodes.finetuner.keyframe_store import FOLDER, LearningStore, Progress
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDER
 from semantic_mapper.nodes.mapper.offered_weights import read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions
-from semantic_mapper.nodes.status import publish_status
+from semantic_mapper.nodes.process import run_when_idle
+from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.training.config import OnlineConfig
-from semantic_mapper.training.keyframe_pool import KeyframePool
-from semantic_mapper.training.online import OnlineResult
+from semantic_mapper.training.fit import FitProgress
+from semantic_mapper.training.online import KeyframePool, KeyframeSplit, OnlineResult, learn
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import (
     LabelledKeyframe,
@@ -58,7 +60,7 @@ _COUNTERS = ("keyframes", "unusable", "set_aside", "rounds", "failed", "offered"
 _log = structlog.get_logger(__name__)
 
 
-def learn(context: NodeContext, options: FinetunerOptions) -> None:
+def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     """Open the sockets, load the weights to start from, and learn until a stop request.
 
     Raises:
@@ -83,31 +85,106 @@ def learn(context: NodeContext, options: FinetunerOptions) -> None:
         finetuner.close()
 
 
-@dataclass
-class Finetuner:
-    """Learns from the keyframes of ``labels``, and offers what proves better to ``mapper``.
+class FinetuneRound:
+    """A round of learning in a thread of its own, which rests after each step and each look as its share says.
 
     Args:
-        context: Of the node.
-        options: Of the node.
-        config: Of its rounds.
-        publisher: Of weights and status.
-        labels: Labelled keyframes.
-        mapper: What weights it uses.
+        keyframes: To learn from, and to judge by.
+        parent: Weights in use.
+        parent_digest: SHA-256 of their file, hexadecimal.
+        config: Of the round.
+        fraction: Of a core, or of the GPU, in 0..1.
+        idle: Learn only while nobody else wants the processor.
+    """
+
+    def __init__(
+        self,
+        keyframes: KeyframeSplit,
+        parent: Checkpoint,
+        parent_digest: str,
+        config: OnlineConfig,
+        fraction: float,
+        *,
+        idle: bool,
+    ) -> None:
+        self.parent_digest = parent_digest
+        self.step = 0
+        self.result: OnlineResult | None = None
+        self.failure = "it failed; see the log"
+        self._fraction = fraction
+        self._clock = time.process_time if config.finetune.device == "cpu" else time.monotonic
+        self._worked_from = self._clock()
+        self._cancelled = threading.Event()
+        run = (keyframes, parent, config, idle)
+        self._thread = threading.Thread(target=self._run, args=run, name="learning", daemon=True)
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether there is no outcome yet."""
+        return self._thread.is_alive()
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether nobody wants the outcome any more."""
+        return self._cancelled.is_set()
+
+    def cancel(self) -> None:
+        """Request that it ends after the step that it is in."""
+        self._cancelled.set()
+
+    def has_ended(self, timeout_s: float) -> bool:
+        """Whether it ends within this time."""
+        self._thread.join(timeout_s)
+        return not self.running
+
+    def _run(self, keyframes: KeyframeSplit, parent: Checkpoint, config: OnlineConfig, idle: bool) -> None:
+        torch.set_num_threads(torch.get_num_threads())  # OpenMP has a limit for each thread
+        if idle:
+            run_when_idle()
+        try:
+            self.result = learn(keyframes, parent, config, self._on_progress, self._rest)
+        except CancelledError:
+            _log.info("round_given_up", reason="the mapper uses other weights now")
+        except SemanticMapperError as error:
+            self.failure = str(error)
+        except (MemoryError, RuntimeError) as error:  # torch raises a RuntimeError where memory is exhausted
+            lines = str(error).strip().splitlines()
+            self.failure = f"{type(error).__name__}: {lines[0] if lines else 'no more is known'}"
+
+    def _on_progress(self, progress: FitProgress) -> None:
+        self.step = progress.step
+        self._rest()
+
+    def _rest(self) -> None:
+        worked_s = self._clock() - self._worked_from
+        if self._cancelled.wait(worked_s / self._fraction - worked_s):
+            raise CancelledError
+        self._worked_from = self._clock()
+
+
+class Finetuner:
+    """Learns from labelled keyframes, and offers the mapper what proves better.
+
+    Args:
         start: Weights that the mapper was started with.
         start_digest: SHA-256 of their file, hexadecimal.
     """
 
-    context: NodeContext
-    options: FinetunerOptions
-    config: OnlineConfig
-    publisher: Publisher
-    labels: LosslessSubscriber
-    mapper: LosslessSubscriber
-    start: Checkpoint
-    start_digest: str
-
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        context: NodeContext,
+        options: FinetunerOptions,
+        config: OnlineConfig,
+        publisher: Publisher,
+        labels: LosslessSubscriber,
+        mapper: LosslessSubscriber,
+        start: Checkpoint,
+        start_digest: str,
+    ) -> None:
+        self.context, self.options, self.config = context, options, config
+        self.publisher, self.labels, self.mapper = publisher, labels, mapper
+        self.start, self.start_digest = start, start_digest
         self._pool = KeyframePool(self.start.label_set, held_out_every=HELD_OUT_EVERY, capacity=MAX_KEYFRAMES)
         self._last_keyframe_s = 0.0
         self._in_use: WeightsInUse | None = None

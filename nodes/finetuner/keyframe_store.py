@@ -20,7 +20,7 @@ from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.options import Count
 from semantic_mapper.replay.run_folder import free_name
-from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
+from semantic_mapper.training.online import Kept, KeyframePool
 from semantic_mapper.transport.codec import decode_as, encode, pack_parts, unpack_parts
 from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, LabelledKeyframe, digest_of
 from semantic_mapper.types import PosedFrame
@@ -73,10 +73,7 @@ class LearningStore:
 
     def put_aside(self) -> None:
         """Rename the folder of another launch, whose keyframes people may have labelled; then begin with nothing.
-
-        Raises:
-            OSError: it cannot be renamed.
-        """
+        Raises OSError: it cannot be renamed."""
         record = self._folder / _RECORD
         if not record.exists() or not any(self._folder.glob(f"*{_SUFFIX}")):
             record.unlink(missing_ok=True)
@@ -88,10 +85,7 @@ class LearningStore:
 
     def keep(self, kept: Sequence[Kept], progress: Progress) -> None:
         """Save what has changed since the last call.
-
-        Raises:
-            OSError: it cannot be written; the last complete state stays.
-        """
+        Raises OSError: it cannot be written; the last complete state stays."""
         files = tuple(
             _KeptFile(digest=self._save(k.frame), held_out=k.held_out, proved_at=k.validated_by, trials=k.trials)
             for k in kept
@@ -110,10 +104,7 @@ class LearningStore:
 
     def restore(self, pool: KeyframePool) -> Progress:
         """Fill a pool with the keyframes of the folder; damaged ones are left out, with a warning.
-
-        Raises:
-            OSError: there are files that cannot be read.
-        """
+        Raises OSError: there are files that cannot be read."""
         record = self._read_record()
         for file in record.keyframes:
             try:

@@ -17,9 +17,9 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
         TransportError: an endpoint is taken.
     """
     _lower_priority(options)
-    from semantic_mapper.nodes.finetuner.finetuner import learn  # loads torch, in the threads that were set
+    from semantic_mapper.nodes.finetuner import finetuner  # loads torch, in the threads that were set
 
-    learn(context, options)
+    finetuner.run_finetuner(context, options)
 
 
 def _lower_priority(options: FinetunerOptions) -> None:

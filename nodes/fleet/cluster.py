@@ -14,7 +14,6 @@ import secrets
 import signal
 import socket
 import tempfile
-import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,10 +21,8 @@ from urllib.parse import urlsplit
 
 from semantic_mapper.errors import DependencyError, FleetError
 
-LOCAL = "local"
 _CONNECT_TIMEOUT_S = 5.0
 _OBJECT_STORE_BYTES = 256 << 20  # tasks read and write files, and pass small values
-_LONGEST_TEMPORARY = 30  # letters: below it Ray puts sockets, whose paths may be 107 bytes long
 _COMMON = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would send the working folder to every node
@@ -40,8 +37,8 @@ def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool
     """Connect this process to a Ray cluster, for the length of the context.
 
     Args:
-        address: None or ``local`` starts a cluster on this machine that ends with the context. ``HOST:PORT`` joins one
-            that runs; a node of it must run on this machine (``ray start --address=HOST:PORT --num-cpus=0``).
+        address: None starts a cluster on this machine that ends with the context. ``HOST:PORT`` joins one that runs; a
+            node of it must run on this machine (``ray start --address=HOST:PORT --num-cpus=0``).
         cpus: Of the cluster of this machine; None = all that this process may use.
         worker_logs: Show on stderr what tasks print.
 
@@ -56,21 +53,18 @@ def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool
             f'the fleet needs the package ray ({error}): pip install "semantic-mapper[fleet]"'
         ) from error
     with contextlib.ExitStack() as stack:
-        if address is None or address == LOCAL:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sm-ray-", dir=_short_folder())))
+        if address is None:
+            # Not where TMPDIR says: Ray puts sockets there, whose paths may be 107 bytes long.
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sm-ray-", dir="/tmp")))
             token = folder / "token"
             token.touch(0o600)
             token.write_text(secrets.token_hex(32), encoding="ascii")
             # A path, because programs that report errors often send the environment with them.
-            security = {
-                "RAY_AUTH_MODE": "token",
-                "RAY_AUTH_TOKEN_PATH": str(token),
-                "RAY_USE_TLS": "0",
-            }
+            security = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), "RAY_USE_TLS": "0"}
             stack.enter_context(_environment({**_COMMON, **_PATIENT, **security}))
             stack.enter_context(_on_loopback())
             found = {
-                "address": LOCAL,
+                "address": "local",
                 "num_cpus": cpus or len(os.sched_getaffinity(0)),
                 "include_dashboard": False,
                 "object_store_memory": _OBJECT_STORE_BYTES,
@@ -83,21 +77,20 @@ def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool
                 stack.enter_context(_on_loopback())
             found = {"address": address}
         stack.callback(ray.shutdown)
-        _start(ray, address or LOCAL, {**found, "log_to_driver": worker_logs})
+        _start(ray, {**found, "log_to_driver": worker_logs})
         yield
 
 
-def _start(ray: Any, address: str, arguments: Mapping[str, Any]) -> None:
+def _start(ray: Any, arguments: Mapping[str, Any]) -> None:
     """``ray.init``, with its many errors as one, and without its handler of SIGTERM where the program has its own."""
-    is_main = threading.current_thread() is threading.main_thread()
     handler = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(logging_level=logging.ERROR, **arguments)
     except Exception as error:  # Ray raises this very class for a node that is late
         reason = " ".join(str(error).split())[:400] or type(error).__name__
-        raise FleetError(f"the Ray cluster at '{address}' cannot be used: {reason}") from error
+        raise FleetError(f"the Ray cluster at '{arguments['address']}' cannot be used: {reason}") from error
     finally:
-        if is_main and handler not in (signal.SIG_DFL, None):
+        if handler not in (signal.SIG_DFL, None):
             signal.signal(signal.SIGTERM, handler)
 
 
@@ -113,7 +106,7 @@ def _check_reachable(address: str) -> None:
     except ValueError:
         host, port = "", 0
     if not host or not port or parts.netloc != address or "@" in address:
-        raise FleetError(f"'{address}' is not the address of a Ray cluster; give HOST:PORT, or {LOCAL}")
+        raise FleetError(f"'{address}' is not the address of a Ray cluster; give HOST:PORT")
     has_token = os.environ.get("RAY_AUTH_MODE", "").lower() == "token"
     if has_token and not os.environ.get("RAY_AUTH_TOKEN"):
         path = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
@@ -180,8 +173,3 @@ def _on_loopback() -> Iterator[None]:
         yield
     finally:
         ray_constants.ENABLE_RAY_CLUSTER = before
-
-
-def _short_folder() -> str:
-    folder = tempfile.gettempdir()
-    return folder if len(folder) <= _LONGEST_TEMPORARY else "/tmp"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,34 +12,20 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.config import read_json
-from semantic_mapper.errors import ConfigError, MapError, StoreError
+from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.mapping.files.map_file import MapManifest, describe_map
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.fleet.store import Store, file_digest, is_store
-from semantic_mapper.nodes.fleet.urls import is_url, open_url, reaching, shown
+from semantic_mapper.nodes.fleet.store import Store, is_store
+from semantic_mapper.nodes.fleet.urls import is_url, open_url, reaching
+from semantic_mapper.redaction import without_secrets
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX
 from semantic_mapper.types import Float64
 
 MEMORY_MB = 1000  # of the merged map, and of the one that is added to it
-MAX_BLOCKS = 1 << 27
-MAP_NAME, MAP_SUFFIX = "map.npz", ".npz"
+_MAX_BLOCKS = 1 << 27
 _WAY_OUT = "Give its pose in the file of --poses"
-
-
-@dataclass(frozen=True, slots=True)
-class MapSource:
-    """A saved map that takes part in a merge.
-
-    Args:
-        name: For people and for poses: of its file, of the folder of a ``map.npz``, or of the log it was made of.
-        url: Of its file.
-        sha256: Of its content, where a store names it.
-    """
-
-    name: str
-    url: str
-    sha256: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +44,7 @@ class MergeReport:
 
 
 def merge_maps(
-    sources: Sequence[MapSource], given: Mapping[str, Float64], on_added: Callable[[], object] = lambda: None
+    sources: Mapping[str, str], given: Mapping[str, Float64], on_added: Callable[[], object] = lambda: None
 ) -> MergeReport:
     """Fuse saved maps; at most two are loaded at a time, each within ``MEMORY_MB``.
 
@@ -74,16 +60,16 @@ def merge_maps(
         ConfigError: a pose of no map.
         MapError: maps that do not fit each other, are the same, have seen the same frames, or fit nowhere; or a map
             cannot be read.
-        StoreError: a map cannot be fetched, or is not the file that its result names.
+        StoreError: a map cannot be fetched.
     """
-    names = [source.name for source in sources]
+    names = list(sources)
     if unknown := sorted(set(given) - set(names)):
         raise ConfigError(f"--poses names {', '.join(unknown)}, but the maps are {', '.join(names)}")
     known = given or {names[0]: np.eye(4)}
     poses: dict[str, Float64] = {}
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="semantic-mapper-merge-") as folder:
-        files = {source.name: _fetch(source, Path(folder) / f"{n}.npz") for n, source in enumerate(sources)}
+        files = {name: _fetch(url, Path(folder) / f"{n}.npz") for n, (name, url) in enumerate(sources.items())}
         whole = _empty_map({name: describe_map(file) for name, file in files.items()})
         waiting = sorted(names, key=lambda name: name not in known)
         while waiting:
@@ -111,42 +97,36 @@ def merge_maps(
     return MergeReport(whole, poses, tuple(notes))
 
 
-def find_maps(arguments: Sequence[str]) -> list[MapSource]:
-    """The maps that are meant.
+def find_maps(arguments: Sequence[str]) -> dict[str, str]:
+    """Paths and URLs of the maps that are meant.
 
     Args:
         arguments: Paths or URLs of map files, of folders with a ``map.npz``, or of stores: the latest replay of each
             of its logs.
 
+    Returns:
+        By the name of the file, of the folder of a ``map.npz``, or of the log that it was made of; by the path or URL
+        itself where two have the same name.
+
     Raises:
-        ConfigError: fewer than two maps, one of them twice, a store without maps, or no such file.
+        ConfigError: fewer than two maps, a store without maps, or no such file.
         StoreError: a store cannot be reached.
     """
-    found: list[MapSource] = []
+    found: list[tuple[str, str]] = []
     for argument in arguments:
         if not argument.endswith(MAP_SUFFIX) and is_store(argument):
-            store = Store(argument)
-            replays = sorted((r for r in store.results() if r.operation == "replay"), key=lambda r: r.finished_ns)
-            latest = {result.log_digest: result for result in replays}.values()
-            results = sorted(latest, key=lambda result: result.log)
-            if not results:
-                raise ConfigError(f"{store.shown}: has no maps; `fleet run replay` makes them")
-            found += [
-                MapSource(_stem(r.log), f"{store.url}/{r.folder}/{MAP_NAME}", r.files[MAP_NAME].sha256) for r in results
-            ]
-        else:
-            url = argument if is_url(argument) else str(Path(argument).absolute())
-            url = url if url.endswith(MAP_SUFFIX) else f"{url.rstrip('/')}/{MAP_NAME}"
-            if not is_url(url) and not Path(url).is_file():
-                raise ConfigError(f"{argument}: no such map file, and no folder with a {MAP_NAME}")
-            found.append(MapSource(_stem(url.removesuffix(f"/{MAP_NAME}")), url))
-    if len(found) < 2:
+            found += _maps_of_store(Store(argument))
+            continue
+        url = argument if is_url(argument) else str(Path(argument).absolute())
+        url = url if url.endswith(MAP_SUFFIX) else f"{url.rstrip('/')}/{MAP_NAME}"
+        if not is_url(url) and not Path(url).is_file():
+            raise ConfigError(f"{argument}: no such map file, and no folder with a {MAP_NAME}")
+        found.append((_stem(url.removesuffix(f"/{MAP_NAME}")), url))
+    stems = [stem for stem, _ in found]
+    named = {stem if stems.count(stem) == 1 else without_secrets(url): url for stem, url in found}
+    if len(named) < 2:
         raise ConfigError("a merge needs two maps or more")
-    urls = [source.url for source in found]
-    if len(set(urls)) < len(urls):
-        raise ConfigError(f"{shown(next(url for url in urls if urls.count(url) > 1))}: is given twice; leave one out")
-    stems = [source.name for source in found]
-    return [s if stems.count(s.name) == 1 and s.name else replace(s, name=shown(s.url)) for s in found]
+    return named
 
 
 def read_poses(path: Path) -> dict[str, Float64]:
@@ -178,6 +158,14 @@ def read_poses(path: Path) -> dict[str, Float64]:
     return poses
 
 
+def _maps_of_store(store: Store) -> list[tuple[str, str]]:
+    replays = sorted((r for r in store.results() if r.operation == "replay"), key=lambda r: r.finished_ns)
+    latest = {result.log_digest: result for result in replays}.values()
+    if not latest:
+        raise ConfigError(f"{store.shown}: has no maps; `fleet run replay` makes them")
+    return [(_stem(r.log), f"{store.url}/{r.folder}/{MAP_NAME}") for r in sorted(latest, key=lambda r: r.log)]
+
+
 def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
     """With the settings of the first map and room for all.
 
@@ -191,7 +179,7 @@ def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
             raise MapError(f"{twin} and {name} are the same map: all that it has seen would count twice")
     first = next(iter(manifests.values()))
     # A block that is turned reaches into at most 8 others.
-    blocks = min(8 * sum(manifest.blocks for manifest in manifests.values()), MAX_BLOCKS)
+    blocks = min(8 * sum(manifest.blocks for manifest in manifests.values()), _MAX_BLOCKS)
     config = msgspec.structs.replace(
         first.config,
         memory_mb=_memory_mb(first),
@@ -204,22 +192,15 @@ def _memory_mb(manifest: MapManifest) -> int:
     return min(manifest.config.memory_mb or MEMORY_MB, MEMORY_MB)
 
 
-def _fetch(source: MapSource, target: Path) -> Path:
-    """The map as a local file, which is the one that its result names.
-
-    Raises:
-        MapError, StoreError: it is missing, damaged or cannot be reached.
-    """
-    fs, path = open_url(source.url)
-    file = Path(path)
-    if "file" not in fs.protocol:
-        file = target
-        with reaching(source.url):
-            fs.get_file(path, str(file))
-    if source.sha256 and (not file.is_file() or file_digest(file) != source.sha256):
-        raise StoreError(f"{shown(source.url)}: is damaged, or not the file of its result; `fleet run` makes it again")
-    return file
+def _fetch(url: str, target: Path) -> Path:
+    """The map as a local file; ``target`` where it is elsewhere."""
+    fs, path = open_url(url)
+    if "file" in fs.protocol:
+        return Path(path)
+    with reaching(url):
+        fs.get_file(path, str(target))
+    return target
 
 
 def _stem(url: str) -> str:
-    return url.rstrip("/").rsplit("/", 1)[-1].removesuffix(MAP_SUFFIX).removesuffix(".mcap")
+    return url.rstrip("/").rsplit("/", 1)[-1].removesuffix(MAP_SUFFIX).removesuffix(LOG_SUFFIX)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +24,7 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.evaluation.metrics import Segments, class_sums
 from semantic_mapper.files import write_json
-from semantic_mapper.nodes.fleet.store import Event, Findings, MethodScores
+from semantic_mapper.nodes.fleet.store import Findings, MethodScores
 from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
 from semantic_mapper.replay.jobs import (
     OFFLINE,
@@ -35,10 +36,11 @@ from semantic_mapper.replay.jobs import (
     refine_map,
     replay_log,
 )
+from semantic_mapper.replay.run_folder import MAP_NAME
 from semantic_mapper.replay.summary import dig, notes
 from semantic_mapper.training.config import FinetuneConfig
 
-MAX_EVENTS = 200  # of one log
+_MAX_EVENTS = 200  # of one log
 _SCORES = ("miou", "total_accuracy", "average_accuracy", "coverage")
 
 ConfigT = TypeVar("ConfigT", bound=Config)
@@ -75,35 +77,18 @@ class RefineSettings(Config, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One log in the hands of a worker.
-
-    Args:
-        log: The log, a folder with the parts of one, or a map.
-        out: Empty folder; what is in it at the end belongs to the result.
-        weights: None = what ships with the package for this operation.
-        settings: Of the operation's kind.
-    """
-
-    log: Path
-    out: Path
-    weights: Path | None
-    settings: Any
-
-
-@dataclass(frozen=True, slots=True)
 class Operation:
     """One of ``OPERATIONS``.
 
     Args:
         settings: Kind of its settings.
-        run: Does it.
+        run: Does it: log, empty folder for files of the result, weights (None = those that ship), settings.
         memory_gb: A task is given at least so much, unless the user says otherwise.
         defaults: Settings that differ from those of the kind.
     """
 
     settings: type[Config]
-    run: Callable[[Job], Findings]
+    run: Callable[[Path, Path, Path | None, Any], Findings]
     memory_gb: float = 2.0
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
@@ -128,7 +113,7 @@ def read_settings(
     plain = {} if config is None else read_toml(config)
     for name, value in parse_assignments(assignments).items():
         assign(plain, name, value, "--set")
-    data = msgspec.json.decode(msgspec.json.encode(plain))
+    data = copy.deepcopy(plain)
     for name, value in found.defaults.items():
         assign(data, name, value, "--set", replace=False)
     settings = convert_config(data, found.settings, "--set")
@@ -137,33 +122,31 @@ def read_settings(
     return settings, plain
 
 
-def _replay(job: Job) -> Findings:
-    settings: LogSettings = job.settings
-    result = replay_log(job.log, job.out, job.weights, _part(settings, MapperConfig), settings.max_frames)
+def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
+    result = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
     summary = result.summary
     metrics = {name: dig(summary, f"metrics.{name}") for name in (*_SCORES, "map_miou")}
     metrics |= {f"frames_{name}": count for name, count in summary["frames"].items()}
     metrics |= {name: summary["map"][name] for name in ("surface_points", "blocks", "cleared_voxels", "unknown")}
     metrics["depth_disagreement"] = dig(summary, "pose_check.worst_depth_disagreement")
     costs = {f"step_ms_{name}": value for name, value in summary["latency_ms"].items()}
-    events = [Event("note", text) for text in notes(summary)]
-    events += [Event("damaged", text) for text in summary["damaged_stretches"]]
-    events += [Event("refused", r["reason"], r["seq"], r["stamp_ns"]) for r in summary["refusals"]]
+    events = [("note", text) for text in notes(summary)]
+    events += [("damaged", text) for text in summary["damaged_stretches"]]
+    events += [("refused", f"frame {r['seq']}: {r['reason']}") for r in summary["refusals"]]
     return Findings(
         metrics=metrics,
         costs={**costs, "map_memory_mb": summary["map"]["memory_mb"]},
         scores=(_scores("replay", dig(summary, "metrics.per_class") or {}, result.session.segments),),
-        events=tuple(events[:MAX_EVENTS]),
+        events=tuple(events[:_MAX_EVENTS]),
     )
 
 
-def _eval(job: Job) -> Findings:
-    settings: LogSettings = job.settings
-    result = evaluate_log(job.log, job.weights, _part(settings, MapperConfig), settings.max_frames)
-    scores, name = result.plain(), job.log.name
-    found: dict[str, Any] = {"replays": {}, "logs": {name: scores}}
-    write_json(job.out / "eval.json", found)
-    write_eval_report(job.out / "eval.html", {}, [], {name: score_table(name, scores)}, found)
+def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
+    result = evaluate_log(log, weights, _part(settings, MapperConfig), settings.max_frames)
+    scores = result.plain()
+    found: dict[str, Any] = {"replays": {}, "logs": {log.name: scores}}
+    write_json(out / "eval.json", found)
+    write_eval_report(out / "eval.html", {}, [], {log.name: score_table(log.name, scores)}, found)
     methods: Mapping[str, Mapping[str, Any]] = scores["methods"]
     main = next(iter(methods.values()))
     metrics = {key: main.get(key) for key in (*_SCORES, "ece")}
@@ -175,12 +158,11 @@ def _eval(job: Job) -> Findings:
     )
 
 
-def _autolabel(job: Job) -> Findings:
-    settings: AutolabelSettings = job.settings
+def _autolabel(log: Path, out: Path, weights: Path | None, settings: AutolabelSettings) -> Findings:
     request = AutolabelRequest(
-        (job.log,),
-        job.out / "labelled.mcap",
-        job.weights,
+        (log,),
+        out / "labelled.mcap",
+        weights,
         _part(settings, MapperConfig),
         settings.write_depth,
         settings.min_confidence,
@@ -189,22 +171,21 @@ def _autolabel(job: Job) -> Findings:
     )
     report = autolabel_log(request)
     figures = ("frames", "labelled", "kept", "replaced", "unlabelled", "depth_written", "mean_confidence")
-    events = [Event("unlabelled", text) for text in report.unlabelled]
-    events += [Event("damaged", text) for text in report.damage]
+    events = [("unlabelled", text) for text in report.unlabelled]
+    events += [("damaged", text) for text in report.damage]
     return Findings(
         metrics={name: getattr(report.note, name) for name in (*figures, "labelled_pixels")},
-        events=tuple(events[:MAX_EVENTS]),
+        events=tuple(events[:_MAX_EVENTS]),
     )
 
 
-def _finetune(job: Job) -> Findings:
-    settings: FinetuneSettings = job.settings
+def _finetune(log: Path, out: Path, weights: Path | None, settings: FinetuneSettings) -> Findings:
     request = FinetuneRequest(
-        job.log,
-        job.out / "weights.safetensors",
+        log,
+        out / "weights.safetensors",
         0 if settings.kind == "grid" else settings.keyframes,  # a grid learns no classes
         _part(settings, FinetuneConfig),
-        None if settings.kind else job.weights,
+        None if settings.kind else weights,
         depth=DepthConfig(source="sensor"),
         kind=settings.kind or None,
     )
@@ -214,15 +195,14 @@ def _finetune(job: Job) -> Findings:
     return Findings(
         metrics={name: recipe[name] for name in names if name in recipe},
         costs={"fit_s": recipe.get("seconds")},
-        events=(Event("keyframes", ", ".join(map(str, result.chosen))),),
+        events=(("keyframes", ", ".join(map(str, result.chosen))),),
     )
 
 
-def _refine(job: Job) -> Findings:
-    settings: RefineSettings = job.settings
+def _refine(log: Path, out: Path, weights: Path | None, settings: RefineSettings) -> Findings:
     more = {"fill": settings.fill, "up": settings.up, "by_name": settings.by_name}
-    report = refine_map(job.log, job.out / "map.npz", job.weights, **more).report
-    return Findings(metrics={name: getattr(report, name) for name in ("surface", "relabelled", "filled", "things")})
+    report = refine_map(log, out / MAP_NAME, weights, **more).report
+    return Findings(metrics={name: getattr(report, name) for name in ("surface", "relabelled", "filled")})
 
 
 OPERATIONS: Mapping[str, Operation] = {

@@ -13,53 +13,39 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import msgspec
 
 import semantic_mapper
 from semantic_mapper.config import convert_config, to_plain
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError, WeightsError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint, shipped_checkpoint
-from semantic_mapper.fields.nesf import SHIPPED, SMOOTHING, load_nesf
+from semantic_mapper.fields.checkpoint import load_checkpoint, shipped_checkpoint
+from semantic_mapper.fields.nesf import SMOOTHING, load_nesf
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.nodes.fleet.inputs import LogInput
-from semantic_mapper.nodes.fleet.operations import OPERATIONS, Job, read_settings
-from semantic_mapper.nodes.fleet.store import (
-    Failure,
-    Findings,
-    ResultFile,
-    Store,
-    TaskResult,
-    encode_document,
-    file_digest,
-)
-from semantic_mapper.nodes.fleet.urls import MissingError, full_url, is_url, open_url, reaching, shown
+from semantic_mapper.nodes.fleet.operations import OPERATIONS, read_settings
+from semantic_mapper.nodes.fleet.store import Failure, Store, TaskResult, file_digest
+from semantic_mapper.nodes.fleet.urls import LogInput, MissingError, full_url, is_url, open_url, reaching
 from semantic_mapper.redaction import without_secrets
+from semantic_mapper.replay.run_folder import LOG_SUFFIX
 
 MAX_RETRIES = 3  # of a task whose process died, whose node was lost, or that could not reach log or store
-AHEAD = 2  # tasks handed to Ray for each that has room
-MAX_ERROR = 2000  # letters
-_KEY_DIGITS = 40
+_MAX_ERROR = 2000  # letters
 _PACKAGE = Path(semantic_mapper.__file__).parent
-_SOURCES = (".py", ".c", ".h", ".jinja", ".js")
+_SOURCES = (".py", ".c", ".h", ".jinja", ".js", ".safetensors")
 _COMPUTING = ("torch", "numpy", "scipy", "open3d", "opencv-contrib-python-headless")
+_VERSIONS = ("ETag", "etag", "md5Hash", "crc32c", "mtime", "LastModified", "updated")  # of s3, http, gs, file
 
 _log = get_logger(__name__)
 
 
-class OtherCodeError(FleetError):
-    """A worker would not compute what the driver means."""
-
-
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One log and what to do with it; goes to a worker, which has nothing else.
+    """What to do with each log; goes to the workers, which have nothing else.
 
     Args:
         operation: Of ``OPERATIONS``.
@@ -67,10 +53,9 @@ class Task:
         settings: Plain data of the operation's kind.
         shown_settings: What was set, for people.
         weights: Their file's name, or the name of weights that ship with the package; empty = the default ones.
-        weights_digest: SHA-256 of the file.
-        weights_stored: It is in the store; else every package has it.
+        weights_data: Content of their file; empty = they ship with the package.
+        weights_digest: SHA-256 of it.
         code: Digest of the code that the driver has.
-        log: What it is done with.
     """
 
     operation: str
@@ -78,19 +63,14 @@ class Task:
     settings: Mapping[str, Any]
     shown_settings: Mapping[str, Any]
     weights: str
+    weights_data: bytes
     weights_digest: str
-    weights_stored: bool
     code: str
-    log: LogInput
 
-
-@dataclass(frozen=True, slots=True)
-class Resources:
-    """What Ray reserves for a task: processors and GPUs, also fractions, and memory of its node."""
-
-    cpus: float = 1.0
-    gpus: float = 0.0
-    memory_bytes: int = 2 << 30
+    def key(self, log: str) -> str:
+        """Digest of all that decides the result for a log, which is named by the digest of its content."""
+        settings = msgspec.json.encode(self.settings, order="deterministic").decode()
+        return _digest(self.operation, log, self.weights_digest or self.weights, settings, self.code)
 
 
 @dataclass(slots=True)
@@ -111,14 +91,14 @@ class RunReport:
 # The driver
 
 
-def make_template(
+def make_task(
     operation: str,
     out: str,
     weights: str | None = None,
     assignments: Sequence[str] = (),
     config: Path | None = None,
 ) -> Task:
-    """The task that all logs share. Weights from a file are put into the store, for workers elsewhere.
+    """What to do with each log.
 
     Args:
         operation: Of ``OPERATIONS``.
@@ -129,31 +109,35 @@ def make_template(
     Raises:
         ConfigError: a setting cannot be used, or no store can be there.
         WeightsError: the weights cannot.
-        StoreError: they cannot be fetched or stored.
+        StoreError: they cannot be fetched.
     """
     settings, given = read_settings(operation, assignments, config)
     store = Store(out, create=True)
-    name, digest, stored = _find_weights(operation, store, weights)
-    return Task(operation, store.url, to_plain(settings), given, name, digest, stored, code_digest(), LogInput(""))
+    name, data = ("", b"") if weights is None else _read_weights(operation, weights)
+    digest = hashlib.sha256(data).hexdigest() if data else ""
+    return Task(operation, store.url, to_plain(settings), given, name, data, digest, code_digest())
 
 
 def run_fleet(
-    template: Task,
+    task: Task,
     inputs: Sequence[LogInput],
-    resources: Resources,
+    *,
+    cpus: float = 1.0,
+    gpus: float = 0.0,
+    memory_gb: float = 2.0,
     stopped: Callable[[], object] = bool,
-    on_progress: Callable[[RunReport], None] = lambda report: None,
-    function: Callable[[Task], bool] | None = None,
+    on_progress: Callable[[RunReport], object] = lambda report: None,
+    function: Callable[[Task, LogInput], bool] | None = None,
 ) -> RunReport:
     """Go through all logs, on the cluster that this process is connected with.
 
     Args:
-        template: Of ``make_template``.
+        task: What to do with each log.
         inputs: The logs.
-        resources: Of each task.
+        cpus, gpus, memory_gb: What Ray reserves for a task.
         stopped: Looked at often; once it is true, tasks that run are ended and the run is over.
         on_progress: Called after each log.
-        function: What a worker does with a task; None = ``run_task``.
+        function: What a worker does with a log; None = ``run_task``.
 
     Raises:
         FleetError: no node has the resources, or a worker has other code.
@@ -161,69 +145,48 @@ def run_fleet(
     """
     import ray
 
-    if not _room(resources):  # Ray would wait for ever
-        raise FleetError(
-            f"no node of the cluster has {resources.cpus:g} CPUs, {resources.gpus:g} GPUs and "
-            f"{resources.memory_bytes / 1e9:.3g} GB of memory for a task; ask for less (--cpus, --gpus, --memory) or "
-            "join a larger cluster"
+    needs = {"CPU": cpus, "GPU": gpus, "memory": memory_gb * 1e9}
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if not any(all(node.get(name, 0.0) >= need for name, need in needs.items()) for node in nodes):
+        raise FleetError(  # Ray would wait for ever
+            f"no node of the cluster has {cpus:g} CPUs, {gpus:g} GPUs and {memory_gb:.3g} GB of memory for a task; ask "
+            "for less (--cpus, --gpus, --memory) or join a larger cluster"
         )
     remote = ray.remote(function or run_task).options(
-        num_cpus=resources.cpus,
-        num_gpus=resources.gpus,
-        memory=resources.memory_bytes,
+        num_cpus=cpus,
+        num_gpus=gpus,
+        memory=round(memory_gb * 1e9),
         max_retries=MAX_RETRIES,
         retry_exceptions=[StoreError],
         scheduling_strategy="SPREAD",
-        name=f"fleet {template.operation}",
+        name=f"fleet {task.operation}",
     )
-    store = Store(template.store)
-    failed_before = {failure.key for failure in store.failures()}
-    waiting = random.sample(inputs, len(inputs))  # two drivers that share a store seldom meet
-    running: dict[Any, Task] = {}
+    store = Store(task.store)
+    failed_before = set(store.names("failures"))
+    shared = ray.put(task)
+    shuffled = random.sample(inputs, len(inputs))  # two drivers that share a store seldom meet
+    running: dict[Any, LogInput] = {remote.remote(shared, log): log for log in shuffled}
     report = RunReport(len(inputs))
-    while not stopped():
-        room = _room(resources)  # nodes come and go
-        while waiting and len(running) < room:
-            task = replace(template, log=waiting.pop())
-            running[remote.remote(task)] = task
-        if not running and not waiting:
-            return report
-        if not running:
-            time.sleep(0.2)
-            continue
+    while running and not stopped():
         ready, _ = ray.wait(list(running), num_returns=len(running), timeout=0.2)
         for reference in ready:
-            task = running.pop(reference)
-            error = _collect(report, reference)
-            key = _digest(
-                task.operation, task.log.url, task.weights_digest, msgspec.json.encode(task.settings).decode()
-            )
+            key, error = task.key(running[reference].url), _count(reference, report)
             if error:
-                _log.error("log_failed", log=shown(task.log.url), error=error)
-                failure = Failure(
-                    key=key,
-                    operation=task.operation,
-                    log=shown(task.log.url),
-                    tags=task.log.tags,
-                    version=code_version(),
-                    error=error,
-                    finished_ns=time.time_ns(),
-                )
-                store.write(f"failures/{key}.json", encode_document(failure))
-                report.failures.append(failure)
-            elif key in failed_before:
+                report.failures.append(_note_failure(store, task, key, running[reference], error))
+            elif f"{key}.json" in failed_before:
                 store.remove(f"failures/{key}.json")
+            del running[reference]
             on_progress(report)
     for reference in running:
         ray.cancel(reference, force=True)
     return report
 
 
-def _collect(report: RunReport, reference: Any) -> str:
+def _count(reference: Any, report: RunReport) -> str:
     """Count a task that has ended; what went wrong, or an empty text.
 
     Raises:
-        OtherCodeError: every log would fail like that.
+        FleetError: every log would fail like that.
     """
     import ray
     from ray.exceptions import RayError, RayTaskError
@@ -231,75 +194,64 @@ def _collect(report: RunReport, reference: Any) -> str:
     try:
         done: Any = ray.get(reference)
     except RayTaskError as error:
-        cause = error.cause
-        if isinstance(cause, OtherCodeError):
-            raise cause from error
-        return _one_line(f"{type(cause).__name__}: {cause}")
+        if isinstance(error.cause, FleetError):
+            raise error.cause from error
+        return f"{type(error.cause).__name__}: {error.cause}"
     except RayError as error:  # the process died again and again, or its nodes did
-        return _one_line(f"the process of the task died {MAX_RETRIES + 1} times: {type(error).__name__}: {error}")
+        return f"the process of the task died {MAX_RETRIES + 1} times: {type(error).__name__}: {error}"
     report.done += done
     report.existing += not done
     return ""
 
 
-def _one_line(text: str) -> str:
-    return without_secrets(" ".join(text.split()))[:MAX_ERROR]
+def _note_failure(store: Store, task: Task, key: str, log: LogInput, error: str) -> Failure:
+    failure = Failure(
+        key=key,
+        operation=task.operation,
+        log=without_secrets(log.url),
+        tags=log.tags,
+        version=code_version(),
+        error=without_secrets(" ".join(error.split()))[:_MAX_ERROR],
+        finished_ns=time.time_ns(),
+    )
+    _log.error("log_failed", log=failure.log, error=failure.error)
+    store.note_failure(failure)
+    return failure
 
 
-def _room(resources: Resources) -> int:
-    """How many tasks may be in Ray's hands; 0 = none fits on any node."""
-    import ray
-
-    needs = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": resources.memory_bytes}
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    fits = (min(int(node.get(name, 0.0) / need) for name, need in needs.items() if need) for node in nodes)
-    return AHEAD * sum(fits)
-
-
-def _find_weights(operation: str, store: Store, weights: str | None) -> tuple[str, str, bool]:
-    """Name, digest, and whether they are in the store now."""
+def _read_weights(operation: str, weights: str) -> tuple[str, bytes]:
+    """Name and content; no content for weights that ship."""
     refines = operation == "refine"
-    if weights is None:
-        default = shipped_checkpoint(SHIPPED) if refines else default_checkpoint_path()
-        return "", "" if default is None else file_digest(default), False
-    if refines and Path(weights) == SMOOTHING:
-        return weights, weights, False
-    shipped = shipped_checkpoint(Path(weights))
-    if shipped is not None and not is_url(weights) and not Path(weights).is_file():
-        return weights, file_digest(shipped), False
+    is_file = is_url(weights) or Path(weights).is_file()
+    if not is_file and ((refines and Path(weights) == SMOOTHING) or shipped_checkpoint(Path(weights)) is not None):
+        return weights, b""
     fs, path = open_url(weights)
-    name = Path(shown(weights)).name
+    with reaching(weights):
+        data = fs.cat_file(path)
     with tempfile.TemporaryDirectory() as folder:
-        local = Path(folder) / name
+        local = Path(folder) / _name_of(path)
+        local.write_bytes(data)
         try:
-            with reaching(weights):
-                fs.get_file(path, str(local))
             (load_nesf if refines else load_checkpoint)(local)
         except WeightsError as error:
-            raise WeightsError(str(error).replace(str(local), shown(weights))) from error
-        digest = file_digest(local)
-        store.upload(local, _stored_weights(digest, name))
-    return name, digest, True
-
-
-def _stored_weights(digest: str, name: str) -> str:
-    return f"weights/{digest}/{name}"
+            raise WeightsError(str(error).replace(str(local), without_secrets(weights))) from error
+    return local.name, data
 
 
 # The worker
 
 
-def run_task(task: Task) -> bool:
-    """Do a task; False where its result was there, or another attempt was quicker.
+def run_task(task: Task, log: LogInput) -> bool:
+    """Do a task with a log; False where its result was there, or another attempt was quicker.
 
     Raises:
         StoreError: the store or the log cannot be reached.
-        OtherCodeError: this worker has other code.
+        FleetError: this worker has other code.
         SemanticMapperError: the log, weights or settings cannot be used.
     """
     began = time.monotonic()
     if code_digest() != task.code:
-        raise OtherCodeError(
+        raise FleetError(
             f"{socket.gethostname()}: this worker has other code ({code_version()}) than the driver, or other versions "
             f"of {', '.join(_COMPUTING)}; install the same everywhere"
         )
@@ -309,84 +261,64 @@ def run_task(task: Task) -> bool:
         raise StoreError(
             f"{socket.gethostname()}: {error}. Where nodes share no folder of this name, --out must be a bucket"
         ) from error
-    versions = _versions(task.log.url)
-    source = f"sources/{_digest(task.log.url, *versions.values())}"
+    versions = _versions(log.url)
+    source = f"sources/{_digest(log.url, *versions.values())}"
     known = store.find(source) if all(versions.values()) else None  # the log was read before
-    if known is not None and store.exists(f"results/{task_key(task, known.decode())}.json"):
+    if known is not None and store.exists(f"results/{task.key(known.decode())}.json"):
         return False
-    with tempfile.TemporaryDirectory(prefix="semantic-mapper-fleet-") as folder:
-        paths = [_local(url, Path(folder) / "log") for url in versions]
+    with tempfile.TemporaryDirectory(prefix="semantic-mapper-fleet-") as name:
+        folder = Path(name)
+        paths = [_local(url, folder / "log") for url in versions]
         digests = [file_digest(path) for path in paths]
         digest = digests[0] if len(digests) == 1 else _digest(*digests)
         store.write(source, digest.encode())
-        key = task_key(task, digest)
-        if store.exists(f"results/{key}.json"):  # another URL of the same log
+        if store.exists(f"results/{task.key(digest)}.json"):  # another URL of the same log
             return False
-        out = Path(folder) / "out"
+        out = folder / "out"
         out.mkdir()
         operation = OPERATIONS[task.operation]
         settings = convert_config(task.settings, operation.settings, "settings of the fleet")
-        log = paths[0] if len(paths) == 1 else paths[0].parent
-        findings = operation.run(Job(log, out, _weights(task, store, Path(folder)), settings))
-        if _versions(task.log.url) != versions:
-            raise LogError(f"{shown(task.log.url)}: has changed while it was read; run it again once it is written")
-        size = sum(path.stat().st_size for path in paths)
-        return _commit(task, store, key, digest, size, findings, out, began)
+        weights = Path(task.weights) if task.weights else None
+        if task.weights_data:
+            weights = folder / task.weights
+            weights.write_bytes(task.weights_data)
+        findings = operation.run(paths[0] if len(paths) == 1 else paths[0].parent, out, weights, settings)
+        if _versions(log.url) != versions:
+            raise LogError(
+                f"{without_secrets(log.url)}: has changed while it was read; run it again once it is written"
+            )
+        place = f"files/{task.key(digest)}/{secrets.token_hex(6)}"
+        result = TaskResult(
+            key=task.key(digest),
+            operation=task.operation,
+            log=without_secrets(log.url),
+            log_digest=digest,
+            tags=log.tags,
+            weights=task.weights,
+            settings=dict(task.shown_settings),
+            version=code_version(),
+            findings=findings,
+            files=_upload(store, out, place),
+            folder=place,
+            seconds=round(time.monotonic() - began, 3),
+            node=socket.gethostname(),
+            finished_ns=time.time_ns(),
+        )
+        return store.commit(result)
 
 
-def _commit(
-    task: Task, store: Store, key: str, digest: str, size: int, findings: Findings, out: Path, began: float
-) -> bool:
-    """Put files and result into the store; after an error nothing of them stays."""
-    folder = f"files/{key}/{secrets.token_hex(6)}"
-    files: dict[str, ResultFile] = {}
+def _upload(store: Store, out: Path, place: str) -> dict[str, str]:
+    """Put files of a result into the store, their digests by name; after an error nothing of them stays."""
+    files: dict[str, str] = {}
     try:
         for path in sorted(p for p in out.rglob("*") if p.is_file()):
             name = path.relative_to(out).as_posix()
-            files[name] = ResultFile(path.stat().st_size, file_digest(path))
-            store.upload(path, f"{folder}/{name}")
+            files[name] = file_digest(path)
+            store.upload(path, f"{place}/{name}")
     except StoreError:
-        store.remove(folder)
+        store.remove(place)
         raise
-    result = TaskResult(
-        key=key,
-        operation=task.operation,
-        log=shown(task.log.url),
-        log_digest=digest,
-        log_bytes=size,
-        tags=task.log.tags,
-        weights=task.weights,
-        settings=dict(task.shown_settings),
-        version=code_version(),
-        findings=findings,
-        files=files,
-        folder=folder,
-        seconds=round(time.monotonic() - began, 3),
-        node=socket.gethostname(),
-        finished_ns=time.time_ns(),
-    )
-    return store.commit(result)
-
-
-def task_key(task: Task, log_digest: str) -> str:
-    """What a result is named by: everything that decides it, and nothing else."""
-    settings = msgspec.json.encode(task.settings, order="deterministic").decode()
-    return _digest(task.operation, log_digest, task.weights_digest, settings, task.code)
-
-
-def _weights(task: Task, store: Store, folder: Path) -> Path | None:
-    """The weights as a local file, or a name of the package's own.
-
-    Raises:
-        StoreError: they are not in the store, or damaged.
-    """
-    if not task.weights_stored:
-        return Path(task.weights) if task.weights else None
-    path = folder / task.weights
-    store.download(_stored_weights(task.weights_digest, task.weights), path)
-    if file_digest(path) != task.weights_digest:
-        raise StoreError(f"{store.shown}: the weights {task.weights} in it are damaged; start the run again")
-    return path
+    return files
 
 
 def _versions(url: str) -> dict[str, str]:
@@ -404,13 +336,12 @@ def _versions(url: str) -> dict[str, str]:
             is_folder = info["type"] == "directory"
             parts = fs.ls(path, detail=True) if is_folder else [{**info, "name": path}]
     except MissingError as error:
-        raise LogError(f"{shown(url)}: no such log") from error
+        raise LogError(f"{without_secrets(url)}: no such log") from error
     if is_folder:
-        parts = sorted((p for p in parts if p["name"].lower().endswith(".mcap")), key=lambda p: p["name"])
+        parts = sorted((p for p in parts if p["name"].lower().endswith(LOG_SUFFIX)), key=lambda p: p["name"])
     if not parts:
-        raise LogError(f"{shown(url)}: a folder without logs (.mcap)")
-    names = ("ETag", "etag", "md5Hash", "crc32c", "mtime", "LastModified", "updated")  # of s3, http, gs, file
-    versions = (next((f"{p.get('size')} {p[name]}" for name in names if p.get(name)), "") for p in parts)
+        raise LogError(f"{without_secrets(url)}: a folder without logs ({LOG_SUFFIX})")
+    versions = (next((f"{p.get('size')} {p[name]}" for name in _VERSIONS if p.get(name)), "") for p in parts)
     return dict(zip((full_url(fs, part["name"], url) for part in parts), versions, strict=True))
 
 
@@ -419,16 +350,19 @@ def _local(url: str, folder: Path) -> Path:
     fs, path = open_url(url)
     if "file" in fs.protocol:
         return Path(path)
-    # Without what signs a web address; in buckets "?" and "#" are letters.
-    name = Path(urlsplit(url).path if url.startswith(("http://", "https://")) else url).name
     folder.mkdir(exist_ok=True)
     with reaching(url):
-        fs.get_file(path, str(folder / name))
-    return folder / name
+        fs.get_file(path, str(folder / _name_of(path)))
+    return folder / _name_of(path)
+
+
+def _name_of(path: str) -> str:
+    """Of a file, without what signs a web address."""
+    return Path(path.split("?", 1)[0]).name
 
 
 def _digest(*texts: str) -> str:
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:_KEY_DIGITS]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:40]
 
 
 # The code
@@ -436,12 +370,12 @@ def _digest(*texts: str) -> str:
 
 @cache
 def code_digest() -> str:
-    """SHA-256 over the sources of the package, and the versions of the packages that compute."""
+    """SHA-256 over sources and weights of the package, and the versions of the packages that compute."""
     digest = hashlib.sha256()
     for name in _COMPUTING:
         digest.update(f"{name} {metadata.version(name)}\n".encode())
     for folder, subfolders, files in os.walk(_PACKAGE, followlinks=True):  # drivers, nodes and replay are links
-        subfolders[:] = sorted(s for s in subfolders if s not in ("__pycache__", "weights"))
+        subfolders[:] = sorted(s for s in subfolders if s != "__pycache__")
         for name in sorted(files):
             if name.endswith(_SOURCES):
                 path = Path(folder) / name

@@ -19,12 +19,15 @@ from semantic_mapper.errors import ConfigError, DependencyError
 from semantic_mapper.nodes.fleet.store import Store, TaskResult
 
 _SQL = re.compile(r"\W*(select|with|from|pivot|unpivot|describe|summarize|show|values)\b", re.IGNORECASE)
+_LOG_TEXTS = ("key", "operation", "log", "log_digest", "weights", "settings", "version", "node", "folder")
 _COLUMNS = {
-    "logs": "key operation log log_digest log_bytes:BIGINT weights settings version seconds:DOUBLE node "
-    "finished:TIMESTAMP folder",
-    "classes": "key method name iou:DOUBLE",
-    "events": "key kind text seq:BIGINT stamp_ns:BIGINT",
-    "failures": "operation log tags version error finished:TIMESTAMP",
+    "logs": {**dict.fromkeys(_LOG_TEXTS, "VARCHAR"), "seconds": "DOUBLE", "finished": "TIMESTAMP"},
+    "classes": {**dict.fromkeys(("key", "method", "name"), "VARCHAR"), "iou": "DOUBLE"},
+    "events": dict.fromkeys(("key", "kind", "text"), "VARCHAR"),
+    "failures": {
+        **dict.fromkeys(("operation", "log", "tags", "version", "error"), "VARCHAR"),
+        "finished": "TIMESTAMP",
+    },
 }
 
 
@@ -61,7 +64,7 @@ class Tables:
             ) from error
         self._error = duckdb.Error
         self._database = duckdb.connect()
-        kinds = {table: _kinds(columns) for table, columns in _COLUMNS.items()}
+        kinds = {table: dict(columns) for table, columns in _COLUMNS.items()}
         with tempfile.TemporaryDirectory(prefix="semantic-mapper-fleet-") as folder, ExitStack() as stack:
             files = {table: stack.enter_context(Path(folder, f"{table}.json").open("wb")) for table in kinds}
             for table, row in _rows(store):
@@ -87,7 +90,7 @@ class Tables:
         try:
             found = self._database.execute(text if _SQL.match(text) else f"SELECT {text} FROM logs")
             names = tuple(column[0] for column in found.description or ())
-            return Rows(names, [tuple(_plain(value) for value in row) for row in found.fetchall()])
+            return Rows(names, [tuple(map(_plain, row)) for row in found.fetchall()])
         except self._error as error:
             raise ConfigError(f"SQL: {error}") from error
 
@@ -107,30 +110,26 @@ class Tables:
         )
 
 
-def _kinds(columns: str) -> dict[str, str]:
-    """Types of columns by name; text where none is said."""
-    return {name: kind or "VARCHAR" for name, _, kind in (column.partition(":") for column in columns.split())}
-
-
 def _rows(store: Store) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows with the tables that they belong to."""
     for result in store.results():
+        key = result.key
         yield "logs", _log_row(result)
         for scores in result.findings.scores:
             for name, iou in scores.iou.items():
-                yield "classes", {"key": result.key, "method": scores.method, "name": name, "iou": iou}
-        for event in result.findings.events:
-            yield "events", {"key": result.key, **msgspec.structs.asdict(event)}
+                yield "classes", {"key": key, "method": scores.method, "name": name, "iou": iou}
+        for kind, text in result.findings.events:
+            yield "events", {"key": key, "kind": kind, "text": text}
     for failure in store.failures():
         row = {name: getattr(failure, name) for name in ("operation", "log", "version", "error")}
         yield "failures", {**row, "tags": _json(failure.tags), "finished": _time(failure.finished_ns)}
 
 
 def _log_row(result: TaskResult) -> dict[str, Any]:
-    row = {_column(name): value for name, value in result.findings.metrics.items()}
+    row: dict[str, Any] = {_column(name): value for name, value in result.findings.metrics.items()}
     row |= {_column(f"cost_{name}"): value for name, value in result.findings.costs.items()}
     row |= {_column(f"tag_{name}"): text for name, text in result.tags.items()}
-    row |= {name: getattr(result, name, None) for name in _kinds(_COLUMNS["logs"])}
+    row |= {name: getattr(result, name) for name in (*_LOG_TEXTS, "seconds")}
     return {**row, "settings": _json(result.settings), "finished": _time(result.finished_ns)}
 
 
@@ -147,13 +146,7 @@ def _json(data: dict[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A value of DuckDB as JSON has it."""
-    if isinstance(value, Decimal):
-        value = float(value)
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {str(name): _plain(item) for name, item in value.items()}
-    return value if isinstance(value, int | float | str | None) else str(value)
+    """A value of DuckDB as JSON has it; what is neither number nor text becomes text."""
+    if isinstance(value, float | Decimal):
+        return float(value) if math.isfinite(value) else None
+    return value if isinstance(value, int | str | None) else str(value)

@@ -1,6 +1,9 @@
 """A Foxglove websocket on this machine: what a launch publishes, as Foxglove's own message types.
 
 A client that does not keep up loses the oldest of what waits for it. What nobody subscribes to is not even encoded.
+
+Raises:
+    DependencyError: on import, where the extra is not installed.
 """
 
 from __future__ import annotations
@@ -8,29 +11,45 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Literal, Self
 
+import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.errors import TransportError
+from semantic_mapper.errors import DependencyError, TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.nodes.bridge.feed import Subject
-from semantic_mapper.nodes.bridge.packing import POINT, moving_mask, pack_points, to_jpeg, to_png
-from semantic_mapper.nodes.foxglove.scene import WORLD, camera_frame, draw_graph, draw_path, stamp, transform
-from semantic_mapper.nodes.foxglove.sdk import channels, foxglove, messages
+from semantic_mapper.nodes.map_feed import POINT, pack_points
 from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import SceneGraph
-from semantic_mapper.replay.exporters.base import CameraPath
+from semantic_mapper.queries.instances import Instance
+from semantic_mapper.replay.exporters.base import CameraPath, quaternion
 from semantic_mapper.transport.messages import Status
-from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame, UInt8
+
+try:
+    import foxglove
+    from foxglove import channels, messages
+except ModuleNotFoundError as error:
+    raise DependencyError(
+        "nodes of kind 'foxglove' need the package foxglove-sdk: pip install 'semantic-mapper[foxglove]'"
+    ) from error
 
 HOST = "127.0.0.1"  # the protocol has neither keys nor passwords: other machines come in by `ssh -L`
 BACKLOG = 32  # messages that may wait for a client; of a map of 400,000 points each has 8 MB
 SETTLE_S = 0.05  # after the SDK has said so, until what is sent reaches who has subscribed
+JPEG_QUALITY = 80
 PATH_PERIOD_S = 1.0  # a long path takes milliseconds to draw
+WORLD = "world"  # that of the map
+TEXT_M = 0.12  # height of letters
+LINE_M = 0.03
+PATH_COLOR = messages.Color(r=1.0, g=0.85, b=0.2, a=1.0)
+ROOM_COLOR = messages.Color(r=0.9, g=0.9, b=0.95, a=1.0)
+DOOR_COLOR = messages.Color(r=1.0, g=0.5, b=0.1, a=1.0)
+BOX_OPACITY = 0.35
 STATUS_SCHEMA = {
     "type": "object",
     "properties": {
@@ -42,6 +61,7 @@ STATUS_SCHEMA = {
         "degraded": {"type": "array", "items": {"type": "string"}},
     },
 }
+Subject = Literal["map", "graph"]
 _TYPES = {"<f4": messages.PackedElementFieldNumericType.Float32, "|u1": messages.PackedElementFieldNumericType.Uint8}
 _MAPS: dict[str, Subject] = {"/map/classes": "map", "/map/colors": "map", "/map/info": "map", "/graph": "graph"}
 
@@ -60,7 +80,7 @@ class _Camera:
 
 
 class FoxgloveServer:
-    """An ``Outlet`` that serves Foxglove; a context manager.
+    """Serves Foxglove; a context manager. Frames and status come from one thread, map and graph from another.
 
     Args:
         port: Of 127.0.0.1; 0 = any that is free.
@@ -111,62 +131,63 @@ class FoxgloveServer:
         self._server.stop()
 
     def requests(self, subject: Subject) -> int:
-        """See ``Outlet``."""
+        """How many have begun to receive this so far, or 0 where nobody receives it now."""
         return self._listener.requests(subject)
 
     def send_labels(self, label_set: LabelSet) -> None:
-        """See ``Outlet``."""
+        """The classes of the map, before anything that has classes."""
         self._labels = label_set
 
     def wants(self, topic: Literal["frame", "map"], camera_id: str) -> bool:
-        """See ``Outlet``."""
+        """Whether anybody receives what messages of a camera on this topic hold: else they are not even decoded."""
         c = self._camera(camera_id)
         wanted = (c.rgb, c.depth, c.calibration, self._tf) if topic == "frame" else (c.semantics, c.moving, self._path)
         return any(channel.has_sinks() for channel in wanted)
 
     def note_pose(self, camera_id: str, T_map_camera: Float64) -> None:
-        """See ``Outlet``."""
+        """Where a camera was in the map, of every frame of which that is known."""
         self._camera(camera_id).path.add(T_map_camera)
 
     def send_frame(self, frame: PosedFrame, T_map_camera: Float64 | None) -> None:
-        """See ``Outlet``."""
-        camera, when, name = self._camera(frame.camera_id), frame.stamp_ns, camera_frame(frame.camera_id)
+        """One camera image with its pose in the map; None while that is not known."""
+        camera, when, name = self._camera(frame.camera_id), frame.stamp_ns, _camera_frame(frame.camera_id)
         if T_map_camera is not None and self._tf.has_sinks():
-            moved = transform(T_map_camera, name, when)
+            moved = _transform(T_map_camera, name, when)
             self._tf.log(messages.FrameTransforms(transforms=[moved]), log_time=when)
         if camera.calibration.has_sinks():
             camera.calibration.log(_calibration(frame.intrinsics, name, when), log_time=when)
         if camera.rgb.has_sinks():
-            picture = to_jpeg(frame.rgb)
+            picture = _encoded(".jpg", frame.rgb, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
             camera.rgb.log(_picture(picture, "jpeg", name, when), log_time=when)
         if camera.depth.has_sinks() and frame.depth_m is not None:
             height, width = frame.depth_m.shape
             data = np.ascontiguousarray(frame.depth_m, "<f4").tobytes()
             form = {"width": width, "height": height, "encoding": "32FC1", "step": 4 * width}
-            image = messages.RawImage(timestamp=stamp(when), frame_id=name, data=data, **form)
+            image = messages.RawImage(timestamp=_stamp(when), frame_id=name, data=data, **form)
             camera.depth.log(image, log_time=when)
 
     def send_update(self, update: MapUpdate) -> None:
-        """See ``Outlet``."""
+        """What was rendered for a frame."""
         camera, labels, when = self._camera(update.camera_id), self._labels, update.stamp_ns
-        name = camera_frame(update.camera_id)
+        name = _camera_frame(update.camera_id)
         if labels is not None and camera.semantics.has_sinks():
-            picture = to_png(class_colors(update.label, labels))
+            picture = _png(class_colors(update.label, labels))
             camera.semantics.log(_picture(picture, "png", name, when), log_time=when)
         if camera.moving.has_sinks():
-            camera.moving.log(_picture(to_png(moving_mask(update)), "png", name, when), log_time=when)
+            moving = np.zeros(update.label.shape, np.bool_) if update.moving is None else update.moving
+            camera.moving.log(_picture(_png(moving * np.uint8(255)), "png", name, when), log_time=when)
         paths = {name: camera.path.poses for name, camera in self._cameras.items() if camera.path.poses}
         if paths and self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
             self._path_sent = time.monotonic()
-            self._path.log(draw_path(paths, when), log_time=when)
+            self._path.log(_draw_path(paths, when), log_time=when)
 
     def send_status(self, status: Status) -> None:
-        """See ``Outlet``."""
+        """What a node says of itself."""
         if self._status.has_sinks():
             self._status.log(msgspec.json.encode(status), log_time=status.stamp_ns)
 
     def send_map(self, points: MapPoints, about: dict[str, Any]) -> None:
-        """See ``Outlet``."""
+        """The map as it is now; ``about`` as of ``describe_map``."""
         when = about["stamp_ns"]
         if self._classes.has_sinks() and self._labels is not None:
             self._classes.log(_cloud(points, class_colors(points.label, self._labels), when), log_time=when)
@@ -176,9 +197,9 @@ class FoxgloveServer:
             self._info.log(about, log_time=when)
 
     def send_graph(self, graph: SceneGraph, stamp_ns: int) -> None:
-        """See ``Outlet``."""
+        """Floors, rooms, doors and things as they are now."""
         if self._graph.has_sinks() and self._labels is not None:
-            self._graph.log(draw_graph(graph, self._labels, stamp_ns), log_time=stamp_ns)
+            self._graph.log(_draw_graph(graph, self._labels, stamp_ns), log_time=stamp_ns)
 
     def _camera(self, camera_id: str) -> _Camera:
         if camera_id not in self._cameras:
@@ -196,7 +217,7 @@ class _Listener(foxglove.websocket.ServerListener):
         self._last = 0.0  # when somebody joined
 
     def requests(self, subject: Subject) -> int:
-        """See ``Outlet``."""
+        """As of the server."""
         with self._lock:
             settled = time.monotonic() - self._last > SETTLE_S
             return self._joined[subject] if self._there[subject] and settled else 0
@@ -216,14 +237,24 @@ class _Listener(foxglove.websocket.ServerListener):
                 self._there[_MAPS[channel.topic]] -= 1
 
 
+def _png(image: UInt8) -> bytes:
+    return _encoded(".png", image, cv2.IMWRITE_PNG_COMPRESSION, 1)  # little, for speed
+
+
+def _encoded(kind: str, image: UInt8, *flags: int) -> bytes:
+    """File of an image (H, W, 3) or of one channel (H, W)."""
+    turned = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    return cv2.imencode(kind, turned, flags)[1].tobytes()
+
+
 def _picture(data: bytes, form: str, frame_id: str, when: int) -> messages.CompressedImage:
-    return messages.CompressedImage(timestamp=stamp(when), frame_id=frame_id, data=data, format=form)
+    return messages.CompressedImage(timestamp=_stamp(when), frame_id=frame_id, data=data, format=form)
 
 
 def _calibration(k: CameraIntrinsics, frame_id: str, when: int) -> messages.CameraCalibration:
     """Images are rectified: there is no distortion."""
     return messages.CameraCalibration(
-        timestamp=stamp(when),
+        timestamp=_stamp(when),
         frame_id=frame_id,
         width=k.width,
         height=k.height,
@@ -242,10 +273,97 @@ def _cloud(points: MapPoints, rgb: Any, when: int) -> messages.PointCloud:
         if name != "spare"
     ]
     return messages.PointCloud(
-        timestamp=stamp(when),
+        timestamp=_stamp(when),
         frame_id=WORLD,
         pose=messages.Pose(position=messages.Vector3(), orientation=messages.Quaternion(w=1.0)),
         point_stride=POINT.itemsize,
         fields=fields,
         data=pack_points(points, rgb),
     )
+
+
+def _camera_frame(camera_id: str) -> str:
+    """Name of a camera's frame (x right, y down, z forward), a child of ``WORLD``."""
+    return f"camera/{camera_id}"
+
+
+def _stamp(stamp_ns: int) -> messages.Timestamp:
+    """Capture time, on the robot's clock."""
+    return messages.Timestamp(stamp_ns // 10**9, stamp_ns % 10**9)
+
+
+def _transform(T_map_camera: Float64, child: str, stamp_ns: int) -> messages.FrameTransform:
+    """Where a camera is."""
+    pose = _pose(T_map_camera[:3, :3], T_map_camera[:3, 3])
+    return messages.FrameTransform(
+        timestamp=_stamp(stamp_ns), parent_frame_id=WORLD, child_frame_id=child, translation=pose[0], rotation=pose[1]
+    )
+
+
+def _draw_path(paths: Mapping[str, Sequence[Float64]], stamp_ns: int) -> messages.SceneUpdate:
+    """The way of each camera, of poses (4, 4)."""
+    return messages.SceneUpdate(
+        entities=[
+            _entity(f"path/{name}", stamp_ns, lines=[_line([T[:3, 3] for T in poses], PATH_COLOR, closed=False)])
+            for name, poses in paths.items()
+        ]
+    )
+
+
+def _draw_graph(graph: SceneGraph, label_set: LabelSet, stamp_ns: int) -> messages.SceneUpdate:
+    """Boxes of things, outlines of rooms and doors, each with its name, in place of all that was drawn before."""
+    entities = [_thing(thing, label_set, stamp_ns) for thing in graph.things]
+    for room in graph.rooms:
+        outline = _line(room.outline, ROOM_COLOR, closed=True)
+        name = _text(f"room {room.id}, {room.area_m2:.1f} m2", room.center, ROOM_COLOR)
+        entities.append(_entity(f"room/{room.id}", stamp_ns, lines=[outline], texts=[name]))
+    for number, door in enumerate(graph.doors):
+        top = _text(f"door {door.rooms[0]}-{door.rooms[1]}, {door.width_m:.2f} m", door.center, DOOR_COLOR)
+        post = _line([door.center, door.center + 2.0 * graph.up], DOOR_COLOR, closed=False)
+        entities.append(_entity(f"door/{number}", stamp_ns, lines=[post], texts=[top]))
+    gone = messages.SceneEntityDeletion(timestamp=_stamp(stamp_ns), type=messages.SceneEntityDeletionType.All)
+    return messages.SceneUpdate(deletions=[gone], entities=entities)
+
+
+def _thing(thing: Instance, label_set: LabelSet, stamp_ns: int) -> messages.SceneEntity:
+    r, g, b = (value / 255 for value in label_set.colors[label_set.ids.index(thing.class_id)])
+    position, rotation = _pose(thing.box.R_world_box, thing.box.center)
+    cube = messages.CubePrimitive(
+        pose=messages.Pose(position=position, orientation=rotation),
+        size=_vector(thing.box.size),
+        color=messages.Color(r=r, g=g, b=b, a=BOX_OPACITY),
+    )
+    top = thing.box.center + thing.box.R_world_box[:, 2] * (thing.box.size[2] / 2 + TEXT_M)
+    name = _text(f"{thing.class_name} {thing.id}", top, messages.Color(r=r, g=g, b=b, a=1.0))
+    return _entity(f"thing/{thing.id}", stamp_ns, cubes=[cube], texts=[name])
+
+
+def _entity(name: str, stamp_ns: int, **primitives: list[object]) -> messages.SceneEntity:
+    return messages.SceneEntity(timestamp=_stamp(stamp_ns), frame_id=WORLD, id=name, **primitives)  # pyright: ignore
+
+
+def _line(points: Sequence[Float64] | Float64, color: messages.Color, *, closed: bool) -> messages.LinePrimitive:
+    kinds = messages.LinePrimitiveLineType
+    return messages.LinePrimitive(
+        type=kinds.LineLoop if closed else kinds.LineStrip,
+        pose=messages.Pose(position=messages.Vector3(), orientation=messages.Quaternion(w=1.0)),
+        thickness=LINE_M,
+        points=[messages.Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in points],
+        color=color,
+    )
+
+
+def _text(text: str, at: Float64, color: messages.Color) -> messages.TextPrimitive:
+    where = messages.Pose(position=_vector(at), orientation=messages.Quaternion(w=1.0))
+    return messages.TextPrimitive(pose=where, billboard=True, font_size=TEXT_M, color=color, text=text)
+
+
+def _vector(v: Float64) -> messages.Vector3:
+    return messages.Vector3(x=float(v[0]), y=float(v[1]), z=float(v[2]))
+
+
+def _pose(R: Float64, at: Float64) -> tuple[messages.Vector3, messages.Quaternion]:
+    T = np.eye(4)
+    T[:3, :3] = R
+    x, y, z, w = map(float, quaternion(T))
+    return _vector(at), messages.Quaternion(x=x, y=y, z=z, w=w)

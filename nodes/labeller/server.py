@@ -1,4 +1,4 @@
-"""The labelling page, served to browsers of this machine that know the token in its address.
+"""The labelling page of one log, served to browsers of this machine that know the token in its address.
 
 The page is on loopback alone, and its policy lets it speak to nobody but this server. Other pages that a browser has
 open cannot reach it: they lack the token, and names that somebody has bound to this machine's address are refused.
@@ -6,26 +6,34 @@ open cannot reach it: they lack the token, and names that somebody has bound to 
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import json
 import re
 import secrets
 import threading
+from collections.abc import Sequence
+from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-from urllib.parse import urlsplit
 
+import cv2
+import numpy as np
 import structlog
 
-from semantic_mapper.errors import TransportError
-from semantic_mapper.nodes.labeller.session import SESSION_ERRORS, ChangedElsewhereError, LabelSession, revision_of
+from semantic_mapper.errors import FrameError, LabelError, LogError, TransportError
 from semantic_mapper.nodes.local_server import LocalServer
+from semantic_mapper.replay.label_folder import LabelFolder
+from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.training.strokes import grow_strokes
+from semantic_mapper.types import PosedFrame
 
 HOST = "127.0.0.1"
 PORT = 9092
+JPEG_QUALITY = 95
 TIMEOUT_S = 10.0  # of one read or write of a request
 _PAGE = Path(__file__).parent / "page"
 _FILES = {
@@ -47,6 +55,129 @@ _HEADERS = {
 }
 
 _log = structlog.get_logger(__name__)
+
+
+class ChangedElsewhereError(LabelError):
+    """A label image is no longer what it was when the page showed it."""
+
+
+def revision_of(label: bytes) -> str:
+    """Tells one state of a label image from another."""
+    return hashlib.sha256(label).hexdigest()[:32]
+
+
+class LabelSession:
+    """One log being labelled. Any thread may call.
+
+    Args:
+        log: Open as long as the session.
+        folder: Where label images are read from and written to.
+        order: Numbers of the frames to label, in the order in which the page shows them.
+    """
+
+    def __init__(self, log: Log, folder: LabelFolder, order: Sequence[int]) -> None:
+        self._log, self._folder, self._order = log, folder, list(order)
+        self._sizes: dict[int, tuple[int, int]] = {}
+        self._lock = threading.Lock()
+
+    def describe(self) -> dict[str, Any]:
+        """What the page shows: plain data."""
+        labels = self._folder.label_set
+        classes = zip(labels.ids, labels.names, labels.colors, strict=True)
+        return {
+            "log": self._log.path.name,
+            "folder": str(self._folder.path),
+            "frames": len(self._log),
+            "order": self._order,
+            "labelled": self._folder.numbers(),
+            "ignore": labels.ignore_id,
+            "classes": [{"id": i, "name": name, "color": list(color)} for i, name, color in classes],
+        }
+
+    def image(self, number: int) -> bytes:
+        """Colour image of a frame, as JPEG.
+
+        Raises:
+            LogError, FrameError: no such frame, or a damaged one.
+        """
+        with self._lock:
+            frame = self._frame(number)
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        return cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes()
+
+    def label(self, number: int) -> bytes:
+        """Class ids of a frame's pixels, row by row, a byte each; the ignore id where nothing is labelled.
+
+        Raises:
+            LogError, FrameError: no such frame, a damaged one, or a damaged label image.
+        """
+        with self._lock:
+            return self._label(number)
+
+    def grown(self, number: int) -> bytes:
+        """What the strokes of a frame grow to, in the form of ``label``.
+
+        Raises:
+            LogError, FrameError: as ``label``.
+        """
+        label_set = self._folder.label_set
+        with self._lock:
+            frame = self._frame(number)
+            label = np.frombuffer(self._label(number), np.uint8).reshape(self._size(number))
+        grown = grow_strokes(replace(frame, label=label), label_set).label
+        assert grown is not None
+        return grown.tobytes()
+
+    def _label(self, number: int) -> bytes:
+        size = self._size(number)
+        if number in self._folder.numbers():
+            return self._folder.read(number, size).tobytes()
+        return np.full(size, self._folder.label_set.ignore_id, np.uint8).tobytes()
+
+    def save(self, number: int, data: bytes, revision: str | None = None) -> None:
+        """Write what ``label`` gives, as changed by a person.
+
+        Args:
+            number: Of the frame.
+            data: Class ids.
+            revision: ``revision_of`` what the person changed; None = whatever is there is replaced.
+
+        Raises:
+            ChangedElsewhereError: somebody else has changed it since.
+            LabelError: not a byte a pixel, or an id that is no class.
+            LogError, FrameError: no such frame, or it cannot be written.
+        """
+        with self._lock:
+            height, width = self._size(number)
+            if len(data) != height * width:
+                raise LabelError(
+                    f"frame {number}: {len(data):,} bytes came for {width}x{height} pixels; send one class id a pixel"
+                )
+            if revision is not None and revision != revision_of(self._label(number)):
+                raise ChangedElsewhereError(f"frame {number} was changed elsewhere, in another tab or by a program")
+            self._folder.write(number, np.frombuffer(data, np.uint8).reshape(height, width))
+
+    def pixels(self, number: int) -> int:
+        """How many a frame has: bytes of its label.
+
+        Raises:
+            LogError, FrameError: no such frame, or a damaged one.
+        """
+        with self._lock:
+            height, width = self._size(number)
+        return height * width
+
+    def _size(self, number: int) -> tuple[int, int]:
+        if number not in self._sizes:
+            self._frame(number)
+        return self._sizes[number]
+
+    def _frame(self, number: int) -> PosedFrame:
+        if not 0 <= number < len(self._log):
+            raise LogError(f"{self._log.path}: has no frame {number}; it has {len(self._log)}")
+        frame = self._log.frame(number)
+        self._sizes[number] = frame.intrinsics.height, frame.intrinsics.width
+        return frame
 
 
 class LabelServer:
@@ -114,7 +245,7 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
                 self._refuse(error.status, str(error))
             except ChangedElsewhereError as error:
                 self._refuse(HTTPStatus.PRECONDITION_FAILED, str(error))
-            except SESSION_ERRORS as error:
+            except (LabelError, LogError, FrameError) as error:
                 self._refuse(HTTPStatus.BAD_REQUEST, str(error))
             except OSError as error:  # the browser has left
                 _log.debug("page_not_served", reason=str(error))
@@ -125,9 +256,10 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             Raises:
                 _RefusedError: by somebody who may not.
             """
-            _check_name(self.headers.get("Host", ""))
-            if (origin := self.headers.get("Origin")) is not None:
-                _check_name(_netloc(origin))
+            host = self.headers.get("Host", "")  # of a tunnel, the port may be another
+            own = f"http://{host}"
+            if host.rpartition(":")[0] not in (HOST, "localhost") or self.headers.get("Origin", own) != own:
+                raise _RefusedError(HTTPStatus.FORBIDDEN, f"the page is at {HOST} or localhost")
             given, slash, path = self.path.removeprefix("/").partition("/")
             if not hmac.compare_digest(given.encode(), token.encode()):
                 raise _RefusedError(HTTPStatus.FORBIDDEN, "open the address that `label --serve` has shown")
@@ -185,24 +317,6 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             _log.debug("page_served", request=(format % args).replace(token, "TOKEN"))
 
     return Handler
-
-
-def _netloc(origin: str) -> str:
-    """Host and port of an ``Origin``; empty where that is no address."""
-    try:
-        return urlsplit(origin).netloc
-    except ValueError:  # such as http://[
-        return ""
-
-
-def _check_name(netloc: str) -> None:
-    """Refuse requests that came by another name than this machine's own: a tunnel may have another port.
-
-    Raises:
-        _RefusedError: they did.
-    """
-    if netloc.rpartition(":")[0] not in (HOST, "localhost"):
-        raise _RefusedError(HTTPStatus.FORBIDDEN, f"the page is at {HOST} or localhost")
 
 
 def _frame(path: str) -> tuple[int, str]:

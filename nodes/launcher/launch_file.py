@@ -23,9 +23,9 @@ from semantic_mapper.nodes.options import (
     CAMERA_KINDS,
     OPTIONS,
     POSE_KINDS,
-    BridgeOptions,
     CameraOptions,
     FinetunerOptions,
+    FoxgloveOptions,
     LiveCamera,
     MapperOptions,
     NodeOptions,
@@ -36,8 +36,6 @@ from semantic_mapper.nodes.options import (
 LAUNCH_FOLDER = Path(semantic_mapper.__file__).parent / "launch_files"  # ``launch/`` of the top level
 STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
 MAX_NODES = 64  # each is a process
-MAX_SHOWN = 60  # letters of an argument in a message
-MAX_TEXT = 4096  # letters of a value given with --set
 # What a camera without poses in its file has: the source that needs nothing else.
 DEFAULT_POSES = {"oak": "device", "realsense": "rgbd", "stereo": "rgbd"}
 HISTORY_FRAMES = 3000  # that the map of a camera with closed loops keeps, unless its launch file says how many
@@ -98,7 +96,7 @@ class Launch(Limits, frozen=True, kw_only=True):
 
     def listeners(self, name: str) -> int:
         """How many nodes subscribe to the frames of a node."""
-        kinds = MapperOptions | RecorderOptions | BridgeOptions
+        kinds = MapperOptions | RecorderOptions | FoxgloveOptions
         return sum(name in o.inputs() for o in self.options.values() if isinstance(o, kinds))
 
 
@@ -156,6 +154,7 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         if n.enabled
     )
     _complete_cameras(nodes)
+    _complete_viewers(nodes)
     options = {n.name: _convert_options(n, file.keys, path) for n in nodes}
     for name, own in options.items():
         for source in own.inputs():
@@ -165,7 +164,6 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
                 )
     _check_restarts(nodes, options, path)
     _check_cameras(options, path)
-    _check_bridges(options, path)
     limits = {name: getattr(file, name) for name in Limits.__struct_fields__}
     launch = Launch(name=path.name, nodes=nodes, options=options, **limits)
     sockets = launch.sockets()
@@ -269,9 +267,7 @@ def _typed(text: str, kind: Any) -> Any:
 def _parse_setting(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or not name:
-        raise ConfigError(f"--set {text[:MAX_SHOWN]}: write NODE.OPTION=VALUE")
-    if len(value) > MAX_TEXT:
-        raise ConfigError(f"--set {name[:MAX_SHOWN]}: the value is longer than {MAX_TEXT} letters")
+        raise ConfigError(f"--set {text}: write NODE.OPTION=VALUE")
     return name, value
 
 
@@ -309,6 +305,17 @@ def _complete_cameras(nodes: Sequence[NodeEntry]) -> None:
             for mapper in mappers:
                 mapper.setdefault("history_frames", HISTORY_FRAMES)
                 node.options["corrections"] = mapper.get("query", "query")
+
+
+def _complete_viewers(nodes: Sequence[NodeEntry]) -> None:
+    """Where the mapper of a viewer answers, and its keys."""
+    mappers = {node.name: node.options for node in nodes if node.kind == "mapper"}
+    for node in nodes:
+        if node.kind == "foxglove":
+            mapper = mappers.get(node.options.get("mapper", "mapper"), {})
+            for name in ("query", "keys"):
+                if name in mapper:
+                    node.options.setdefault(name, mapper[name])
 
 
 def _convert_options(node: NodeEntry, keys: str, path: Path) -> NodeOptions:
@@ -380,10 +387,10 @@ def _check_cameras(options: Mapping[str, NodeOptions], path: Path) -> None:
     """Frames that go to one place are distinguished by the names of their cameras.
 
     Raises:
-        ConfigError: two cameras of one name, or frames of what is no camera.
+        ConfigError: two cameras of one name, frames of what is no camera, or the map of what is no mapper.
     """
     for name, own in options.items():
-        if not isinstance(own, MapperOptions | RecorderOptions | BridgeOptions):
+        if not isinstance(own, MapperOptions | RecorderOptions | FoxgloveOptions):
             continue
         cameras: dict[str, CameraOptions] = {}
         for source in own.cameras:
@@ -392,27 +399,8 @@ def _check_cameras(options: Mapping[str, NodeOptions], path: Path) -> None:
                 raise ConfigError(f"{path}: node '{name}' takes the frames of '{source}', which is no camera")
             cameras[source] = camera
         check_camera_ids(name, cameras, str(path))
-
-
-def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
-    """A bridge to other tools queries a mapper of its launch about the map.
-
-    Raises:
-        ConfigError: it would query where none answers.
-    """
-    for name, own in options.items():
-        if not isinstance(own, BridgeOptions):
-            continue
-        mapper = options[own.mapper]
-        if not isinstance(mapper, MapperOptions):
+        if isinstance(own, FoxgloveOptions) and not isinstance(options[own.mapper], MapperOptions):
             raise ConfigError(f"{path}: node '{name}' shows the map of '{own.mapper}', which is no mapper")
-        for what in ("query", "keys"):
-            ours, theirs = getattr(own, what), getattr(mapper, what)
-            if ours != theirs:
-                raise ConfigError(
-                    f"{path}: node '{name}' has {what} = '{ours}', but mapper '{own.mapper}' '{theirs}'; give both the "
-                    "same"
-                )
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:

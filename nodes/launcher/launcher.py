@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -19,10 +20,9 @@ from semantic_mapper.nodes.launcher.fork_server import ForkServer
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
 from semantic_mapper.nodes.launcher.processes import PROCESS_TABLE, ManagedProcess, node_environment
 from semantic_mapper.nodes.launcher.running import leave_launch_note
-from semantic_mapper.nodes.launcher.systemd import Notifier
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.process_folder import OwnFolder, sweep
-from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import NodeState, Status
 from semantic_mapper.transport.sockets import NewestSubscriber
@@ -33,6 +33,65 @@ MAX_SENTENCE, MAX_SENTENCES = 400, 32  # last words of a node may be long
 END_HEARD_S = 2.0  # after the last camera has ended, a node that was not there then will not hear of it
 
 _log = structlog.get_logger(__name__)
+
+
+class Notifier:
+    """Tells systemd the state of the service (sd_notify). What cannot be sent is logged once.
+
+    Args:
+        address: Path of the socket, "@name" for an abstract one; empty = none.
+        watchdog_s: How often systemd wants a sign of life, at least; 0 = never.
+    """
+
+    def __init__(self, address: str, watchdog_s: float = 0.0) -> None:
+        self._address = address.replace("@", "\0", 1) if address.startswith("@") else address
+        self._watchdog_s = watchdog_s
+        self._last_sign = 0.0
+        self._last_status = ""
+        self._extended_at = float("-inf")
+        self._failed = False
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Notifier:
+        """As systemd has set it up; a watchdog may be meant for another process."""
+        usec, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
+        ours = usec.isdigit() and pid in ("", str(os.getpid()))
+        return cls(environment.get("NOTIFY_SOCKET", ""), int(usec) / 1e6 if ours else 0.0)
+
+    def ready(self, status: str) -> None:
+        """Start-up is over."""
+        self._send(f"READY=1\nSTATUS={_one_line(status)}")
+
+    def stopping(self, extend_s: float) -> None:
+        """The end has begun, and may take so long from now; to be called in a loop."""
+        if time.monotonic() - self._extended_at < min(1.0, extend_s / 3):
+            return
+        self._extended_at = time.monotonic()
+        self._send(f"STOPPING=1\nEXTEND_TIMEOUT_USEC={round(extend_s * 1e6)}")
+
+    def status(self, text: str) -> None:
+        """One line for ``systemctl status``; sent when it changes."""
+        if text != self._last_status:
+            self._last_status = text
+            self._send(f"STATUS={_one_line(text)}")
+
+    def alive(self) -> None:
+        """A sign of life, as often as the watchdog asks for; to be called in a loop."""
+        now = time.monotonic()
+        if self._watchdog_s and now - self._last_sign >= self._watchdog_s / 3:
+            self._last_sign = now
+            self._send("WATCHDOG=1")
+
+    def _send(self, message: str) -> None:
+        if not self._address:
+            return
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+                sender.sendto(message.encode(), self._address)
+        except OSError as error:
+            if not self._failed:
+                _log.warning("systemd_not_reached", what=message.split("\n")[0], reason=str(error))
+            self._failed = True
 
 
 class Launcher:
@@ -93,8 +152,7 @@ class Launcher:
         leave_launch_note(self._launch, folder)
         endpoints = {name: f"ipc://{folder}/{name}" for name in self._launch.sockets()}
         names = [n.name for n in self._launch.nodes]
-        status = LaunchStatus(endpoints, names, self._launch.publish, self._launch.keys)
-        self._status = self._stack.enter_context(status)
+        self._status = LaunchStatus(self._stack, endpoints, names, self._launch.publish, self._launch.keys)
         server = ForkServer(node_environment())
         self._stack.callback(server.close)
         for node in self._launch.nodes:
@@ -135,9 +193,6 @@ class Launcher:
         processes = [p for p in self._processes if p.kind == kind]
         began = time.monotonic()
         while True:
-            if kind == "mapper":  # its map was saved, the results that people look at were not
-                for process in processes:
-                    process.start_to_finish()
             progress = [p.makes_progress(limit_s) for p in processes]  # of all: limits begin now
             if not any(progress):
                 break
@@ -162,13 +217,14 @@ class Launcher:
 
 
 class LaunchStatus:
-    """Publishes a ``Status`` of each node, and one of the launch itself. A context manager.
+    """Publishes a ``Status`` of each node, and one of the launch itself.
 
     Counters and ages of a node's own status are passed on (a player of logs has none: its launcher counts ``published``
-    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``, ``fds`` and ``threads``, and the ages ``start``
+    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms`` and ``fds``, and the ages ``start``
     (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
 
     Args:
+        stack: Its sockets are freed with this.
         endpoints: Of the nodes and, under ``STATUS_SOCKET``, of this topic.
         nodes: Names of those that may publish a status.
         public, keys: A second endpoint for it, see ``PublicPublisher``.
@@ -177,25 +233,15 @@ class LaunchStatus:
         TransportError: the endpoint cannot be bound.
     """
 
-    def __init__(self, endpoints: Mapping[str, str], nodes: Sequence[str], public: str = "", keys: str = "") -> None:
+    def __init__(
+        self, stack: ExitStack, endpoints: Mapping[str, str], nodes: Sequence[str], public: str, keys: str
+    ) -> None:
         self._began = time.monotonic()
         self._reported_at = 0.0
         self._own: dict[str, Status] = {}
-        self._publisher = PublicPublisher(endpoints[STATUS_SOCKET], public, keys, linger_ms=200)
-        self._subscriber = NewestSubscriber([endpoints[name] for name in nodes], ("status",))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the sockets. Harmless when repeated."""
-        self._subscriber.close()
-        self._publisher.close()
+        publisher = PublicPublisher(endpoints[STATUS_SOCKET], public, keys, linger_ms=200)
+        self._publisher = stack.enter_context(publisher)
+        self._subscriber = stack.enter_context(NewestSubscriber([endpoints[name] for name in nodes], ("status",)))
 
     def report(self, processes: Sequence[ManagedProcess], state: NodeState, *, now: bool = False) -> None:
         """Publish, if it is time to."""
@@ -254,7 +300,7 @@ def node_status(managed: ManagedProcess, own: Status | None) -> Status:
 
 
 def process_stats(pid: int) -> dict[str, int]:
-    """``rss_kb``, ``cpu_ms`` (total), ``fds``, ``threads``; empty where the process has ended."""
+    """``rss_kb``, ``cpu_ms`` (total), ``fds``; empty where the process has ended."""
     try:
         process = psutil.Process(pid)
         with process.oneshot():
@@ -263,7 +309,10 @@ def process_stats(pid: int) -> dict[str, int]:
                 "rss_kb": process.memory_info().rss // 1024,
                 "cpu_ms": round(1000 * (times.user + times.system)),
                 "fds": process.num_fds(),
-                "threads": process.num_threads(),
             }
     except (psutil.Error, OSError):
         return {}
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split("\n"))

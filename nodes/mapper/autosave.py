@@ -11,7 +11,7 @@ import structlog
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.nodes.publishing import PartStatus
 
 FIRST_S = 2.0  # until the first save, twice as long until each further one: who is killed often still gets somewhere
 REST_FRACTION = 1.0  # rests as long as it works, so that the next frame finds the processor free half of the time

@@ -15,7 +15,7 @@ from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.mapping.map_types import CorrectedPoses
 from semantic_mapper.mapping.odometry_sessions import OdometrySessions
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries.questions import Correction, CorrectPosesRequest
 from semantic_mapper.replay.corrected_poses import match_frames
 from semantic_mapper.replay.session import MapSession
@@ -131,7 +131,7 @@ class LiveCorrection:
     def _begin(self, request: CorrectPosesRequest) -> tuple[int, int]:
         poses = self._to_frames(request)
         if self._odometry_sessions is not None:
-            poses = self._odometry_sessions.in_map(poses, self._pipeline.corrector.world_by_frame())
+            poses = self._odometry_sessions.in_map(poses)
         known = self._pipeline.corrector.poses()
         stamps = {stamp_ns for _, stamp_ns in known}
         used = sum((key in known) if isinstance(key, tuple) else (key in stamps) for key in poses)

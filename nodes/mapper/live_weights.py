@@ -15,11 +15,11 @@ import structlog
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.mapper import Mapper, make_field
-from semantic_mapper.mapping.views.weights_check import FieldTrial
+from semantic_mapper.mapping.pipeline import FieldTrial
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER, file_of_version, keep_offer, read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
-from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries.questions import Weights, WeightsEntry
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode

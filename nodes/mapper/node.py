@@ -15,7 +15,7 @@ from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.map_scale import FIX
+from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.mapping.moving import KEPT_S
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
@@ -32,12 +32,10 @@ from semantic_mapper.nodes.mapper.resume import (
     resume_map,
     stored_settings,
 )
-from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
-from semantic_mapper.nodes.public_publisher import PublicPublisher
-from semantic_mapper.nodes.status import PartStatus, publish_status
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.publishing import PartStatus, PublicPublisher, publish_status
+from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.run_folder import MAP_NAME, map_path, prepare_folder
 from semantic_mapper.replay.session import MapSession, open_recording
@@ -337,9 +335,9 @@ class MapperNode:
             }
             warnings.append(sessions.warning)
         if not pipeline.voxel_map.scale_known:
-            warnings.append(f"scale: unknown; lengths of the map are not metres: {FIX}")
+            warnings.append(f"scale: unknown; lengths of the map are not metres: {SCALE_FIX}")
         counters |= pipeline.picture_check.counters
-        warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning, pipeline.moving.warning]
+        warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning]
         return PartStatus(counters, tuple(filter(None, warnings)))
 
 

@@ -21,13 +21,13 @@ from typing import Any, NamedTuple, Self
 import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.mapping.map_types import PoseInMap
 from semantic_mapper.mapping.moving import MovingSpace
-from semantic_mapper.mapping.odometry_sessions import PoseInMap
 from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
-from semantic_mapper.nodes.status import PartStatus
+from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries import questions
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror

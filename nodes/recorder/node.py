@@ -15,19 +15,17 @@ import structlog
 
 from semantic_mapper.errors import CodecError, LogError, TransportError
 from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
-from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import NodeJob, RecorderOptions
-from semantic_mapper.nodes.status import publish_status
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.publishing import StatusReport
+from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.log.mcap_scan import read_payloads, scan
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.recording import Recording, RecordingRules, make_way
 from semantic_mapper.replay.log.sequence import parts_on_disk
-from semantic_mapper.transport.codec import decode_as, read_envelope, repack_rgb, unpack_parts
+from semantic_mapper.transport.codec import decode_as, read_envelope, repack_rgb
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import EndOfStream, NodeState, Status, StreamInfo, parse_topic, read_topic
+from semantic_mapper.transport.messages import EndOfStream, NodeState, StreamInfo, parse_topic
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import CameraIntrinsics
 
@@ -36,10 +34,7 @@ WAIT_SLICE_S = 0.2
 QUIET_S = 0.5  # after the end of the stream, answers from other nodes may still be on their way
 MAX_WAITING = 256  # messages that may wait to be written, while the disk or the processor is busy
 MAX_EARLY = 1000  # messages kept while no stream has begun
-STATUS_PERIOD_S = 1.0
 DRAIN_S = 5.0  # after a stop, for what has come before it; less than the `stop_s` of launches
-COUNT_S = 1.0  # then, for counting what is left
-LAST_MESSAGES = 100  # of a log, in which the last frame of each camera is looked for
 DRAINED_S = 0.005  # nothing for so long: all is written; what a camera that runs on sends comes later
 NOTE = "recording"  # the name of the recording, for the process that replaces this one
 
@@ -58,9 +53,15 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> str:
         TransportError: a source cannot be subscribed to, or the endpoint is taken.
     """
     with ExitStack() as stack:
-        reporter = StatusReporter(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
-        recorder = record(context, options, reporter.follow)
-        reporter.tell(recorder, "ended")
+        report = StatusReport(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
+
+        def follow(recorder: Recorder) -> bool:
+            if report.due:
+                _publish_status(report, recorder, "running")
+            return False
+
+        recorder = record(context, options, follow)
+        _publish_status(report, recorder, "ended")
     return "; ".join(filter(None, (recorder.losses, recorder.never_came)))
 
 
@@ -110,20 +111,15 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
 
 
 def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessSubscriber]) -> None:
-    """Write what had come before a stop was requested; what there is no time for is counted."""
+    """Write what had come before a stop was requested, as far as there is time."""
     deadline = time.monotonic() + DRAIN_S
     for source in sources:
         while (parts := source.receive_parts(DRAINED_S)) is not None:
             context.heartbeat.turn()
-            now = time.monotonic()
-            if now < deadline:
-                recorder.take(parts)
-            elif now < deadline + COUNT_S:
-                name = read_topic(parts)[0].name
-                recorder.left += name not in ("info", "end")
-                recorder.received += name == "frame"
-            else:  # a camera that publishes on and on
+            if time.monotonic() > deadline:
+                recorder.cut_off = True
                 break
+            recorder.take(parts)
     recorder.rejected = sum(source.rejected for source in sources)
 
 
@@ -153,8 +149,7 @@ class Recorder:
     Attributes:
         recording: None while no stream has begun.
         rejected: Messages that could not be read.
-        unpacked: Frames that were kept as they came, because they could not be packed as ``options.rgb`` says.
-        left: Messages that had come when there was no more time to write them.
+        cut_off: Whether there was no time to write all that had come before a stop.
         received: Frames that came.
 
     Raises:
@@ -178,15 +173,11 @@ class Recorder:
         if options.rgb != "as-sent":
             self._packing = CodecOptions(rgb=options.rgb, jpeg_quality=options.jpeg_quality)
         self.recording: Recording | None = None
-        self.rejected = self.unpacked = self.left = self.received = 0
+        self.rejected = self.received = 0
+        self.cut_off = False
         self.missing_frames = MissingFrames()
         self._streams = Streams(options.streams)
         self._cameras: dict[str, CameraIntrinsics] = {}  # of all streams so far
-        self._before = _last_frames(self._path) if self._goes_on else {}  # the first frames now should follow these
-        for camera_id, seq in self._before.items():  # what was lost in between is counted
-            self.missing_frames.note(camera_id, seq)
-        self._interrupted: list[str] = []
-        self._early_lost = 0
         self._recorded: set[bytes] = set()  # what the recording holds of streams
         self._early: deque[list[bytes]] = deque(maxlen=MAX_EARLY)
 
@@ -202,14 +193,15 @@ class Recorder:
     @property
     def losses(self) -> str:
         """What was sent and is not in the log, as far as anybody knows, in words; empty = nothing."""
-        r, texts = self.recording, list(self._interrupted)
+        r, texts = self.recording, []
+        if self._goes_on:
+            texts.append("the recorder was restarted, and what was sent meanwhile is missing")
         if r is not None and r.lost:
             texts.append(f"{counted(r.lost, 'message')} not written: {r.trouble or 'the disk was full for a while'}")
-        if self.left:
-            texts.append(f"{counted(self.left, 'message')} not written {DRAIN_S:g} s after the stop")
-        if early := self.received if r is None else self._early_lost:
-            texts.append(f"{counted(early, 'frame')} came before it was known of what stream they are")
-        texts += [f"no frame of camera '{camera}' came after a restart" for camera in sorted(self._before)]
+        if self.cut_off:
+            texts.append(f"what was still not written {DRAIN_S:g} s after the stop")
+        if r is None and self.received:
+            texts.append(f"{counted(self.received, 'frame')} came, but not of what stream they are")
         return "; ".join(texts)
 
     @property
@@ -234,8 +226,6 @@ class Recorder:
             self._recorded.add(bytes(parts[1]))
         elif topic.name != "end":
             if self.recording is None:
-                if len(self._early) == MAX_EARLY:
-                    self._early_lost += parse_topic(self._early[0][0])[0].name == "frame"
                 self._early.append(parts)
             else:
                 self.recording.write(self._packed(parts, topic.name))
@@ -291,79 +281,24 @@ class Recorder:
         if topic != "frame":
             return parts
         envelope = read_envelope(parts)
-        self._note_restart(envelope.source, envelope.seq)
         self.missing_frames.note(envelope.source, envelope.seq)
         if self._packing is None:
             return parts
         try:
             return repack_rgb(parts, self._packing)
         except CodecError as error:  # the reader of the log judges it
-            self.unpacked += 1
             _log.warning("frame_kept_as_sent", seq=envelope.seq, error=str(error))
             return parts
 
-    def _note_restart(self, camera_id: str, seq: int) -> None:
-        """The first frame of a camera after a restart: whether it follows the last one before."""
-        last = self._before.pop(camera_id, None)
-        if last is not None and seq != last + 1:
-            self._interrupted.append(
-                f"between frames {last} and {seq} of camera '{camera_id}' the recorder was restarted, and what was "
-                "sent meanwhile is missing"
-            )
 
-
-def _last_frames(path: Path) -> dict[str, int]:
-    """Numbers of the last frames of each camera at the end of a recording.
-
-    Args:
-        path: Of its first part.
-    """
-    found: dict[str, int] = {}
-    for part in reversed(parts_on_disk(path).values()):
-        with suppress(LogError), part.open("rb") as file:  # not even its head was written
-            for offset, length in scan(file.fileno(), str(part)).chunks[-LAST_MESSAGES:]:
-                with suppress(LogError, CodecError):  # damaged
-                    envelopes = map(read_envelope, map(unpack_parts, read_payloads(file.fileno(), offset, length)))
-                    found |= {e.source: e.seq for e in envelopes if e.topic == "frame"}
-        if found:
-            break
-    return found
-
-
-class StatusReporter:
-    """Publishes how a recorder is, about once a second.
-
-    Args:
-        node: Name of the recorder.
-        publisher: Where.
-    """
-
-    def __init__(self, node: str, publisher: Publisher) -> None:
-        self._node = node
-        self._publisher = publisher
-        self._last_sent = 0.0
-
-    def follow(self, recorder: Recorder) -> bool:
-        """Tell, if it is time to; it is never enough."""
-        if time.monotonic() - self._last_sent >= STATUS_PERIOD_S:
-            self.tell(recorder, "running")
-        return False
-
-    def tell(self, recorder: Recorder, state: NodeState) -> None:
-        """Tell now."""
-        self._last_sent = time.monotonic()
-        counters = {
-            "missed": recorder.missing_frames.missed,
-            "rejected": recorder.rejected,
-            "unpacked": recorder.unpacked,
-        }
-        degraded: tuple[str, ...] = ()
-        if (r := recorder.recording) is not None:
-            counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost + recorder.left}
-            counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
-            degraded = tuple(text for text in (r.trouble,) if text)
-        status = Status(self._node, state, time.monotonic_ns(), counters, degraded=degraded)
-        publish_status(self._publisher, status)
+def _publish_status(report: StatusReport, recorder: Recorder, state: NodeState) -> None:
+    counters = {"missed": recorder.missing_frames.missed, "rejected": recorder.rejected}
+    degraded: tuple[str, ...] = ()
+    if (r := recorder.recording) is not None:
+        counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost}
+        counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
+        degraded = (r.trouble,) if r.trouble else ()
+    report.publish(state, counters, {}, degraded)
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

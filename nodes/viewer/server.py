@@ -7,13 +7,18 @@ browser gets its pages through ``QuietPage``.
 
 from __future__ import annotations
 
+import http.client
 import importlib.util
 import os
+import shutil
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -22,15 +27,17 @@ from urllib.parse import quote
 import structlog
 
 from semantic_mapper.errors import DependencyError, TransportError
-from semantic_mapper.nodes.launcher.liveness import ProgressLimit, cpu_seconds, end_with_launcher
+from semantic_mapper.nodes.launcher.liveness import end_with_launcher
+from semantic_mapper.nodes.local_server import LocalServer
 from semantic_mapper.nodes.process_folder import OwnFolder
-from semantic_mapper.nodes.viewer.privacy_proxy import QuietPage
 
 HOST = "127.0.0.1"  # what is seen has neither keys nor passwords: other machines come in by `ssh -L`
 WEB_PORT, DATA_PORT = 9090, 9876
-START_S = 20.0  # without progress
+START_S = 120.0  # on a machine that has too much to do
 STOP_S = 3.0
+TIMEOUT_S = 10.0  # of one request
 _POLL_S = 0.05
+_KEPT = ("Content-Type", "Content-Length", "rerun-final-length")  # headers that are passed on
 
 _log = structlog.get_logger(__name__)
 
@@ -135,10 +142,9 @@ class WebViewer:
                 process_group=0,  # Ctrl-C is for us; we end it
                 preexec_fn=end_with_launcher,  # and where we are killed, the kernel does
             )
-        pid = self._process.pid
-        limit = ProgressLimit(START_S, lambda: cpu_seconds(pid))
+        deadline = time.monotonic() + START_S
         while not (_answers(web) and _answers(data)):
-            if not self.alive or limit.exceeded():
+            if not self.alive or time.monotonic() > deadline:
                 words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-3:]
                 raise TransportError(f"the web viewer has not started; its last words: {' | '.join(words) or 'none'}")
             time.sleep(_POLL_S)
@@ -174,3 +180,74 @@ def _answers(port: int) -> bool:
     with socket.socket() as client:
         client.settimeout(1.0)
         return client.connect_ex((HOST, port)) == 0
+
+
+class QuietPage:
+    """Serves another server's pages with the order to speak to nobody else, in threads of its own.
+
+    Rerun's viewer reports its use, looks for newer releases and loads a font, whatever its settings. A content security
+    policy is what a browser obeys.
+
+    Args:
+        address: Where; port 0 = any that is free.
+        source: Host and port of the other server.
+        allowed: Origins that the page may fetch from, in addition to this server.
+
+    Raises:
+        TransportError: the port is taken.
+    """
+
+    def __init__(self, address: tuple[str, int], source: tuple[str, int], allowed: tuple[str, ...]) -> None:
+        own = "'self'"
+        policy = (
+            f"default-src {own} 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
+            f"connect-src {' '.join((own, 'data:', 'blob:', *allowed))}; "
+            "form-action 'none'; base-uri 'self'"
+        )
+        try:
+            self._server = LocalServer(address, _make_handler(source, policy))
+        except OSError as error:
+            raise TransportError(f"port {address[1]} cannot be had: {error.strerror}; choose another one") from error
+        self.port = int(self._server.server_address[1])
+        self._thread = threading.Thread(target=self._server.serve_forever, name="web page", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+
+def _make_handler(source: tuple[str, int], policy: str) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        """One request."""
+
+        timeout = TIMEOUT_S
+
+        def do_GET(self) -> None:
+            connection = http.client.HTTPConnection(*source, timeout=TIMEOUT_S)
+            path = self.path.partition("?")[0]
+            if not path.isascii():
+                self.send_error(HTTPStatus.BAD_REQUEST, "addresses are ASCII")
+                return
+            try:
+                connection.request("GET", path)
+                answer = connection.getresponse()
+                self.send_response(answer.status)
+                for name in _KEPT:
+                    if (value := answer.headers.get(name)) is not None:
+                        self.send_header(name, value)
+                self.send_header("Content-Security-Policy", policy)
+                self.send_header("Referrer-Policy", "no-referrer")
+                self.end_headers()
+                shutil.copyfileobj(answer, self.wfile)
+            except (OSError, http.client.HTTPException) as error:  # the browser has left, or the server has ended
+                _log.debug("page_not_served", path=self.path, reason=str(error))
+            finally:
+                connection.close()
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002 (its name there)
+            _log.debug("page_served", request=format % args)
+
+    return Handler

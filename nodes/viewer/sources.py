@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,12 +12,11 @@ import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.errors import MapError, SemanticMapperError, TransportError
+from semantic_mapper.errors import MapError, TransportError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.bridge.packing import thinned, thinning
-from semantic_mapper.nodes.map_poses import MapPoses
+from semantic_mapper.nodes.map_feed import MapFollower, thinned, thinning
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker, find_graph
 from semantic_mapper.queries.snapshot import BlockAges, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
@@ -124,18 +122,19 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
         log.note_scale(snapshot.scale_known)
         show = MapShow(log)
         show.show(snapshot, time.monotonic_ns())
-        following = _Following(client, show, refresh_s)
-        thread = threading.Thread(target=following.run, name="map", daemon=True)
-        thread.start()
+        heard = _Heard()
+
+        def look() -> None:
+            show.show(client.mirror().snapshot(), heard.stamp_ns or time.monotonic_ns())
+
         try:
-            if live.nodes:
-                _follow_nodes(live, log, following, stop)
-                tell("the stream has ended" if not stop else "stopped")
-            while not stop and not live.nodes:
-                time.sleep(POLL_S)
+            with MapFollower(look, refresh_s):
+                if live.nodes:
+                    _follow_nodes(live, log, heard, stop)
+                    tell("the stream has ended" if not stop else "stopped")
+                while not stop and not live.nodes:
+                    time.sleep(POLL_S)
         finally:
-            following.ended.set()
-            thread.join()
             log.close()
 
 
@@ -153,32 +152,12 @@ def _first_snapshot(client: MapClient, stop: StopRequest, tell: Callable[[str], 
     return None
 
 
-class _Following:
-    """Shows the map of a running mapper again and again, in a thread of its own."""
-
-    def __init__(self, client: MapClient, show: MapShow, refresh_s: float) -> None:
-        self.ended = threading.Event()
-        self.stamp_ns = 0  # of the newest frame
-        self._client = client
-        self._show = show
-        self._refresh_s = refresh_s
-        self._troubled = False
-
-    def run(self) -> None:
-        """Until ``ended``; then once more, for what has come since."""
-        ended = False
-        while not ended:
-            ended = self.ended.wait(self._refresh_s)
-            try:
-                self._show.show(self._client.mirror().snapshot(), self.stamp_ns or time.monotonic_ns())
-                self._troubled = False
-            except SemanticMapperError as error:
-                if not (self._troubled or ended):  # a mapper that starts again has no map for a while
-                    _log.warning("map_not_shown", reason=str(error))
-                self._troubled = True
+@dataclass(slots=True)
+class _Heard:
+    stamp_ns: int = 0  # of the newest frame
 
 
-def _follow_nodes(live: Live, log: RerunLog, following: _Following, stop: StopRequest) -> None:
+def _follow_nodes(live: Live, log: RerunLog, heard: _Heard, stop: StopRequest) -> None:
     """Show frames and what was rendered for them until all streams have ended: cameras wait for their listeners."""
     intrinsics: dict[str, CameraIntrinsics] = {}
     streams, poses = Streams(live.streams), MapPoses()
@@ -188,7 +167,7 @@ def _follow_nodes(live: Live, log: RerunLog, following: _Following, stop: StopRe
             match message:
                 case PosedFrame():
                     intrinsics[message.camera_id] = message.intrinsics
-                    following.stamp_ns = message.stamp_ns
+                    heard.stamp_ns = message.stamp_ns
                     pose = poses.place(message.world, message.T_world_camera)
                     if pose is None:  # the mapper does not know yet where in the map it was taken
                         log.log_frame(message, posed=False)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.metrics import confusion_of
-from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float32

@@ -16,7 +16,6 @@ from torch.nn import functional
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, Segments, confusion_of
 from semantic_mapper.evaluation.panoptic import PanopticImage
-from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
@@ -85,7 +84,7 @@ def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
         kind: lambda frame: _mapped(bundle.pipeline, frame),
         f"{kind}, novel view": lambda frame: _mapped(pipeline, frame),
     }
-    if type(bundle.checkpoint.model).source_logits is not LearnedField.source_logits and kind != "unet":
+    if bundle.checkpoint.model.classifies_images and kind != "unet":
         found["own image alone"] = lambda frame: _of_image(bundle, frame)
     return found
 

@@ -14,21 +14,19 @@ from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
 from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.files.floor_plan import FREE, OCCUPIED, UNKNOWN, find_up, occupancy_grid, write_map_server
 from semantic_mapper.mapping.files.formats import (
     ColorBy,
     colored,
     sure_faces,
     sure_points,
     write_glb,
-    write_map_server,
     write_npz,
     write_obj,
     write_ply,
 )
-from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
-from semantic_mapper.mapping.map_scale import require_metres
-from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.types import Float64

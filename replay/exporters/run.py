@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple, get_args
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import atomic_folder, atomic_path, write_bytes
-from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT
 from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter

@@ -223,8 +223,6 @@ class _Lens:
             self.source, self.about = f"found, beginning with the given {options.focal_prior_px:g}", False
         if options.calibration is None:
             return
-        if options.focal_prior_px is not None:
-            raise ConfigError("give a calibration or a guess of the focal length, not both")
         given = rotate_intrinsics(load_calibration(options.calibration), options.quarters)
         if given.width * film.full_height != given.height * film.full_width:
             raise ConfigError(

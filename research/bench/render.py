@@ -26,7 +26,7 @@ from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import sample_guided
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS, LabelSet
-from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
+from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer
 from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.training.views import stack_sources, view_from_frame

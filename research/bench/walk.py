@@ -185,6 +185,8 @@ class _StepLog:
         truth = label_set.to_ids(label_set.channel_map_from(ROOMS)[frame.label])
         self.confusions[int(minute)].update(truth, update.label, f"frame {frame.seq}")
         stored = voxel_map.stored_blocks
+        with voxel_map.locked() as grid:
+            stored_bytes = grid.stored_bytes
         self.rows.append(
             (
                 minute,
@@ -195,7 +197,7 @@ class _StepLog:
                 resident_mb(),
                 voxel_map.block_count - stored,
                 stored,
-                voxel_map.stored_bytes / 1e6,
+                stored_bytes / 1e6,
                 len(self.pipeline.keyframes),
                 len(update.source_seqs),
                 update.blocks_touched,
@@ -210,7 +212,9 @@ class _StepLog:
         by_minute = [of for of in by_minute if of.any()]
         rss = [float(counted["rss_mb"][of].max()) for of in by_minute]
         scores = [confusion.metrics().miou for confusion in self.confusions]
-        most_touched, block_bytes = int(table["blocks_touched"].max()), self.pipeline.voxel_map.block_bytes
+        most_touched = int(table["blocks_touched"].max())
+        with self.pipeline.voxel_map.locked() as grid:
+            block_bytes = grid.block_bytes
 
         def minutely(name: str, of: Callable[[NDArray[np.float64]], Any], digits: int = 1) -> list[float]:
             return [round(float(of(counted[name][rows])), digits) for rows in by_minute]

@@ -22,20 +22,20 @@ import numpy as np
 import torch
 
 from research.experiments.grid_scenes import BOX_M, object_frames, objects_scene
+from research.peers.kinds import build_field
 from research.peers.semantic_nerf import config_for_scene
 from research.scenes import VALIDATION_SEEDS, NoiseConfig
 from research.scenes.sequence import room_views
 from semantic_mapper.config import GridFieldConfig, SamplingConfig
 from semantic_mapper.fields.checkpoint import anchor_from_frame
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
 from semantic_mapper.training.finetune import finetune
-from semantic_mapper.training.grid_fit import OPACITY, fit_grid, fit_scene, psnr_of
+from semantic_mapper.training.grid_fit import OPACITY, fit_grid, psnr_of
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
@@ -70,9 +70,8 @@ def measure_room(seed: int, out: Path | None, settings: GridFitConfig) -> list[s
     seen = [v.frame for i, v in enumerate(views) if (i + 1) % ROOM_EVERY]
     grid = msgspec.structs.replace(settings, held_out=0)
     began = time.process_time()
-    fitted: LearnedField = fit_scene(
-        seen, ROOMS, None, FinetuneConfig(seconds=0, steps=grid.steps, width=160, grid=grid)
-    ).model
+    settings_of_grid = FinetuneConfig(seconds=0, steps=grid.steps, width=160, grid=grid)
+    fitted: LearnedField = finetune(seen, ROOMS, None, settings_of_grid, kind="grid").model
     seconds = time.process_time() - began
     rows = [_room_row(f"grid, room {seed}", fitted, held_out, seconds, out)]
     limit = time.process_time() + seconds

@@ -21,9 +21,8 @@ from torch.nn import functional
 
 from research.peers.unet3d import LEVELS, UNet3d
 from semantic_mapper.config import AtLeastOne, Config, GridConfig
-from semantic_mapper.fields.nesf import Near, near_cells
+from semantic_mapper.fields.nesf import Near, cell_levels, near_cells
 from semantic_mapper.fields.scene.grid import SceneGrid
-from semantic_mapper.fields.sparse_conv import cell_levels
 from semantic_mapper.labels import LabelSet
 
 DENSE = 0.01  # opacity of a voxel from which on there is something

@@ -18,12 +18,12 @@ from torch import nn
 from torch.nn import functional
 
 from research.peers.config import NeuRayConfig
+from research.peers.rendering import composite_render, weighted_moments
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import EncodedViews, check_views, depth_at, encoded_views, spread_at, sure_depth
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.source_views import check_views, depth_at, encoded_views, spread_at, sure_depth
-from semantic_mapper.fields.sray_layers import (
+from semantic_mapper.fields.sray import (
     CUES,
     LEAST_VISIBILITY,
     DensityNet,
@@ -31,7 +31,7 @@ from semantic_mapper.fields.sray_layers import (
     contextual_space,
     softmax_weights,
 )
-from semantic_mapper.fields.volume import composite, composite_render, compositing_weights, weighted_moments
+from semantic_mapper.fields.volume import composite, compositing_weights
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 

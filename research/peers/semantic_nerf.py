@@ -16,13 +16,14 @@ from torch import nn
 from torch.nn import functional
 
 from research.peers.config import SemanticNeRFConfig
+from research.peers.rendering import composite_render, density_from
+from research.peers.seen_bounds import seen_bounds
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.scene.grid import density_from, encode_frequencies, encoded_size, relu_layers
-from semantic_mapper.fields.source_views import check_views, encoded_views, seen_bounds
-from semantic_mapper.fields.volume import composite, composite_render, compositing_weights, interval_lengths
+from semantic_mapper.fields.scene.grid import encode_frequencies, encoded_size, relu_layers
+from semantic_mapper.fields.volume import composite, compositing_weights, interval_lengths
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -70,10 +71,6 @@ class SemanticNeRF(LearnedField):
         """
         check_views(views)
         return encoded_views(views, views.rgb[:, :0])
-
-    def scene_config(self, views: SourceViews, far_m: float) -> SemanticNeRFConfig:
-        """This shape, in the smallest box that holds what the views can see."""
-        return config_for_scene(views, far_m, self.config)
 
     def render_samples(
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from semantic_mapper.fields.sparse_conv import CellLevel, Down, SubmanifoldConv, Up
+from semantic_mapper.fields.nesf import CellLevel, Down, SubmanifoldConv, Up
 
 LEVELS = 3
 

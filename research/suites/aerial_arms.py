@@ -31,9 +31,10 @@ from research.suites.aerial import (
 from research.suites.plateau import fit_to_plateau
 from research.suites.scene_runs import ViewScores
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
-from semantic_mapper.types import Float32, PosedFrame, UInt8
+from semantic_mapper.types import Float32, PosedFrame, SourceViews, UInt8
 
 _log = get_logger(__name__)
 
@@ -42,6 +43,7 @@ PATCH = 7  # pixels a side
 DARKEST = 0.15  # light of the U-Net's darkest pictures where it is trained with such
 
 _BATCH = 4096
+_GAMMA = 2.2  # of the camera's pictures
 _MOST_DOUBLINGS = 3
 _BLOCK = 16  # pixels a side of what is held out of labelled views
 _HELD_OUT = 8  # one block in so many
@@ -94,8 +96,24 @@ def patch_arm(config: AerialConfig, episode: Episode) -> ViewScores:
     return found
 
 
+class DimmedUNet(UNetBaseline):
+    """A U-Net for whose training images are scaled by a number from ``darkest`` to 1, in linear light."""
+
+    def __init__(self, label_set: LabelSet, config: UNetConfig, darkest: float) -> None:
+        super().__init__(label_set, config)
+        self.darkest = darkest
+
+    def varied(self, sources: SourceViews, generator: torch.Generator) -> SourceViews:
+        """As the base's, and dimmed."""
+        sources = super().varied(sources, generator)
+        if self.darkest == 1:
+            return sources
+        light = self.darkest + (1 - self.darkest) * torch.rand(len(sources.rgb), 1, 1, 1, generator=generator)
+        return replace(sources, rgb=sources.rgb * light ** (1 / _GAMMA))
+
+
 def unet_fit(darkest: float = 1.0) -> Fit:
-    """The per-image U-Net on the labelled views, past its plateau; ``darkest``: see ``UNetConfig``.
+    """The per-image U-Net on the labelled views, past its plateau; ``darkest``: see ``DimmedUNet``.
 
     One block in eight of the labelled views is held out. The network is fitted again with twice the steps until those
     after four fifths of them bring less than half a point of mIoU there.
@@ -122,8 +140,8 @@ def _fit_unet(
     config: AerialConfig, frames: list[PosedFrame], held_out: list[PosedFrame], steps: int, darkest: float
 ) -> tuple[UNetBaseline, float]:
     """A U-Net fitted to ``frames``, and what the last fifth of the steps brought at ``held_out``."""
-    settings = UNetConfig(steps=steps, width=config.width, batch=2, seed=config.seed, darkest=darkest)
-    unet = UNetBaseline(AERIAL_SUITE.label_set, settings)
+    settings = UNetConfig(steps=steps, width=config.width, batch=2, seed=config.seed)
+    unet = DimmedUNet(AERIAL_SUITE.label_set, settings, darkest)
     before: list[float] = []
 
     def look(fraction: float) -> None:

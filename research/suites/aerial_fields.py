@@ -29,7 +29,7 @@ from research.suites.aerial_grids import FIT_NEAR_M, NEAR_M, TownGrid, grid_dept
 from semantic_mapper.fields.scene.grid import SceneGrid
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.baselines import WarpBaseline
-from semantic_mapper.training.finetune import held_out_blocks
+from semantic_mapper.training.fit import held_out_blocks
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays
 from semantic_mapper.types import PosedFrame, UInt8
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false
 import hashlib
 import json
-import math
 from pathlib import Path
 
 import msgspec
@@ -42,8 +41,9 @@ from semantic_mapper.fields.scene.irt import IRT, TEXTURE, TextureNet
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import FinetuneConfig
+from semantic_mapper.training.fit import Budget
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.grid_fit import GridFit, fit_trunk
+from semantic_mapper.training.grid_fit import GridFit, fit_trunk, trunk_steps
 from semantic_mapper.training.irt import ClassFit, labelled_rays
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import Float32, PosedFrame, UInt8
@@ -131,7 +131,7 @@ def fit_classes(config: AerialConfig, episode: Episode, field: IRT, frames: list
     """Stage 2: classes from the labelled views; one block in eight of these chooses the weights."""
     settings = finetune_settings(config, episode.town)
     fit = ClassFit(field, labelled_rays(frames, AERIAL_SUITE.label_set, settings), settings)
-    best, _ = fit.run(0.0)
+    best, _ = fit.run(Budget(settings.seconds, settings.steps, settings.evaluations))
     field.eval()
     _log.info("irt_fitted", variant=field.shape.variant, step=best.step, accuracy=round(best.accuracy, 4))
 
@@ -180,7 +180,7 @@ def _load_trunk(config: AerialConfig, episode: Episode, field: IRT, start: TownG
         return
     frames = training_frames(config, episode)
     gains: Float32 = np.ones((len(frames), 3), np.float32)
-    fit = GridFit(field.grid, config.grid_steps, 0.0, start.psnr, math.nan, tuple(frames), gains)
-    psnr = fit_trunk(field, fit, settings)
+    fit = GridFit(field.grid, config.grid_steps, start.psnr, tuple(frames), gains)
+    psnr = fit_trunk(field, fit, settings, Budget(settings.seconds, trunk_steps(settings)))
     _log.info("trunk_fitted", town=episode.town, psnr=round(psnr, 2))
     write_bytes(path, save({name: tensor.contiguous() for name, tensor in field.trunk.state_dict().items()}))

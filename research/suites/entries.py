@@ -9,20 +9,20 @@ from pathlib import Path
 
 import torch
 
+from research.peers.kinds import build_field
 from research.scenes.suite import ROOMS_SUITE
 from research.suites.protocols import Entry
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import find_checkpoint, load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
 
 
 def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry]:
     """Load weights files onto the GPU where there is one, else the CPU; each is named by its file or its folder.
 
     Args:
-        kinds: Names of ``fields.registry`` that take part with random weights and default settings, after the files.
+        kinds: Names of ``fields.learned`` that take part with random weights and default settings, after the files.
 
     Raises:
         WeightsError: a file that cannot be used, or one given twice.

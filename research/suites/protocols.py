@@ -19,6 +19,7 @@ from research.suites.config import (
 from research.suites.predict import predict_view
 from research.suites.records import CurvePoint, RoomRecord, Rows
 from research.suites.rooms import BenchmarkRoom, as_given
+from research.suites.scene_box import scene_config
 from research.suites.scoring import (
     Answer,
     as_rows,
@@ -33,12 +34,12 @@ from research.suites.views import Sources, choose_as_mapper, choose_covering, ch
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.checkpoint import adapt_model
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import LearnedField, build_field
+from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.baselines import WarpBaseline
+from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews
@@ -159,7 +160,7 @@ def _source_count(field: LearnedField, suite: SuiteConfig) -> int:
 
 def _shows_own(field: LearnedField, suite: SuiteConfig) -> bool:
     """Whether the query's own image is a source view."""
-    return field.needs_own_view or field.reads_own_view or (suite.protocol == "generalize" and suite.own_image)
+    return field.needs_own_view or isinstance(field, IRT) or (suite.protocol == "generalize" and suite.own_image)
 
 
 def _answer(
@@ -202,18 +203,17 @@ def _fit_and_score(
     frames += [as_given(room.given[n], depth=True) for n in keyframes.unlabelled]
     views = stack_sources([view_from_frame(frame, room.label_set, suite.tier.width) for frame in frames])
     field = _start(entry, suite, views, room.label_set)
-    fit = fitter_of(field.kind)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
     device = next(field.parameters()).device
     if suite.scene.seconds > 0:  # what the first step of a process costs more is no part of any budget
         one_step = msgspec.structs.replace(fit_config(suite, 1.0), seconds=0, steps=1, held_out_rays=64)
-        fit(frames, room.label_set, _start(entry, suite, views, room.label_set), one_step)
+        finetune(frames, room.label_set, _start(entry, suite, views, room.label_set), one_step)
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
         start = _start(entry, suite, views, room.label_set)
         progress = _progress(on_fit, spent, share, whole)
-        fitted = fit(frames, room.label_set, start, fit_config(suite, share), progress, stopped)
+        fitted = finetune(frames, room.label_set, start, fit_config(suite, share), progress, stopped)
         if stopped():
             return None
         answers = answer_from_keyframes(room, fitted.model.to(device).eval(), suite, keyframes)
@@ -241,7 +241,7 @@ def _start(entry: Entry, suite: SuiteConfig, views: SourceViews, label_set: Labe
     field = entry.field
     if suite.protocol == "finetune" and entry.file:
         return adapt_model(field, label_set)
-    config = field.scene_config(views, suite.tier.guided.far_m)
+    config = scene_config(field, views, suite.tier.guided.far_m)
     return build_field(field.kind, config, label_set, field.sampling).to(next(field.parameters()).device)
 
 

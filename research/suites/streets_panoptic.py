@@ -36,7 +36,7 @@ from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig
-from semantic_mapper.training.panoptic import fit_panoptic
+from semantic_mapper.training.finetune import finetune
 from semantic_mapper.types import PosedFrame
 
 _log = get_logger(__name__)
@@ -119,7 +119,7 @@ def street_field(config: StreetsConfig, street: Drive, name: str, folder: Path) 
     if name == NO_DEPTH or not config.field_depth:
         frames = [replace(frame, depth_m=None) for frame in frames]
     began = time.process_time()
-    checkpoint = fit_panoptic(frames, STREETS_SUITE.label_set, start, settings)
+    checkpoint = finetune(frames, STREETS_SUITE.label_set, start, settings)
     seconds = round(time.process_time() - began, 1)
     _log.info("street_field", arm=name, street=street.seed, cpu_s=seconds, **checkpoint.recipe["panoptic"])
     save_checkpoint(checkpoint, path)

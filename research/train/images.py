@@ -18,7 +18,6 @@ from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.losses import Loss, guess_loss, image_loss
-from semantic_mapper.training.step import classifies_images
 from semantic_mapper.training.views import (
     LabelledView,
     jitter_colours,
@@ -115,7 +114,7 @@ def encoder_for_images(model: LearnedField) -> ImageEncoder:
         ConfigError: a kind of field that says nothing of an image by itself.
     """
     encoder = model.image_encoder
-    if encoder is None or not classifies_images(model):
+    if encoder is None or not model.classifies_images:
         raise ConfigError(
             f"a field of kind '{model.kind}' does not classify single images, so it can only learn from rays: set "
             "fraction = 0 under [images] in the file that --config names, as recipes/cpu-rays.toml does, and take "

@@ -39,10 +39,10 @@ from semantic_mapper.fields.nesf import (
     NesfWeights,
     SurfacePoints,
     near_cells,
+    pack_cells,
     pool,
     smoothed_votes,
 )
-from semantic_mapper.fields.sparse_conv import pack_cells
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.fit import budget_fraction
@@ -449,6 +449,16 @@ def _validate(model: Nesf, maps: Sequence[TrainingMap]) -> dict[str, Any]:
     return {name: round(value, 5) for name, value in figures.items()}
 
 
+@torch.no_grad()
+def trust(model: Nesf, fraction: float) -> None:
+    """Blend the answers about classes with the smoothed votes: 1 = leave them as they are, 0 = smoothed votes."""
+    head, classes = model.net.head, slice(0, -3)
+    head.weight[classes] *= fraction
+    head.bias[classes] *= fraction
+    head.bias[-5] += 1 - fraction
+    head.bias[-4] -= 1 - fraction
+
+
 @torch.inference_mode()
 def _fit_to_validation(model: Nesf, maps: Sequence[TrainingMap]) -> float:
     """Set how far the network is trusted against smoothed votes, and the temperature: labels of the maps are likeliest.
@@ -467,7 +477,7 @@ def _fit_to_validation(model: Nesf, maps: Sequence[TrainingMap]) -> float:
         for t in TEMPERATURES.tolist()
     }
     trusted, temperature = min(losses, key=losses.__getitem__)
-    model.trust(trusted)
+    trust(model, trusted)
     model.temperature.fill_(temperature)
     return trusted
 

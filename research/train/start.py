@@ -29,6 +29,8 @@ _THEIR_NORMS = {"expand_norm": "_bn0", "depthwise_norm": "_bn1", "project_norm":
 _THEIR_LAYERS = {"expand": "_expand_conv", "depthwise": "_depthwise_conv", "project": "_project_conv"} | _THEIR_NORMS
 _log = get_logger(__name__)
 
+IMAGE_PARTS = ("semantic", "classifier")  # modules of S-Ray that classify an image's features by themselves
+
 
 def take_over(field: LearnedField, path: Path) -> dict[str, Any]:
     """Copy all weights of a file into ``field``, which may have more classes; returns the file's ``recipe.origin``.
@@ -79,8 +81,8 @@ def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
 
 def _take_over_classifier(field: LearnedField, start: LearnedField) -> bool:
     """Classify images as ``start`` does; False where the field cannot."""
-    if start.kind == field.kind and field.image_parts:
-        theirs = {name: t for name, t in start.state_dict().items() if name.split(".")[0] in field.image_parts}
+    if start.kind == field.kind == SRay.kind:
+        theirs = {name: t for name, t in start.state_dict().items() if name.split(".")[0] in IMAGE_PARTS}
         field.load_state_dict(field.state_dict() | theirs)
         return True
     if not isinstance(field, SRay) or not isinstance(start, UNetField):

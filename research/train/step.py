@@ -21,15 +21,14 @@ from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, 
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
 from semantic_mapper.training.losses import COLOUR, DEPTH, IGNORE, SEMANTIC, Loss, guess_loss, image_loss, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
     draw_pixels,
+    guided_rays,
     jitter_colours,
     mirrored_view,
-    query_rays,
     stack_sources,
     withhold_depth,
 )
@@ -193,7 +192,17 @@ def draw_rays(
     flat = draw_pixels(target.channel, config.rays, config.balanced_fraction, generator, classes)
     if len(flat) == 0:
         return None
-    rays, targets, z = _draw_samples(target, flat, config, blind, generator)
+    rays, targets, z = guided_rays(
+        target,
+        flat,
+        config.sampling,
+        generator,
+        noise=config.prior_noise,
+        withheld=config.depth_dropout,
+        samples_without_depth=config.samples_without_depth,
+        blind=blind,
+        thinning=config.no_depth_thinning,
+    )
     if config.natural_prior:
         targets = replace(targets, weight=natural_weights(targets.channel, target.channel, config.balanced_fraction))
     return rays, targets, z
@@ -270,20 +279,3 @@ def _sources(
     own = torch.tensor([i == query for i in sources], device=stacked.channel.device)
     stacked = replace(stacked, channel=torch.where(own[:, None, None], IGNORE, stacked.channel))
     return withhold_labels(stacked, config.label_dropout, generator)
-
-
-def _draw_samples(
-    target: LabelledView, flat: torch.Tensor, config: StepConfig, blind: bool, generator: torch.Generator
-) -> tuple[RayBatch, RayTargets, torch.Tensor]:
-    noise = 1 + config.prior_noise * torch.randn(len(flat), generator=generator)
-    withheld = float(torch.rand(1, generator=generator)) < config.depth_dropout
-    near_m, far_m = config.sampling.near_m, config.sampling.far_m
-    depth_m = target.depth_m if target.computed_m is None else target.computed_m
-    if blind or withheld or not bool((depth_m > 0).any()):
-        rays, targets = query_rays(target, flat[:: config.no_depth_thinning], near_m=near_m, far_m=far_m, prior=None)
-        return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, config.samples_without_depth, generator)
-    # Computed depth has errors of its own.
-    prior = depth_m.flatten()[flat] * noise if target.computed_m is None else depth_m.flatten()[flat]
-    rays, targets = query_rays(target, flat, near_m=near_m, far_m=far_m, prior=prior)
-    sampling = config.sampling if target.computed_m is None else around_computed(config.sampling)
-    return rays, targets, sample_guided(rays, sampling)

@@ -16,6 +16,7 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
+from research.peers.kinds import build_field
 from research.scenes import SUITE_VERSION
 from research.train.folder_lock import sole_use_of
 from research.train.images import ImageBatch, images_loss
@@ -36,7 +37,6 @@ from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.device import bfloat16_is_fast, choose_device, compute_in_bfloat16
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.fit import budget_fraction, cosine_rate, make_optimiser, set_rates
@@ -134,8 +134,10 @@ class _Run:
         self.field = build_field(config.kind, config.field, ROOMS).to(device)
         check_field(self.field, config)
         trained = config.imagenet or config.start or config.encoder_from
+        self.frozen: list[nn.Module] = []
         if config.backbone_rate == 0 and trained and self.field.image_encoder is not None:
-            self.field.image_encoder.freeze_backbones()
+            self.frozen += self.field.image_encoder.backbones()
+            self.field.image_encoder.freeze(*self.frozen)
         self.loss: nn.Module = _StepLoss(self.field, config)
         if ranks.world > 1:  # parts that a config switches off (an attention, say) get no gradient
             self.loss = DistributedDataParallel(self.loss, find_unused_parameters=True)
@@ -221,8 +223,8 @@ class _Run:
         generator = torch.Generator().manual_seed(seed)
         share = self._images_share()
         if (encoder := self.field.image_encoder) is not None and encoder.depth_net is not None:
-            frozen = config.images.frozen_colours and progress.depth_grown and fraction < share
-            encoder.freeze_colours(frozen)
+            rests = config.images.frozen_colours and progress.depth_grown and fraction < share
+            encoder.freeze(*self.frozen, *([encoder.colour_net] if rests else []))
         later = config.images.later
         on_images = fraction < share or (later > 0 and float(torch.rand(1, generator=generator)) < later)
         batch = self._draw_images(pool, generator) if on_images else self._draw(pool, generator)

@@ -12,7 +12,7 @@ from research.train.step import encodes_views_separately
 from research.train.train_config import TrainConfig
 from research.train.train_state import unfinished_step
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.device import check_parts, to_device
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.types import SourceViews
 
@@ -50,7 +50,11 @@ def check_field(field: LearnedField, config: TrainConfig) -> None:
             "pool.computed_depth: this encoder is shown no computed depth; set depth = true and computed_depth = true "
             "in [field.encoder]"
         )
-    check_parts(field, config.bfloat16)
+    parts = dict(field.named_modules())
+    for name in config.bfloat16:
+        if not name or name not in parts:
+            children = ", ".join(child for child, _ in field.named_children())
+            raise ConfigError(f"bfloat16: the field has no part '{name}'; there are {children}")
     if config.encode_together and not _encodes_views_separately(field):
         raise ConfigError(
             f"encode_together: fields of kind '{field.kind}' encode views in the light of each other, so the rooms of "

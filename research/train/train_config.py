@@ -31,7 +31,7 @@ class TrainStepConfig(StepConfig, frozen=True):
 class TrainConfig(Config, frozen=True):
     """A training run."""
 
-    kind: str = "sray"  # of field, as in ``fields.registry``
+    kind: str = "sray"  # of field, as in ``fields.learned``
     field: dict[str, Any] = msgspec.field(
         default_factory=dict
     )  # settings of that kind; what is left out keeps its default

@@ -24,8 +24,7 @@ from safetensors.torch import save
 
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import SemanticMapperError, WeightsError
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
@@ -44,16 +43,11 @@ DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
-    """A field with its provenance.
+    """A field with its provenance."""
 
-    Args:
-        model: In evaluation mode.
-        anchors: Frames the field was finetuned on, at working resolution.
-        recipe: How it was trained: plain data (seed, steps, seconds, figures, git revision, ``train_stamps_ns``, ...).
-    """
-
-    model: LearnedField
-    anchors: tuple[PosedFrame, ...] = ()
+    model: LearnedField  # in evaluation mode
+    anchors: tuple[PosedFrame, ...] = ()  # Frames the field was finetuned on, at working resolution
+    # How it was trained: plain data (seed, steps, seconds, figures, git revision, ``train_stamps_ns``, ...)
     recipe: dict[str, Any] = field(default_factory=dict[str, Any])
 
     @property
@@ -97,10 +91,7 @@ def _shipped() -> Path:
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -> None:
     """Write atomically; ``half`` stores weights as float16 (half the size, for shipping).
-
-    Raises:
-        WeightsError: it cannot be written there.
-    """
+    Raises WeightsError: it cannot be written there."""
     try:
         data = checkpoint_bytes(checkpoint, half=half)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -111,10 +102,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
 
 def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
     """The weights file of a checkpoint; ``half`` as of ``save_checkpoint``.
-
-    Raises:
-        SafetensorError: tensors that the format does not know.
-    """
+    Raises SafetensorError: tensors that the format does not know."""
     half = half or checkpoint.model.stored_in_half
     # Running variances span more powers of ten than float16 has.
     tensors = {
@@ -147,10 +135,7 @@ def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[st
 
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a weights file; a name of weights that ship with the package ("rooms-computed-depth") will do.
-
-    Raises:
-        WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config.
-    """
+    Raises WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config."""
     path = find_checkpoint(path)
     tensors, metadata = open_weights(path)
     try:
@@ -181,10 +166,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     """Tensors and metadata of a weights file of this project, of any kind, joined with those of its base.
-
-    Raises:
-        WeightsError: missing, damaged, of another format or version, or its base is.
-    """
+    Raises WeightsError: missing, damaged, of another format or version, or its base is."""
     if path.exists() and not path.is_file():
         raise WeightsError(f"{path}: is no regular file; copy its content to one")
     if not path.exists():
@@ -214,10 +196,7 @@ def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
 
 def check_same_shape(path: Path, like: Checkpoint) -> None:
     """Make sure that a file holds weights of the same network and classes, before anything is made as it says.
-
-    Raises:
-        WeightsError: no weights file, or one of another network or of other classes.
-    """
+    Raises WeightsError: no weights file, or one of another network or of other classes."""
     try:
         with safe_open(path, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
@@ -280,11 +259,7 @@ def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
 
 
 def _checked_recipe(recipe: Any) -> dict[str, Any]:
-    """The recipe, if it is one whose parts that are read here can be.
-
-    Raises:
-        ValueError, TypeError: it is not.
-    """
+    """The recipe, if it is one whose parts that are read here can be. Raises ValueError, TypeError: it is not."""
     if not isinstance(recipe, dict):
         raise TypeError(f"the recipe is {type(recipe).__name__}, not a table")
     if not 4 <= int(recipe.get("width", DEFAULT_WIDTH)) <= MAX_WIDTH:
@@ -365,10 +340,6 @@ def label_set_to_plain(label_set: LabelSet) -> dict[str, Any]:
 
 
 def label_set_from_plain(data: dict[str, Any]) -> LabelSet:
-    """What ``label_set_to_plain`` gave.
-
-    Raises:
-        KeyError, TypeError, ValueError, LabelError: it is something else.
-    """
+    """What ``label_set_to_plain`` gave. Raises KeyError, TypeError, ValueError, LabelError: it is something else."""
     colors = tuple((int(r), int(g), int(b)) for r, g, b in data["colors"])
     return LabelSet(str(data["name"]), tuple(data["ids"]), tuple(data["names"]), colors, int(data["ignore_id"]))

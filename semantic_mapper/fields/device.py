@@ -32,10 +32,7 @@ BFLOAT16_PARTS = ("encoder", "radial", "cross", "semantic")
 
 def choose_device(name: DeviceName, local_rank: int) -> torch.device:
     """``auto`` takes a GPU where there is one; of several, each rank of this machine takes its own.
-
-    Raises:
-        ConfigError: ``cuda`` is requested and there are fewer GPUs than ranks.
-    """
+    Raises ConfigError: ``cuda`` is requested and there are fewer GPUs than ranks."""
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "cpu" or (name == "auto" and count == 0):
         return torch.device("cpu")
@@ -64,28 +61,11 @@ def compute_in_bfloat16(model: nn.Module, names: Sequence[str], device_type: str
 
     Only named parts: reprojection in bfloat16, whose mantissa has 8 bits, would miss its pixel by several pixels.
     Weights stay float32, as do names in the state dict.
-
-    Raises:
-        ConfigError: no part of that name.
     """
-    check_parts(model, names)
     parts = dict(model.named_modules())
     for name in names:
         part: Any = parts[name]
         part.forward = _in_bfloat16(part.forward, device_type)
-
-
-def check_parts(model: nn.Module, names: Sequence[str]) -> None:
-    """Refuse names of parts that ``model`` does not have.
-
-    Raises:
-        ConfigError: no part of that name.
-    """
-    parts = dict(model.named_modules())
-    for name in names:
-        if not name or name not in parts:
-            children = ", ".join(child for child, _ in model.named_children())
-            raise ConfigError(f"bfloat16: the field has no part '{name}'; there are {children}")
 
 
 @contextmanager

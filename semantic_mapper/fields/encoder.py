@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.source_views import sure_depth
+from semantic_mapper.fields.base import sure_depth
 from semantic_mapper.types import SourceViews
 
 COLOURS = 3
@@ -56,15 +56,7 @@ REFERENCE_WIDTH = 160
 GRAVITY_COLUMNS = 40  # columns of the coarse grid that gravity and the lowest point are found on
 LOWEST_FRACTION = 0.02  # of the points lie below the one that counts as the lowest
 NEAREST_M = 0.2
-GRAVITY_STEPS_DEG = (
-    45.0,
-    45.0,
-    45.0,
-    15.0,
-    15.0,
-    15.0,
-    15.0,
-)  # how far from level or plumb a surface may be, step by step
+GRAVITY_STEPS_DEG = (45.0, 45.0, 45.0, 15.0, 15.0, 15.0, 15.0)  # from level or plumb that a surface may be, by step
 
 
 class ResidualBlock(nn.Module):
@@ -103,39 +95,6 @@ class UpBlock(nn.Module):
         height, width = skip.shape[-2:]
         up = functional.interpolate(self.reduce(x), scale_factor=2.0, mode="nearest")[..., :height, :width]
         return self.refine(skip + up)
-
-
-class ResidualUNet(nn.Module):
-    """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2); H and W need not be multiples of the deepest stride."""
-
-    def __init__(self, c_in: int, config: EncoderConfig, c_out: int) -> None:
-        super().__init__()
-        channels, blocks = config.channels, config.blocks
-        self.stem = nn.Conv2d(c_in, channels[0], 5, 2, 2)
-        stages: list[nn.Module] = []
-        width = channels[0]
-        for i, (out, count) in enumerate(zip(channels, blocks, strict=True)):
-            layers = [ResidualBlock(width if k == 0 else out, out, 2 if k == 0 and i > 0 else 1) for k in range(count)]
-            stages.append(nn.Sequential(*layers))
-            width = out
-        self.stages = nn.ModuleList(stages)
-        # At the finest stage a residual block would cost as much as all of the others, and brings little.
-        self.ups = nn.ModuleList(
-            UpBlock(channels[i + 1], channels[i], refine=int(i > 0)) for i in reversed(range(len(blocks) - 1))
-        )
-        self.head = nn.Conv2d(channels[0], c_out, 3, 1, 1)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2), sizes rounded up."""
-        x = functional.relu(self.stem(x.contiguous(memory_format=torch.channels_last)))
-        skips: list[torch.Tensor] = []
-        for stage in self.stages:
-            x = stage(x)
-            skips.append(x)
-        skips.pop()
-        for up in self.ups:
-            x = up(x, skips.pop())
-        return self.head(x)
 
 
 def _norm(channels: int) -> nn.BatchNorm2d:
@@ -185,10 +144,7 @@ class InvertedResidual(nn.Module):
 
 class EfficientNetLite0(nn.Module):
     """Colours in [0, 1] (B, 3, H, W) -> features at strides 2, 4, ... of ``BACKBONE_WIDTHS`` channels.
-
-    Args:
-        stages: How many of the five; the classifier of the published network and its last block are not built.
-    """
+    ``stages``: how many of the five; the classifier of the published network and its last block are not built."""
 
     def __init__(self, stages: int = len(BACKBONE_STAGES)) -> None:
         super().__init__()
@@ -208,65 +164,66 @@ class EfficientNetLite0(nn.Module):
         return maps
 
 
-class PretrainedUNet(nn.Module):
-    """The same shapes as ``ResidualUNet``, with EfficientNet-Lite0 in the place of its deeper stages.
+class UNet(nn.Module):
+    """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2); H and W need not be multiples of the deepest stride.
 
-    The backbone sees colours alone. Next to it a slim residual encoder sees all inputs, depth among them: where colours
-    are not those of the training rooms, in photographs, depth is what a view can be known by. ``channels`` are the
-    widths of that encoder and of the decoder, finest first, ``blocks`` the residual blocks of both at each stage; the
-    coarsest stage is the backbone's alone.
+    A residual U-Net, or with a backbone EfficientNet-Lite0 in the place of its deeper stages. The backbone sees colours
+    alone. Next to it a slim residual encoder sees all inputs, depth among them: where colours are not those of the
+    training rooms, in photographs, depth is what a view can be known by. The coarsest stage is the backbone's alone.
     """
 
     def __init__(self, c_in: int, config: EncoderConfig, c_out: int) -> None:
         super().__init__()
-        channels = config.channels
+        channels, blocks, pretrained = config.channels, config.blocks, config.backbone != "residual"
         self.stem = nn.Conv2d(c_in, channels[0], 5, 2, 2)
-        widths = (channels[0], *channels[:-1])
-        self.stages = nn.ModuleList(
-            nn.Sequential(
-                *(
-                    ResidualBlock(widths[i] if k == 0 else out, out, 2 if k == 0 and i > 0 else 1)
-                    for k in range(max(config.blocks[i], 1))
-                )
-            )
-            for i, out in enumerate(channels[:-1])
-        )
-        self.backbone = EfficientNetLite0(len(channels))
-        self.laterals = nn.ModuleList(nn.Conv2d(BACKBONE_WIDTHS[i], out, 1) for i, out in enumerate(channels))
+        widths = (channels[0], *channels)
+        stages = range(len(channels) - pretrained)
+        self.stages = nn.ModuleList(_stage(widths[i], channels[i], max(blocks[i], 1), halves=i > 0) for i in stages)
+        self.backbone = self.laterals = None
+        if pretrained:
+            self.backbone = EfficientNetLite0(len(channels))
+            self.laterals = nn.ModuleList(nn.Conv2d(BACKBONE_WIDTHS[i], out, 1) for i, out in enumerate(channels))
+        # Without a backbone a residual block at the finest stage would cost as much as all others, and bring little.
+        refine = blocks if pretrained else [int(i > 0) for i in range(len(blocks))]
         self.ups = nn.ModuleList(
-            UpBlock(channels[i + 1], channels[i], refine=config.blocks[i]) for i in reversed(range(len(channels) - 1))
+            UpBlock(channels[i + 1], channels[i], refine=refine[i]) for i in reversed(range(len(channels) - 1))
         )
         self.head = nn.Conv2d(channels[0], c_out, 3, 1, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2), sizes rounded up."""
         x = x.contiguous(memory_format=torch.channels_last)
-        maps = self.backbone(x[:, :COLOURS] * COLOUR_DEVIATION + COLOUR_MEAN)
-        skips = [lateral(features) for lateral, features in zip(self.laterals, maps, strict=True)]
+        skips: list[torch.Tensor] = []
+        if self.backbone is not None and self.laterals is not None:
+            maps = self.backbone(x[:, :COLOURS] * COLOUR_DEVIATION + COLOUR_MEAN)
+            skips = [lateral(features) for lateral, features in zip(self.laterals, maps, strict=True)]
         x = functional.relu(self.stem(x))
         for i, stage in enumerate(self.stages):
             x = stage(x)
-            skips[i] = skips[i] + x
+            if self.backbone is None:
+                skips.append(x)
+            else:
+                skips[i] = skips[i] + x
         x = skips.pop()
         for up in self.ups:
             x = up(x, skips.pop())
         return self.head(x)
 
 
-class ImageEncoder(nn.Module):
-    """U-Nets of either kind, shared by all views; each view is encoded by itself.
+def _stage(c_in: int, c_out: int, blocks: int, *, halves: bool) -> nn.Sequential:
+    first = ResidualBlock(c_in, c_out, 2 if halves else 1)
+    return nn.Sequential(first, *(ResidualBlock(c_out, c_out, 1) for _ in range(blocks - 1)))
 
-    Where the config asks for depth there are two: one for views with measured depth, which sees what
-    ``surface_maps`` makes of it next to the colours, and one for views without, which sees colours alone. Both
-    give features of one kind. A single network that has to do with and without gives away much of what each can do.
+
+class ImageEncoder(nn.Module):
+    """U-Nets shared by all views; each view is encoded by itself, into C = ``feature_dim`` channels.
+
+    Where the config asks for depth there are two: one for views with measured depth, which sees what ``surface_maps``
+    makes of it next to the colours, and one for views without. A single network for both would do either less well.
 
     Batch norm, because on a CPU it costs half of what group norm does and learns faster. Its statistics come from the
     images only inside ``batch_statistics`` (where the encoder is trained on many different images at once); everywhere
     else, in training mode too, they are constants, so that a view's features do not depend on the views next to it.
-
-    Args:
-        config: Shape, and whether depth that was computed from pictures is shown to it.
-        feature_dim: C, channels of the output.
 
     Raises:
         ConfigError: a shape that cannot be built.
@@ -287,13 +244,11 @@ class ImageEncoder(nn.Module):
                 f"encoder: this backbone has 2 to {len(BACKBONE_WIDTHS)} stages, the last one without blocks (0); got "
                 f"{list(channels)} and {list(blocks)}"
             )
-        unet = PretrainedUNet if pretrained else ResidualUNet
-        self.colour_net = unet(COLOURS, config, feature_dim)
-        self.depth_net = unet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
+        self.colour_net = UNet(COLOURS, config, feature_dim)
+        self.depth_net = UNet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
         self.takes_computed_depth = config.depth and config.computed_depth
         self._of_batch = False
-        self._colours_frozen = False
-        self._backbones_frozen = False
+        self._frozen: tuple[nn.Module, ...] = ()
         # Channels-last convolutions take a quarter of the CPU time at these widths (forward and backward).
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.train()  # which is where the norms learn that they are constants
@@ -328,27 +283,16 @@ class ImageEncoder(nn.Module):
         super().train(mode)
         for norm in self._norms():
             norm.train(mode and self._of_batch)
-        if self._colours_frozen:
-            self.colour_net.eval()
-        if self._backbones_frozen:
-            for backbone in self.backbones():
-                backbone.eval()
+        for part in self._frozen:
+            part.eval()
         return self
 
-    def freeze_colours(self, frozen: bool) -> None:
-        """Whether the network for colours alone keeps its weights and statistics, whatever is trained."""
-        if frozen != self._colours_frozen:
-            self._colours_frozen = frozen
-            self.colour_net.requires_grad_(not frozen)
-            if self._backbones_frozen:
-                self.freeze_backbones()
-            self.train(self.training)
-
-    def freeze_backbones(self) -> None:
-        """Let pretrained backbones keep their weights and statistics from now on, whatever is trained."""
-        self._backbones_frozen = True
-        for backbone in self.backbones():
-            backbone.requires_grad_(False)
+    def freeze(self, *parts: nn.Module) -> None:
+        """Let these parts keep their weights and statistics from now on, whatever is trained, and all others learn."""
+        self.requires_grad_(True)
+        self._frozen = parts
+        for part in parts:
+            part.requires_grad_(False)
         self.train(self.training)
 
     @contextmanager
@@ -404,10 +348,6 @@ def surface_maps(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
 
     Channels: inverse depth (1 / m), 1 where depth is measured, height above the lowest point in view (m), cosine of
     the normal with up, cosine of the normal with the viewing axis (0 next to holes, where there is no normal).
-
-    Args:
-        depth_m: (m, H, W), 0 = none.
-        K: (m, 3, 3) in pixels of (H, W).
     """
     # Not in bfloat16, whose mantissa of 8 bits would make steps of centimetres.
     with torch.no_grad(), torch.autocast(depth_m.device.type, enabled=False):
@@ -432,12 +372,9 @@ def surface_maps(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
 
 
 def surface_normals(points: torch.Tensor, measured: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Normals from central differences, towards the camera: (m, 3, H, W), and where there is one (m, H, W).
+    """Normals towards the camera (m, 3, H, W), and where there is one (m, H, W).
 
-    Args:
-        points: (m, 3, H, W) camera coordinates, metres.
-        measured: (m, H, W) bool.
-        reach: Pixels between a pixel and the ones that its differences are taken from.
+    They are central differences of points (m, 3, H, W), each between pixels ``reach`` away on either side.
     """
     r = reach
     height, width = measured.shape[-2:]
@@ -452,13 +389,8 @@ def surface_normals(points: torch.Tensor, measured: torch.Tensor, reach: int) ->
     (ax, ay, az), (bx, by, bz) = dv.unbind(1), du.unbind(1)
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     length = torch.sqrt(x * x + y * y + z * z).clamp_min(1e-9)
-    known[middle] = (
-        measured[..., r:-r, r:-r]
-        & measured[..., r:-r, 2 * r :]
-        & measured[..., r:-r, : -2 * r]
-        & measured[..., 2 * r :, r:-r]
-        & measured[..., : -2 * r, r:-r]
-    )
+    across = measured[..., r:-r, 2 * r :] & measured[..., r:-r, : -2 * r]
+    known[middle] = measured[middle] & across & measured[..., 2 * r :, r:-r] & measured[..., : -2 * r, r:-r]
     normal[middle] = torch.stack((x / length, y / length, z / length), dim=1)
     return normal * known[:, None], known
 
@@ -468,11 +400,7 @@ def up_direction(normal: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
 
     Gupta et al., "Perceptual Organization and Recognition of Indoor Scenes" (CVPR 2013), section 3: starting from the
     camera's own up, take the normals near to and near to square with it, and turn up to fit them; then the same with
-    closer bounds. The camera may be inclined by up to 45 degrees.
-
-    Args:
-        normal: (m, 3, h, w) unit normals in camera axes (y down).
-        known: (m, h, w) bool.
+    closer bounds. The camera may be inclined by up to 45 degrees. ``normal`` (m, 3, h, w), ``known`` (m, h, w) bool.
     """
     n = normal.flatten(2)  # (m, 3, P)
     weight = known.flatten(1).to(n.dtype)

@@ -1,16 +1,29 @@
-"""What training, checkpoints and evaluation ask of a field that has weights, whatever its kind."""
+"""Fields that have weights, whatever their kind: what training and checkpoints ask of them, and the kinds there are."""
 
 from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import nn
 
-from semantic_mapper.config import Config, SamplingConfig
+from semantic_mapper.config import (
+    Config,
+    GridFieldConfig,
+    IRTConfig,
+    PanopticConfig,
+    SamplingConfig,
+    SRayConfig,
+    UNetFieldConfig,
+    convert_config,
+)
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.volume import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
@@ -32,11 +45,9 @@ class LearnedField(nn.Module, ABC):
 
     kind: ClassVar[str]
     needs_own_view: ClassVar[bool] = False  # whether it can render only views whose image is among the sources
-    reads_own_view: ClassVar[bool] = False  # whether it makes use of that image where it is there, and does without
     holds_scene: ClassVar[bool] = False  # whether its density is the geometry of the one scene that it was fitted to
     knows_classes: ClassVar[bool] = True  # whether it ever says a class; else there is nothing to label or to score
     class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order
-    image_parts: ClassVar[tuple[str, ...]] = ()  # names of the modules that classify an image's features by themselves
     stored_in_half: ClassVar[bool] = False  # whether files hold its weights as float16
     encoding_parts: ClassVar[tuple[str, ...]] = ()  # names of the modules that ``encode`` uses; none = not known
 
@@ -44,12 +55,12 @@ class LearnedField(nn.Module, ABC):
         super().__init__()
         self.config: Any = config
         self.sampling = sampling or SamplingConfig()
-        self._label_set = label_set
+        self.label_set = label_set
 
     @property
-    def label_set(self) -> LabelSet:
-        """Classes of the rendered logits, in channel order."""
-        return self._label_set
+    def classifies_images(self) -> bool:
+        """Whether a field of this kind says anything of single images."""
+        return type(self).source_logits is not LearnedField.source_logits
 
     @property
     def image_encoder(self) -> ImageEncoder | None:
@@ -75,14 +86,6 @@ class LearnedField(nn.Module, ABC):
         without measured depth; False = no choice."""
         return False
 
-    def scene_config(self, views: SourceViews, far_m: float) -> Config:
-        """The config that a field of this kind and shape should have to be fitted to the scene that ``views`` show.
-
-        Args:
-            far_m: How far pixels without measured depth may see.
-        """
-        return self.config
-
     def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
         """Sample depths (R, N): coarse + fine, or guided by the depth prior, as ``sampling.mode`` says."""
         if self.sampling.mode == "streaming":
@@ -106,3 +109,49 @@ def encode_alike(a: LearnedField, b: LearnedField) -> bool:
     theirs = b.state_dict()
     shared = {name: t for name, t in a.state_dict().items() if name.split(".")[0] in a.encoding_parts}
     return all(torch.equal(tensor, theirs[name]) for name, tensor in shared.items())
+
+
+class FieldKind(NamedTuple):
+    """A kind of field: its settings, and the module and class that make it, imported when one is built."""
+
+    config: type[Config]
+    module: str
+    class_name: str
+
+
+KINDS: dict[str, FieldKind] = {
+    "sray": FieldKind(SRayConfig, "semantic_mapper.fields.sray", "SRay"),
+    "unet": FieldKind(UNetFieldConfig, "semantic_mapper.fields.unet_field", "UNetField"),
+    "grid": FieldKind(GridFieldConfig, "semantic_mapper.fields.scene.grid", "GridField"),
+    "irt": FieldKind(IRTConfig, "semantic_mapper.fields.scene.irt", "IRT"),
+    "panoptic": FieldKind(PanopticConfig, "semantic_mapper.fields.scene.panoptic", "Panoptic"),
+}
+GROUP = "semantic_mapper.fields"  # entry points of other packages, each a ``FieldKind``
+
+
+@cache
+def field_kinds() -> dict[str, FieldKind]:
+    """The kinds of this package, and those that installed packages add by entry points."""
+    return KINDS | {entry.name: entry.load() for entry in entry_points(group=GROUP)}
+
+
+def build_field(
+    kind: str, config: dict[str, Any] | Config, label_set: LabelSet, sampling: SamplingConfig | None = None
+) -> LearnedField:
+    """A field with random weights.
+
+    Args:
+        config: Of that kind, or plain data for it.
+
+    Raises:
+        ConfigError: no such kind, or a config that does not fit it.
+    """
+    if kind not in field_kinds():
+        raise ConfigError(f"no field of kind '{kind}'; there are {', '.join(sorted(field_kinds()))}")
+    config_type, module, class_name = field_kinds()[kind]
+    if isinstance(config, dict):
+        config = convert_config(config, config_type, f"config of field '{kind}'")
+    if not isinstance(config, config_type):
+        raise ConfigError(f"field '{kind}' takes a {config_type.__name__}, got a {type(config).__name__}")
+    field_type: type[LearnedField] = getattr(import_module(module), class_name)
+    return field_type(config, label_set, sampling)

@@ -5,6 +5,10 @@ map's surface is pooled to cells of ``CELL_M``; each cell tells the network its 
 there say. The answer is a *residual* on the map's log-probabilities: a vector, how much of the smoothed votes round the
 cell is added, and how much a voxel's own still count. All of it comes from a layer that starts at zero, so that an
 untrained network leaves the map as it is.
+
+Its convolutions are *submanifold* ones over the occupied cells (Graham et al. 2018), in plain torch: neighbour tables,
+gathers, matrix products. They give an output where there is an input and nowhere else, so that a surface stays a
+surface however many layers follow. Missing neighbours count as zeros.
 """
 
 from __future__ import annotations
@@ -13,7 +17,8 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import hashlib
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -36,16 +41,6 @@ from semantic_mapper.fields.checkpoint import (
     open_weights,
     save_tensors,
 )
-from semantic_mapper.fields.sparse_conv import (
-    OFFSETS,
-    CellLevel,
-    Down,
-    SubmanifoldConv,
-    Up,
-    cell_levels,
-    find_rows,
-    pack_cells,
-)
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
 
@@ -62,6 +57,10 @@ MOST_VOTES = 8.0  # further ones tell nothing new
 LEVELS = 4
 WIDTHS = (1, 2, 4, 4)  # of the levels, times the width
 BLOCKS = (1, 2, 2, 2)  # on the way down; one on the way up
+CHUNK_ROWS = 1024  # gathered at a time: 27 rows of features each, which stay in the cache
+MAX_BOX = 100  # entries a cell of a table of all cells of a box
+OFFSETS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.int64)  # (27, 3)
+_BITS, _HALF = 21, 1 << 20  # a packed coordinate
 
 
 class NesfConfig(Config, frozen=True):
@@ -71,24 +70,177 @@ class NesfConfig(Config, frozen=True):
     centres: bool = True  # whether it has learned where the centres of objects are
 
 
+class CellLevel(NamedTuple):
+    """The occupied cells of one resolution."""
+
+    cells: NDArray[np.int64]  # (N, 3) coordinates, in lexicographic order
+    neighbours: torch.Tensor  # (N, 27) rows of the cells round each, in the order of ``OFFSETS``; N = not occupied
+    parent: torch.Tensor  # (N,) row in the next coarser level
+    corner: torch.Tensor  # (N,) which of the parent's eight
+    parents: int  # cells of the next coarser level
+
+
+def pack_cells(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Keys (N,) int64 of cells (N, 3), in the same order; coordinates within +-2^20."""
+    shifted = cells + _HALF
+    return (shifted[..., 0] << (2 * _BITS)) | (shifted[..., 1] << _BITS) | shifted[..., 2]
+
+
+def find_rows(keys: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each of ``wanted`` stands in sorted ``keys`` (N,); N = nowhere."""
+    rows = np.searchsorted(keys, wanted)
+    found = keys[np.minimum(rows, len(keys) - 1)] == wanted
+    return np.where(found, rows, len(keys))
+
+
+def cell_levels(cells: NDArray[np.int64], count: int) -> tuple[CellLevel, ...]:
+    """Tables of ``count`` resolutions, each half the one before.
+    ``cells``: (N, 3) of the finest, unique and in lexicographic order; N > 0."""
+    levels: list[CellLevel] = []
+    for _ in range(count):
+        coarse, parent = _unique_cells(cells >> 1)
+        corner = (cells & 1) @ np.array((4, 2, 1))
+        neighbours, up, place = (torch.from_numpy(t) for t in (_neighbours(cells), parent, corner))
+        levels.append(CellLevel(cells, neighbours, up, place, len(coarse)))
+        cells = coarse
+    return tuple(levels)
+
+
+def _unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    _, first, inverse = np.unique(pack_cells(cells), return_index=True, return_inverse=True)
+    return cells[first], inverse.reshape(-1)
+
+
+def _neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows (N, 27) of the cells round each; looked up in a box round all cells where that is small, else searched."""
+    low = cells.min(0) - 1
+    shape = cells.max(0) - low + 2
+    if math.prod(map(int, shape)) > MAX_BOX * len(cells):
+        return _searched_neighbours(cells)
+    stride = np.array((shape[1] * shape[2], shape[2], 1))
+    place = (cells - low) @ stride
+    box = np.full(int(np.prod(shape)), len(cells), np.int64)
+    box[place] = np.arange(len(cells))
+    return box[place[:, None] + OFFSETS @ stride]
+
+
+def _searched_neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    keys, count = pack_cells(cells), len(cells)
+    table = np.full((count, len(OFFSETS)), count, np.int64)
+    middle = len(OFFSETS) // 2
+    rows = np.arange(count)
+    table[:, middle] = rows
+    for n in range(middle):  # the rest mirrors these
+        found = find_rows(keys, keys + int(pack_cells(OFFSETS[n]) - pack_cells(np.zeros(3, np.int64))))
+        table[:, n] = found
+        here = found < count
+        table[found[here], len(OFFSETS) - 1 - n] = rows[here]
+    return table
+
+
+class _Submanifold(torch.autograd.Function):
+    """Gather and multiply in chunks. The gradient of the input is the same convolution with mirrored weights."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(x, weight, table)
+        return _convolve(x, weight, table)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        x, weight, table = ctx.saved_tensors
+        gradient = gradients[0].contiguous()
+        places, channels_in, channels_out = weight.shape
+        if not ctx.needs_input_grad[0]:
+            of_weight = x.new_zeros(places * channels_in, channels_out)
+            for rows, gathered in _chunks(x, table):
+                of_weight.addmm_(gathered.t(), gradient[rows])
+            return None, of_weight.view_as(weight), None
+        # The table is symmetric: gradients gathered once serve the input and, mirrored, the weights.
+        mirrored = weight.flip(0).transpose(1, 2).reshape(-1, channels_in)
+        of_x, of_weight = torch.empty_like(x), x.new_zeros(channels_in, places * channels_out)
+        for rows, gathered in _chunks(gradient, table):
+            torch.mm(gathered, mirrored, out=of_x[rows])
+            of_weight.addmm_(x[rows].t(), gathered)
+        return of_x, of_weight.view(channels_in, places, channels_out).flip(1).transpose(0, 1), None
+
+
+def _convolve(x: torch.Tensor, weight: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
+    flat = weight.reshape(-1, weight.shape[2])
+    out = x.new_empty(len(table), weight.shape[2])
+    for rows, gathered in _chunks(x, table):
+        torch.mm(gathered, flat, out=out[rows])
+    return out
+
+
+def _chunks(x: torch.Tensor, table: torch.Tensor) -> Iterator[tuple[slice, torch.Tensor]]:
+    """Rows, and features of their neighbours (rows, K * C)."""
+    padded = torch.cat((x, x.new_zeros(1, x.shape[1])))
+    for start in range(0, len(table), CHUNK_ROWS):
+        part = table[start : start + CHUNK_ROWS]
+        yield slice(start, start + len(part)), padded.index_select(0, part.reshape(-1)).view(len(part), -1)
+
+
+class SubmanifoldConv(nn.Module):
+    """3^3 convolution over occupied cells; weight (27, in, out) in the order of ``OFFSETS``."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(_initial(27, channels_in, channels_out))
+        self.bias = nn.Parameter(torch.zeros(channels_out))
+
+    def forward(self, x: torch.Tensor, level: CellLevel) -> torch.Tensor:
+        """Features (N, in) of the level's cells -> (N, out)."""
+        convolved: torch.Tensor = _Submanifold.apply(x, self.weight, level.neighbours)  # pyright: ignore[reportAssignmentType]
+        return convolved + self.bias
+
+
+class Down(nn.Module):
+    """2^3 convolution of stride 2: each coarser cell sees the cells in it; weight (8, in, out)."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(_initial(8, channels_in, channels_out))
+        self.bias = nn.Parameter(torch.zeros(channels_out))
+
+    def forward(self, x: torch.Tensor, level: CellLevel) -> torch.Tensor:
+        """Features (N, in) of the level's cells -> (P, out) of the next coarser level's."""
+        coarse = x.new_zeros(level.parents, self.weight.shape[2])
+        # Each cell has one parent: eight products of what stands in the same corner, which needs no padding.
+        for corner in range(8):
+            here = (level.corner == corner).nonzero()[:, 0]
+            coarse = coarse.index_add(0, level.parent[here], x[here] @ self.weight[corner])
+        return coarse + self.bias
+
+
+class Up(nn.Module):
+    """Transposed 2^3 convolution back to the cells that are occupied; weight (8, in, out)."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(_initial(8, channels_in, channels_out) * 8**0.5)  # each cell has one parent
+        self.bias = nn.Parameter(torch.zeros(channels_out))
+
+    def forward(self, x: torch.Tensor, level: CellLevel) -> torch.Tensor:
+        """Features (P, in) of the next coarser level -> (N, out) of the level's cells."""
+        count, wide = len(x), self.weight.shape[2]
+        spread = x @ self.weight.permute(1, 0, 2).reshape(x.shape[1], 8 * wide)  # (P, 8 * out)
+        return spread.view(count * 8, wide).index_select(0, level.parent * 8 + level.corner) + self.bias
+
+
+def _initial(places: int, channels_in: int, channels_out: int) -> torch.Tensor:
+    return torch.randn(places, channels_in, channels_out) * (2 / (places * channels_in)) ** 0.5
+
+
 class SurfacePoints(NamedTuple):
-    """Voxels round a map's surface, with up along z.
+    """Voxels round a map's surface, with up along z."""
 
-    Args:
-        xyz: (N, 3) float32 in cells.
-        rise: (N,) float32, normal . up.
-        height_m: (N,) float32 above the floor.
-        rgb: (N, 3) float32 0..1.
-        log_p: (N, L) float32 log-probabilities of the votes; zeros without votes.
-        votes: (N,) float32.
-    """
-
-    xyz: Float32
-    rise: Float32
-    height_m: Float32
-    rgb: Float32
-    log_p: Float32
-    votes: Float32
+    xyz: Float32  # (N, 3) in cells
+    rise: Float32  # (N,) normal . up
+    height_m: Float32  # (N,) above the floor
+    rgb: Float32  # (N, 3) in 0..1
+    log_p: Float32  # (N, L) log-probabilities of the votes; zeros without votes
+    votes: Float32  # (N,)
 
     def rows(self, chosen: NDArray[Any]) -> SurfacePoints:
         """Some of them, by mask or row."""
@@ -188,12 +340,7 @@ class MapUNet(nn.Module):
 
     Against the paper's U-Net it is narrow at the finest level, where nearly all cells are, and one level deeper: it
     sees 1.9 m far at half the cost. Each block normalises the features of a cell on their own, so that what surrounds a
-    tile does not matter.
-
-    Args:
-        channels_in: C.
-        channels_out: K, of a last linear layer, which starts at zero.
-        width: Features at the finest level.
+    tile does not matter. Its last layer starts at zero.
     """
 
     def __init__(self, channels_in: int, channels_out: int, width: int = 16) -> None:
@@ -228,11 +375,7 @@ class MapUNet(nn.Module):
 
 
 class Nesf(nn.Module):
-    """The network, its classes, and the temperature of its answers.
-
-    Args:
-        label_set: L classes, those of the maps it can refine.
-    """
+    """The network, the L classes of the maps that it can refine, and the temperature of its answers."""
 
     def __init__(self, label_set: LabelSet, config: NesfConfig | None = None) -> None:
         super().__init__()
@@ -245,15 +388,6 @@ class Nesf(nn.Module):
         """Make untrained weights answer with the smoothed votes, which is where training starts."""
         with torch.no_grad():
             self.net.head.bias[-5], self.net.head.bias[-4] = 1.0, -1.0
-
-    def trust(self, fraction: float) -> None:
-        """Blend the answers about classes with the smoothed votes: 1 = leave them as they are, 0 = smoothed votes."""
-        with torch.no_grad():
-            classes = slice(0, -3)
-            self.net.head.weight[classes] *= fraction
-            self.net.head.bias[classes] *= fraction
-            self.net.head.bias[-5] += 1 - fraction
-            self.net.head.bias[-4] -= 1 - fraction
 
     def extended(self, label_set: LabelSet) -> Nesf:
         """The same network for maps of more classes behind its own: votes for those are smoothed."""
@@ -283,11 +417,7 @@ class Nesf(nn.Module):
         """Logits (N, L) at points, before the temperature, and the way (N, 3) to their objects' centres, metres.
 
         The way is at most some ``FARTHEST_M`` long: it leads to the centre of what is small, and towards it elsewhere.
-
-        Args:
-            answer: Of ``forward``.
-            near: Of the points.
-            log_p: (N, L) what the map says there; zeros without votes.
+        ``log_p`` (N, L) is what the map says there; zeros without votes.
         """
         here = torch.einsum("nkc,nk->nc", _padded(answer)[near.rows], near.weights)
         return log_p * (1 + here[:, -4:-3]) + here[:, :-4], here[:, -3:] * FARTHEST_M
@@ -298,17 +428,11 @@ SMOOTHED = hashlib.sha256(b"smoothed votes").hexdigest()  # in place of a digest
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NesfWeights:
-    """A network with its provenance.
-
-    Args:
-        model: In evaluation mode.
-        recipe: How it was trained, plain data.
-        digest: SHA-256 of the file, empty before it is written.
-    """
+    """A network with its provenance."""
 
     model: Nesf
-    recipe: dict[str, Any] = field(default_factory=dict[str, Any])
-    digest: str = ""
+    recipe: dict[str, Any] = field(default_factory=dict[str, Any])  # how it was trained, plain data
+    digest: str = ""  # SHA-256 of the file, empty before it is written
 
 
 def smoothed_votes(label_set: LabelSet) -> NesfWeights:
@@ -353,11 +477,7 @@ def save_nesf(weights: NesfWeights, path: Path) -> None:
 
 
 def load_nesf(path: Path) -> NesfWeights:
-    """Read weights that ``save_nesf`` wrote.
-
-    Raises:
-        WeightsError: no such file, damaged, or weights of another kind.
-    """
+    """Read weights that ``save_nesf`` wrote. Raises WeightsError: no such file, damaged, or weights of another kind."""
     path = find_checkpoint(path)
     if not path.exists():
         raise WeightsError(

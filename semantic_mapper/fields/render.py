@@ -9,7 +9,8 @@ from __future__ import annotations
 
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-from collections.abc import Callable
+from collections.abc import Iterator
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import EncodedViews, SemanticField
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
-from semantic_mapper.rays import pixel_grid, pixel_rays
+from semantic_mapper.rays import pixel_rays
 from semantic_mapper.types import CameraIntrinsics, FieldRender, Float32, Float64, UInt8
 
 CPU_CHUNK = 2048  # rays rendered at once: what fits in a core's cache
@@ -39,6 +40,39 @@ def chunk_size(rays_per_chunk: int, device: torch.device, sampling: SamplingConf
     return max(1, min(GPU_CHUNK, GPU_PAIRS // samples**2))
 
 
+def _renders(
+    field: SemanticField,
+    sources: EncodedViews,
+    intrinsics: CameraIntrinsics,
+    T_world_camera: Float64,
+    prior_depth_m: Float32,
+    sampling: SamplingConfig,
+    rays_per_chunk: int,
+    measured: NDArray[np.bool_] | None,
+    stamp_ns: int | None,
+    flat: NDArray[np.int64],
+) -> Iterator[tuple[NDArray[np.int64], FieldRender]]:
+    """Pixels ``flat`` (R,) of a view, row by row, and what they render to, chunk by chunk; without gradients."""
+    device = sources.feature.device
+    pose = torch.tensor(T_world_camera, device=device, dtype=torch.float32)
+    rays_per_chunk = chunk_size(rays_per_chunk, device, sampling)
+    for start in range(0, len(flat), rays_per_chunk):
+        part = flat[start : start + rays_per_chunk]
+        v, u = np.divmod(part, intrinsics.width)
+        rays = pixel_rays(
+            torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(device),
+            intrinsics,
+            pose,
+            near_m=sampling.near_m,
+            far_m=sampling.far_m,
+            prior_depth_m=torch.from_numpy(prior_depth_m[v, u]).to(device),
+            measured=None if measured is None else torch.from_numpy(measured[v, u]).to(device),
+            stamp_ns=stamp_ns,
+        )
+        with torch.inference_mode():
+            yield part, field.render(rays, sources)
+
+
 def render_image(
     field: SemanticField,
     sources: EncodedViews,
@@ -47,55 +81,22 @@ def render_image(
     prior_depth_m: Float32,
     sampling: SamplingConfig,
     rays_per_chunk: int,
-    on_chunk: Callable[[int], None] | None = None,
     measured: NDArray[np.bool_] | None = None,
     stamp_ns: int | None = None,
 ) -> FieldRender:
-    """Render every pixel of a view without gradients, row by row.
+    """Render every pixel of a view without gradients: a ``FieldRender`` of H * W rays, row by row.
 
     Args:
         intrinsics: Of the view to render, (H, W).
-        T_world_camera: (4, 4).
         prior_depth_m: (H, W), 0 = no prior.
         sampling: Near and far bounds.
         rays_per_chunk: Rays rendered at once; 0 = what suits the device.
         measured: (H, W), where the prior is not filled in; None = wherever there is one.
-        on_chunk: Called with the number of rays done after each chunk.
         stamp_ns: Of the view, for fields with things that move; None = such things are not there.
-
-    Returns:
-        ``FieldRender`` of H * W rays.
     """
-    device = sources.feature.device
-    pixels = pixel_grid(intrinsics.width, intrinsics.height, device)
-    prior = torch.from_numpy(np.ascontiguousarray(prior_depth_m)).to(device).flatten()
-    seen = None if measured is None else torch.from_numpy(np.ascontiguousarray(measured)).to(device).flatten()
-    pose = torch.tensor(T_world_camera, device=device, dtype=torch.float32)
-    parts: list[FieldRender] = []
-    rays_per_chunk = chunk_size(rays_per_chunk, device, sampling)
-    with torch.inference_mode():
-        for start in range(0, len(pixels), rays_per_chunk):
-            rays = pixel_rays(
-                pixels[start : start + rays_per_chunk],
-                intrinsics,
-                pose,
-                near_m=sampling.near_m,
-                far_m=sampling.far_m,
-                prior_depth_m=prior[start : start + rays_per_chunk],
-                measured=None if seen is None else seen[start : start + rays_per_chunk],
-                stamp_ns=stamp_ns,
-            )
-            parts.append(field.render(rays, sources))
-            if on_chunk is not None:
-                on_chunk(min(start + rays_per_chunk, len(pixels)))
-    return FieldRender(
-        logits=torch.cat([p.logits for p in parts]),
-        depth_m=torch.cat([p.depth_m for p in parts]),
-        opacity=torch.cat([p.opacity for p in parts]),
-        rgb=torch.cat([p.rgb for p in parts]),
-        entropy=torch.cat([p.entropy for p in parts]),
-        known=torch.cat([p.known for p in parts]),
-    )
+    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk, measured, stamp_ns)
+    parts = [render for _, render in _renders(*scene, np.arange(prior_depth_m.size))]
+    return FieldRender(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(FieldRender)))
 
 
 def render_view(
@@ -110,15 +111,18 @@ def render_view(
     stamp_ns: int | None = None,
 ) -> tuple[Float32, NDArray[np.bool_], Float32]:
     """``render_image`` as arrays: class probabilities (H, W, L), known (H, W), depth (H, W) in metres."""
-    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk)
-    render = render_image(*scene, measured=measured, stamp_ns=stamp_ns)
+    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk, measured, stamp_ns)
+    parts = [_arrays(render) for _, render in _renders(*scene, np.arange(prior_depth_m.size))]
+    probabilities, known, depth_m = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     shape = (intrinsics.height, intrinsics.width)
-    probabilities = torch.softmax(render.logits, dim=-1).view(*shape, -1)
-    return (
-        probabilities.cpu().numpy(),
-        render.known.view(shape).cpu().numpy(),
-        (render.depth_m * render.known).view(shape).cpu().numpy(),
-    )
+    return probabilities.reshape(*shape, -1), known.reshape(shape), depth_m.reshape(shape)
+
+
+def _arrays(render: FieldRender) -> tuple[Float32, NDArray[np.bool_], Float32]:
+    """Class probabilities (R, L), known (R,), and depth (R,), 0 where not known."""
+    with torch.inference_mode():
+        probabilities = torch.softmax(render.logits, dim=-1).cpu().numpy()
+        return probabilities, render.known.cpu().numpy(), (render.depth_m * render.known).cpu().numpy()
 
 
 def render_sparse_view(
@@ -139,12 +143,10 @@ def render_sparse_view(
     Args:
         rgb: (H, W, 3) uint8 colours of the view, whose edges tell where to look closer.
         fraction: Of the pixels that may have rays of their own, the most uncertain first; 0..1.
-        measured: (H, W), where the prior is not filled in; None = wherever there is one.
-        stamp_ns: Of the view, for fields with things that move; None = such things are not there.
 
     Returns:
-        Class probabilities (H, W, L), known (H, W), depth (H, W) in metres, and the number of rays rendered. Pixels
-        without a ray hold the mean of the known ones round them.
+        What ``render_view`` returns, and the number of rays rendered. Pixels without a ray hold the mean of the known
+        ones round them.
 
     Raises:
         ShapeError: images of another size than the view.
@@ -155,34 +157,16 @@ def render_sparse_view(
     rgb, prior_depth_m = np.ascontiguousarray(rgb), np.ascontiguousarray(prior_depth_m)
     probabilities = np.zeros((height, width, len(field.label_set)), np.float32)
     known, depth_m = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float32)
-    pose = torch.tensor(T_world_camera, device=sources.feature.device, dtype=torch.float32)
-    rays_per_chunk = chunk_size(rays_per_chunk, pose.device, sampling)
+    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk, measured, stamp_ns)
 
-    def trace(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
-        for start in range(0, len(rows), rays_per_chunk):
-            v, u = rows[start : start + rays_per_chunk], columns[start : start + rays_per_chunk]
-            pixels = torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(pose.device)
-            prior = torch.from_numpy(prior_depth_m[v, u]).to(pose.device)
-            seen = None if measured is None else torch.from_numpy(measured[v, u]).to(pose.device)
-            rays = pixel_rays(
-                pixels,
-                intrinsics,
-                pose,
-                near_m=sampling.near_m,
-                far_m=sampling.far_m,
-                prior_depth_m=prior,
-                measured=seen,
-                stamp_ns=stamp_ns,
-            )
-            with torch.inference_mode():
-                render = field.render(rays, sources)
-                probabilities[v, u] = torch.softmax(render.logits, dim=-1).cpu().numpy()
-                known[v, u] = render.known.cpu().numpy()
-                depth_m[v, u] = (render.depth_m * render.known).cpu().numpy()
+    def trace(flat: NDArray[np.int64]) -> None:
+        for part, render in _renders(*scene, flat):
+            v, u = np.divmod(part, width)
+            probabilities[v, u], known[v, u], depth_m[v, u] = _arrays(render)
 
-    v, u = (grid.ravel() for grid in np.mgrid[0:height:COARSEST, 0:width:COARSEST])
-    trace(v, u)
-    traced, step = len(v), COARSEST
+    coarse = np.arange(height * width).reshape(height, width)[::COARSEST, ::COARSEST].ravel()
+    trace(coarse)
+    traced, step = len(coarse), COARSEST
     while step > 1:
         uncertainty = np.zeros((height, width), np.float32)
         half = step // 2
@@ -192,8 +176,7 @@ def render_sparse_view(
         left = max(int(fraction * height * width) - traced, 0)
         if len(flat) > left:
             flat = flat[np.argsort(-uncertainty.ravel()[flat], kind="stable")[:left]]
-        if len(flat):
-            trace(*np.unravel_index(np.sort(flat), uncertainty.shape))
+        trace(np.sort(flat))
         traced, step = traced + len(flat), step // 2
     return probabilities, known, depth_m, traced
 

@@ -14,15 +14,17 @@ from torch import nn
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.source_views import GEOMETRY_CHANNELS, MIN_DEPTH_M
-from semantic_mapper.fields.sray import HIDDEN, LABEL_UNCERTAINTY, TAU, SRay
-from semantic_mapper.fields.sray_layers import (
+from semantic_mapper.fields.base import GEOMETRY_CHANNELS, MIN_DEPTH_M, EncodedViews
+from semantic_mapper.fields.sray import (
     BACKGROUND_M,
     COLOUR_SCALE,
+    HIDDEN,
+    LABEL_UNCERTAINTY,
     LEAST_VISIBILITY,
     OWN_DENSITY_OFFSET,
     OWN_RADIUS_M,
+    TAU,
+    SRay,
 )
 from semantic_mapper.fields.volume import field_render, sample_guided
 from semantic_mapper.geometry import expect_shape
@@ -78,10 +80,7 @@ class StreamingSRay:
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, sample_weight_threshold: float = 0.0
     ) -> FieldRender:
         """Render rays at given sample depths z (R, N); see ``SRay.render_samples``.
-
-        Raises:
-            ShapeError: fewer than 2 samples a ray.
-        """
+        Raises ShapeError: fewer than 2 samples a ray."""
         if z.shape[1] < 2:
             raise ShapeError(f"a ray needs at least 2 samples for its intervals to have a length, got {z.shape[1]}")
         count, channels = len(z), self.model.config.feature_dim
@@ -211,10 +210,7 @@ def _settings(model: SRay) -> _Settings:
 
 def _source_maps(sources: EncodedViews, channels: int) -> _SourceMaps:
     """The maps as the kernel takes them: without a copy where they are channels-last.
-
-    Raises:
-        ShapeError: maps that do not fit together, or not the model.
-    """
+    Raises ShapeError: maps that do not fit together, or not the model."""
     sizes = expect_shape(sources.feature, f"M {channels} H W", "source features")
     m, h, w = sizes["M"], sizes["H"], sizes["W"]
     expect_shape(sources.rgb, f"{m} 3 {h} {w}", "source rgb")

@@ -16,10 +16,9 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import SamplingConfig, UNetFieldConfig
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views, gather, own_view, reproject
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.source_views import check_views, encoded_views, gather, own_view, reproject
 from semantic_mapper.fields.volume import field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -47,10 +46,7 @@ class UNetField(LearnedField):
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Classify each view by itself; ``feature`` of the result holds the logits (m, L, h, w).
-
-        Raises:
-            ShapeError: tensors that do not fit together.
-        """
+        Raises ShapeError: tensors that do not fit together."""
         check_views(views)
         return encoded_views(views, self._logits(views))
 

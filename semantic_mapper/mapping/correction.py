@@ -37,7 +37,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.map_types import ALWAYS, CorrectedPoses, CorrectionStatus
-from semantic_mapper.mapping.storage.scratch import ScratchFile
+from semantic_mapper.mapping.storage.block_store import ScratchFile
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 
@@ -47,10 +47,7 @@ _log = get_logger(__name__)
 
 
 class PosePair(NamedTuple):
-    """The pose of one frame before and after, both T_world_camera (4, 4) float64 in the map's world.
-
-    ``world`` is the one that the frame came in; see ``PosedFrame``.
-    """
+    """The pose of one frame before and after, (4, 4) float64 in the map's world, and the world that it came in."""
 
     camera_id: str
     stamp_ns: int
@@ -177,8 +174,7 @@ class MapCorrector:
 
     Args:
         config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
-        voxel_map: In use; becomes the corrected one at the end of a rebuild.
-        keyframes: Move with their frames then.
+        voxel_map, keyframes: In use; move with their frames at the end of a rebuild.
         fuse: Upsamples a frame of the history and integrates it into the map given.
         on_move: Called when a correction begins, and when the map has moved.
 

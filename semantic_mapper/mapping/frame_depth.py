@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,9 +13,10 @@ from semantic_mapper.bundle.refiner import PoseRefiner
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS, DepthFromMotion
 from semantic_mapper.depth_from_motion.views import DepthEstimate
-from semantic_mapper.errors import FrameError
+from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.geometry import check_pose
 from semantic_mapper.mapping.picture_check import PictureCheck
-from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, PosedFrame
 
 SURE_SPREAD = 0.03  # spread, as a fraction of depth, up to which computed depth has its full weight
 MOST_SPREAD = 0.10  # from here on it has none
@@ -29,29 +30,7 @@ GUESS_TRUST = 0.1  # where the map has no surface yet
 LEAST_TRUST = 0.05  # below, nothing is fused
 ROUGHNESS = 0.003  # fraction of z by which a pixel may leave the line between its neighbours: trust falls to 1 / e
 
-
-@dataclass(slots=True)
-class PoseDisagreement:
-    """How far given poses and pictures disagree, and how far refined poses do: recent medians, in pixels."""
-
-    given_px: deque[float] = field(default_factory=lambda: deque[float](maxlen=RECENT_FRAMES))
-    refined_px: deque[float] = field(default_factory=lambda: deque[float](maxlen=RECENT_FRAMES))
-
-    def add(self, given_px: float, refined_px: float) -> None:
-        """Note a frame; NaN, of one that too little is known of, is left out."""
-        if math.isfinite(given_px) and math.isfinite(refined_px):
-            self.given_px.append(given_px)
-            self.refined_px.append(refined_px)
-
-    @property
-    def medians(self) -> tuple[float, float] | None:
-        """Of given and of refined poses; None before any frame was compared."""
-        if not self.given_px:
-            return None
-        return float(np.median(self.given_px)), float(np.median(self.refined_px))
-
-
-CastMap = Callable[[PosedFrame, CameraIntrinsics], tuple[Float32, np.ndarray]]
+CastMap = Callable[[PosedFrame, CameraIntrinsics], tuple[Float32, Bool]]
 
 
 class FrameDepth:
@@ -60,18 +39,42 @@ class FrameDepth:
     Args:
         config: Which depth, and how it is computed.
         cast_map: Depth (h, w) of the map as a frame sees it, 0 = no surface, and whether it was measured (h, w) bool.
+
+    Attributes:
+        pictures: What was wrong with pictures that depth was to be computed from.
     """
 
     def __init__(self, config: DepthConfig, cast_map: CastMap) -> None:
         self._config = config
-        self._source = config.source
         self._cast_map = cast_map
         self._refiners: OrderedDict[str, tuple[CameraIntrinsics, PoseRefiner]] = OrderedDict()
-        self.disagreement = PoseDisagreement()
+        self._disagreement: deque[tuple[float, float]] = deque(maxlen=RECENT_FRAMES)
         self.pictures = PictureCheck()
         self._computer: DepthFromMotion | None = None
         if config.source in ("auto", "computed"):
             self._computer = DepthFromMotion(config.from_motion)
+
+    @property
+    def disagreement_px(self) -> tuple[float, float] | None:
+        """Median distance in pixels of corners from where given poses have them, and where refined poses do, of the
+        last frames whose depth was computed; None where there were none."""
+        if not self._disagreement:
+            return None
+        given, refined = np.median(np.array(self._disagreement), axis=0)
+        return float(given), float(refined)
+
+    def give(self, frame: PosedFrame) -> PosedFrame:
+        """A frame with its depth, where frames do not wait for later ones; see ``push``.
+
+        Raises:
+            ConfigError: they do, and this one does not come from ``push``.
+        """
+        if self._computer is None or self._config.from_motion.delay_frames == 0:
+            (ready,) = self.push(frame)
+            return ready
+        if frame.depth_sigma_m is None and (frame.depth_m is None or self._config.source == "computed"):
+            raise ConfigError("depth.from_motion.delay_frames lets frames wait: give step what prepare returns")
+        return frame
 
     def push(self, frame: PosedFrame) -> list[PosedFrame]:
         """Take a frame; the frames that are ready, oldest first. One whose depth is computed may wait for later ones.
@@ -81,22 +84,29 @@ class FrameDepth:
 
         Raises:
             FrameError: a picture that would spoil the map; see ``PictureCheck``. The next frame is welcome.
+            PoseError: the pose is not a rigid transform.
         """
+        where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
+        check_pose(frame.T_world_camera, where)
         if frame.depth_sigma_m is not None:
             return [frame if self._computer is not None else replace(frame, depth_m=None, depth_sigma_m=None)]
-        if self._source in ("off", "computed") and frame.depth_m is not None:
+        if self._config.source in ("off", "computed") and frame.depth_m is not None:
             frame = replace(frame, depth_m=None)
         if self._computer is None or frame.depth_m is not None:
             return [frame] if self._computer is None else self._computer.push(frame)
         done: list[PosedFrame] = []
         if frame.intrinsics.width >= REFINED_WIDTH:
             if why := self.pictures.look(frame):
-                raise FrameError(f"frame seq={frame.seq} of camera '{frame.camera_id}': {why}")
+                raise FrameError(f"{where}: {why}")
             if self._config.refine_poses:
                 if self._lens_changed(frame):
                     done = self.finish()  # frames that wait are in the world of the refiner that goes
                 frame = self._refine(frame, self._computer)
         return done + [self._anchored(f) for f in self._computer.push(frame, self._hint)]
+
+    def finish(self) -> list[PosedFrame]:
+        """The frames that still wait, oldest first."""
+        return [] if self._computer is None else [self._anchored(f) for f in self._computer.finish()]
 
     def _anchored(self, frame: PosedFrame) -> PosedFrame:
         """A frame with computed depth where the given poses have it in the mean; its spread has that of their scale."""
@@ -114,10 +124,6 @@ class FrameDepth:
             depth_sigma_m=factor * sigma_m.astype(np.float32),
         )
 
-    def finish(self) -> list[PosedFrame]:
-        """The frames that still wait, oldest first."""
-        return [] if self._computer is None else [self._anchored(f) for f in self._computer.finish()]
-
     def _lens_changed(self, frame: PosedFrame) -> bool:
         intrinsics, _ = self._refiners.get(frame.camera_id, (frame.intrinsics, None))
         return intrinsics != frame.intrinsics
@@ -133,16 +139,19 @@ class FrameDepth:
         if len(self._refiners) > MAX_CAMERAS:
             self._refiners.popitem(last=False)
         refined = refiner.push(frame)
-        self.disagreement.add(refined.given_error_px, refined.error_px)
+        if math.isfinite(refined.given_error_px) and math.isfinite(refined.error_px):
+            self._disagreement.append((refined.given_error_px, refined.error_px))
         computer.correct_poses(refiner.corrections())
         return replace(frame, T_world_camera=refined.T_world_camera)
 
     def _hint(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
+        """What the map says of the depth of a frame, (h, w)."""
         _, refiner = self._refiners.get(frame.camera_id, (None, None))
-        T_world_camera, scale = (
-            (frame.T_world_camera, 1.0) if refiner is None else refiner.to_given(frame.T_world_camera)
-        )
-        depth_m, measured = self._cast_map(replace(frame, T_world_camera=T_world_camera), intrinsics)
+        scale = 1.0
+        if refiner is not None:
+            T_world_camera, scale = refiner.to_given(frame.T_world_camera)
+            frame = replace(frame, T_world_camera=T_world_camera)
+        depth_m, measured = self._cast_map(frame, intrinsics)
         depth_m = depth_m / np.float32(scale)  # as the refined poses, which it is compared by, have it
         spread = np.where(measured, np.float32(MEASURED_SPREAD), np.float32(HINT_SPREAD))
         return DepthEstimate(depth_m, (spread * depth_m).astype(np.float32))
@@ -162,7 +171,7 @@ def computed_trust(depth_m: Float32, sigma_m: Float32) -> Float32:
 
 
 def rendered_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) -> Float32:
-    """Fraction of its full weight that depth has which a field rendered.
+    """Fraction (h, w) of its full weight that depth has which a field rendered; 0 where nothing is to be fused.
 
     It is a mean along each ray: where its samples disagree, at edges and where it guesses, it leaves the smooth surface
     of its neighbours; and where the map has a surface, it has to lie near that. So trust falls with both differences.
@@ -172,9 +181,6 @@ def rendered_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) 
         depth_m: (h, w) float32 rendered z, 0 = none.
         map_depth_m: (h, w) float32 z of the map's surface in the same view, 0 = none.
         truncation_m: Of the map; half of it away from its surface trust falls to 1 / e.
-
-    Returns:
-        (h, w) float32 in 0..1, 0 where nothing is to be fused.
     """
     roughness = np.maximum(_bend(depth_m, 0), _bend(depth_m, 1)) / np.maximum(depth_m, np.float32(1e-3))
     cost = (roughness / ROUGHNESS) ** 2

@@ -27,13 +27,12 @@ class Keyframe:
     """A frame that later frames are rendered from.
 
     Args:
-        seq, stamp_ns: Of the frame.
+        seq, stamp_ns, camera_id: Of the frame.
         T_world_camera: (4, 4) float64.
         intrinsics: Of ``depth_m``.
         depth_m: (h, w) float32, small, 0 = none.
         encoded: One view.
         labelled: The field was finetuned on this view; such keyframes are never dropped.
-        camera_id: Of the frame.
     """
 
     seq: int
@@ -64,9 +63,7 @@ class KeyframeStore:
     def wants(self, T_world_camera: Float64, size: EncodedSize | None = None) -> bool:
         """Whether a frame at this pose has moved or turned enough, from every keyframe, to become one.
 
-        Args:
-            T_world_camera: (4, 4).
-            size: Of its encoded view: keyframes of another size are no source views for it; None = all count.
+        Keyframes whose encoded view is of another ``size`` are no source views for it; None = all count.
         """
         own = np.array([size in (None, k.encoded.size) for k in self._keyframes], bool)
         moved, turned = pose_distances(self._poses()[own], T_world_camera)
@@ -88,8 +85,7 @@ class KeyframeStore:
     def move(self, poses: Mapping[tuple[str, int], Float64]) -> int:
         """Give keyframes other poses; what was encoded of them stays. Returns how many have moved.
 
-        Args:
-            poses: (camera_id, stamp_ns) -> T_world_camera (4, 4); keyframes that are not named stay where they are.
+        ``poses`` are by (camera_id, stamp_ns); keyframes that are not named stay where they are.
         """
         moved = 0
         for i, keyframe in enumerate(self._keyframes):
@@ -113,7 +109,8 @@ class KeyframeStore:
         """Up to ``count`` keyframes that together cover the query frustum; none that see nothing of it.
 
         Greedy: each pick adds most not yet covered points of the query's own surface (its depth, or points at a few
-        depths where it has none). Visibility is tested against the keyframes' depth.
+            depths where
+        it has none). Visibility is tested against the keyframes' depth.
 
         Args:
             T_world_camera: (4, 4) pose of the query.
@@ -139,8 +136,8 @@ class KeyframeStore:
         return np.array([k.T_world_camera for k in self._keyframes]).reshape(-1, 4, 4)
 
     def _drop_most_redundant(self) -> bool:
-        """Drop the one nearest to another; what the camera has left behind counts as nearer than it is. False where
-        all have to stay.
+        """Drop the one nearest to another; what the camera has left behind counts as nearer. False where all have to
+        stay.
 
         Without that, a long walk would thin out its few keyframes evenly, and leave no source views where it is.
         """

@@ -25,7 +25,7 @@ from semantic_mapper.localization.relocalizer import (
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.merge import check_fit
-from semantic_mapper.mapping.map_scale import require_same_scale
+from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -57,11 +57,7 @@ class MapAlignment:
 
 
 def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
-    """Refuse two saved maps without reading their blocks.
-
-    Args:
-        path, other: Of the first and the second.
-        find: Where the second lies in the first is to be found.
+    """Refuse two saved maps without reading their blocks; ``find``: where the second lies in the first is to be found.
 
     Raises:
         MapError: only one is in metres, they are the same map, or what is to be found cannot be; or one cannot be read.
@@ -84,11 +80,7 @@ def _nothing_to_find(which: str, way_out: str = _WAY_OUT) -> str:
 
 
 def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT) -> MapAlignment:
-    """Where another map lies in this one.
-
-    Args:
-        voxel_map, other: Are read.
-        way_out: What errors advise where it cannot be found.
+    """Where another map lies in this one; ``way_out`` is what errors advise where it cannot be found.
 
     Raises:
         MapError: the maps do not fit each other, nothing is found, or not for sure; says why.

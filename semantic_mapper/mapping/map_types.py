@@ -1,18 +1,28 @@
-"""What a voxel map gives out: plain data."""
+"""What a map gives out, and whether its lengths are metres: plain data.
+
+A map of poses from pictures alone has a unit of its own (``VoxelMap.scale_known``). Snapshots, answers and files of it
+say so. What asks for metres, or states them, asks here first (``require_metres``); pictures, classes and counts go on.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.types import Bool, Float32, Float64, UInt8
 
 # By stamp_ns, or by (camera_id, stamp_ns) where cameras share stamps: T_world_camera (4, 4).
 CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
 ALWAYS = 2**63 - 1  # later than any stamp
+SCALE_FIX = (
+    "give a scale when the film or recording is imported (--distance, --square-mm, --camera-height or --scale), or to "
+    "visual odometry (scale, distance_m or camera_height_m), and map it again"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +57,29 @@ class CorrectionStatus:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CameraPose:
+    """Where a frame was taken.
+
+    Args:
+        camera_id, stamp_ns: Of the frame.
+        T_map_camera: (4, 4) float64; None while its place in the map is not known.
+        reason: Why it is not; empty otherwise.
+    """
+
+    camera_id: str
+    stamp_ns: int
+    T_map_camera: Float64 | None
+    reason: str = ""
+
+
+class PoseInMap:
+    """Where the last frame was taken, ``last``, for any thread; None before the first."""
+
+    def __init__(self) -> None:
+        self.last: CameraPose | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MapPoints:
     """N points of the fused surface.
 
@@ -68,15 +101,9 @@ class MapPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapMesh:
-    """The fused surface as V vertices and F triangles.
+    """The fused surface as V vertices (V, 3), float32 metres in the world, and F faces (F, 3), int32 vertex indices.
 
-    Args:
-        vertices: (V, 3) float32 metres in the world.
-        faces: (F, 3) int32 vertex indices.
-        rgb: (V, 3) uint8.
-        label: (V,) uint8 class ids, the ignore id where unknown; see ``MapPoints``.
-        confidence: (V,) float32, 0 where nothing voted.
-        measured: (V,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
+    The rest is that of the vertices, as of ``MapPoints``.
     """
 
     vertices: Float32
@@ -94,9 +121,7 @@ class MapView:
     Args:
         depth_m: (H, W) float32 z-depth, 0 where the ray meets no surface.
         rgb: (H, W, 3) uint8.
-        label: (H, W) uint8 class ids, the ignore id at misses and where unknown; see ``MapPoints``.
-        confidence: (H, W) float32, 0 at misses and where nothing voted.
-        measured: (H, W) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
+        label, confidence, measured: (H, W) as of ``MapPoints``; ignore id, 0 and False at misses.
     """
 
     depth_m: Float32
@@ -110,3 +135,38 @@ def computed_fraction(surface: MapPoints | MapMesh) -> float:
     """Fraction of the points, or vertices, whose depth no sensor measured; 0 of none, and where it is unknown."""
     measured = surface.measured
     return 0.0 if measured is None or not len(measured) else float(1 - measured.mean())
+
+
+def require_metres(scale_known: bool, what: str) -> None:
+    """Refuse what takes or gives metres where the map, or log, has none; ``what`` begins the error.
+
+    Raises:
+        MapError: lengths are not metres.
+    """
+    if not scale_known:
+        raise MapError(f"{what}: needs metres, but the scale is unknown; {SCALE_FIX}")
+
+
+def require_same_scale(one_known: bool, other_known: bool, what: str) -> None:
+    """Refuse what puts lengths of two maps side by side where only one of them is in metres.
+
+    Raises:
+        MapError: it is so.
+    """
+    if one_known != other_known:
+        raise MapError(f"{what}: one map is in metres, the scale of the other is unknown; {SCALE_FIX}")
+
+
+def scale_name(scale_known: bool) -> Literal["metres", "unknown"]:
+    """What files and answers say."""
+    return "metres" if scale_known else "unknown"
+
+
+def voxel_size_text(size: float, scale_known: bool) -> str:
+    """Edge of a voxel, for people."""
+    return f"{size * 100:g} cm" if scale_known else f"{size:g} {length_unit(scale_known)}"
+
+
+def length_unit(scale_known: bool) -> str:
+    """Unit of lengths, for people."""
+    return "m" if scale_known else "units (scale unknown)"

@@ -25,19 +25,18 @@ more, and people who walk pull at the pose.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.imaging import FrameViews, is_measured
 from semantic_mapper.labels import MOVING_NAMES, LabelSet
-from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame, UInt8
 
 CELLS = 80  # across the longer side of the image
@@ -66,19 +65,6 @@ LEAST_POINTS, LEAST_FRACTION = 30, 0.2  # on surfaces that views saw: to judge a
 _NEAREST_M = 0.1
 EDGE_PX = 2  # around what moves, where depth may be between it and what is behind
 
-RECENT = 30  # frames that a warning is about
-MUCH = 0.3  # fraction of the pixels; where half of the frames leave out more, people are warned
-POSES_OFF = (
-    "moving: poses do not fit the depth of the seconds before, so nothing is left out as moving: check their stamps, "
-    "T_world_camera or T_base_camera and the calibration; moving.motion = false ends the search"
-)
-MUCH_LEFT_OUT = (
-    f"moving: more than {MUCH:.0%} of the pixels are left out as moving and not mapped: either something fills the "
-    "picture, or poses drift: check them against the map; moving.motion = false maps what does not move by its class"
-)
-
-_log = get_logger(__name__)
-
 
 class MovingSpace:
     """Where what is left out of the map was seen within the last ``KEPT_S`` seconds of frames.
@@ -90,12 +76,7 @@ class MovingSpace:
         self._parts: tuple[tuple[int, Float32], ...] = ()
 
     def add(self, frame: PosedFrame, moving: Bool) -> None:
-        """Take over what moves in a frame, and forget what is older.
-
-        Args:
-            frame: With depth.
-            moving: (H, W) pixels of it; every ``STRIDE``-th along rows and columns is kept.
-        """
+        """Take over what moves in a frame with depth, (H, W), every ``STRIDE``-th pixel; forget what is older."""
         assert frame.depth_m is not None
         latest = max((stamp for stamp, _ in self._parts), default=frame.stamp_ns)
         latest = frame.stamp_ns if latest - frame.stamp_ns > KEPT_S * _SECOND else max(latest, frame.stamp_ns)
@@ -103,8 +84,8 @@ class MovingSpace:
         v, u = (STRIDE * i for i in np.nonzero(moving[::STRIDE, ::STRIDE]))
         if len(v):
             k, z = frame.intrinsics, frame.depth_m[v, u].astype(np.float64)
-            rays = np.stack(((u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(len(u))), axis=1)
-            points = transform(frame.T_world_camera, z[:, None] * rays).astype(np.float32)
+            points = z[:, None] * _rays(u, v, (k.fx, k.fy), (k.cx, k.cy))
+            points = transform(frame.T_world_camera, points).astype(np.float32)
             parts.append((frame.stamp_ns, points[np.isfinite(points).all(axis=1) & (z > 0)]))
         self._parts = tuple(parts)
 
@@ -119,24 +100,18 @@ class MovingSpace:
 
 
 class MovingFilter:
-    """Of one map.
-
-    Args:
-        config: Of the mapper.
-        label_set: Of the map.
+    """Finds what moves, for one map.
 
     Attributes:
         pixels: Left out so far.
         space: Where what moves was within the last second.
-        uses_classes: Whether classes of ``label_set`` move.
-        warning: What is wrong with the last ``RECENT`` frames and how to fix it, for people; empty where all is well.
 
     Raises:
         ConfigError: ``moving.classes``, and none of the classes does.
     """
 
     def __init__(self, config: MapperConfig, label_set: LabelSet) -> None:
-        self._config = config
+        self._config = config.moving
         self._motion = MotionDetector(config.voxel_map.depth_max_m)
         self._ids = label_set.moving_ids() if config.moving.classes else ()
         if config.moving.classes and not self._ids:
@@ -146,9 +121,6 @@ class MovingFilter:
                 "weights that know one (`rooms-people` ship), or moving.motion"
             )
         self.pixels = 0
-        self.warning = ""
-        self._recent: deque[tuple[bool, float]] = deque(maxlen=RECENT)  # whether poses fit; fraction that moves
-        self._warned = 0
         self.space = MovingSpace()
 
     @property
@@ -156,13 +128,11 @@ class MovingFilter:
         """Whether classes of the map move by themselves."""
         return bool(self._ids)
 
-    def looks_at(self, frame: PosedFrame) -> bool:
-        """Whether anything is looked for in a frame: a sensor has to have measured its depth."""
-        return (self._config.moving.motion or self._config.moving.classes) and is_measured(frame)
-
-    def find(self, frame: PosedFrame) -> Bool:
-        """Pixels (H, W) of what moves by depth, of a frame whose depth was measured."""
-        return self._motion.find(frame) if self._config.moving.motion else np.zeros(frame.rgb.shape[:2], np.bool_)
+    def find(self, frame: PosedFrame) -> Bool | None:
+        """Pixels (H, W) of what moves by depth; None where nothing is looked for: a sensor has to have measured it."""
+        if not ((self._config.motion or self._config.classes) and is_measured(frame)):
+            return None
+        return self._motion.find(frame) if self._config.motion else np.zeros(frame.rgb.shape[:2], np.bool_)
 
     def of_classes(self, label: UInt8) -> Bool:
         """Pixels (H, W) whose class moves by itself."""
@@ -172,20 +142,6 @@ class MovingFilter:
         """Count what was left out of a frame (its depth as it came), and keep for a second where that was."""
         self.pixels += int(moving.sum())
         self.space.add(frame, moving)
-        self._recent.append((self._motion.poses_fit, float(moving.mean())))
-        before, self.warning = self.warning, self._find_warning()
-        if self.warning and self.warning != before:
-            self._warned += 1
-            if is_power_of_two(self._warned):
-                _log.warning("motion_is_uncertain", seq=frame.seq, camera=frame.camera_id, reason=self.warning)
-
-    def _find_warning(self) -> str:
-        fit, fraction = np.array(self._recent).T
-        if len(fit) < RECENT:
-            return ""
-        if fit.mean() < 0.5:
-            return POSES_OFF
-        return MUCH_LEFT_OUT if np.median(fraction) > MUCH else ""
 
     def leave_out(self, views: FrameViews, moving: Bool) -> FrameViews:
         """The frame without depth where it shows what moves, and at its edges: neither surface nor seen through."""
@@ -200,8 +156,6 @@ class MovingFilter:
         """Forget the last seconds: poses of frames to come are in another world."""
         self._motion.clear()
         self.space.clear()
-        self._recent.clear()
-        self.warning = ""
 
 
 class _Cells(NamedTuple):
@@ -213,16 +167,16 @@ class _Cells(NamedTuple):
     size: int  # pixels across
 
 
-class _View(NamedTuple):
-    """What one frame saw: where it was, and its cells, the nearest depth of each cell and those around it."""
+class SeenView(NamedTuple):
+    """What one frame saw: where it was, and its cells (h, w), whose centres have whole numbers."""
 
     camera_id: str
     stamp_ns: int
     T_camera_world: Float64
     focal: tuple[float, float]  # in cells
     centre: tuple[float, float]
-    near: Float32
-    around: Float32  # 0 where not all of it is measured
+    near: Float32  # nearest depth of each cell
+    around: Float32  # and of those around it; 0 where not all of it is measured
     slopes: Float32  # of ``depth_slopes``
 
 
@@ -235,7 +189,7 @@ class MotionDetector:
 
     def __init__(self, depth_max_m: float) -> None:
         self._depth_max_m = depth_max_m
-        self._views: deque[_View] = deque(maxlen=MOST_VIEWS)
+        self._views: deque[SeenView] = deque(maxlen=MOST_VIEWS)
         self._corrections: dict[str, deque[Float64]] = {}  # of the poses of a camera, metres and radians
         self.poses_fit = True
 
@@ -245,11 +199,7 @@ class MotionDetector:
         self._corrections.clear()
 
     def find(self, frame: PosedFrame) -> Bool:
-        """Pixels (H, W) of what moves; what the frame sees is remembered for later ones.
-
-        Args:
-            frame: With measured depth and a rigid pose.
-        """
+        """Pixels (H, W) of what moves in a frame with measured depth; what it sees is remembered for later ones."""
         assert frame.depth_m is not None
         depth = frame.depth_m
         cells = _cells(depth, self._depth_max_m)
@@ -286,28 +236,25 @@ class MotionDetector:
         return len(far) == 0 or float(np.median(far)) <= 1
 
 
-def _align(frame: PosedFrame, cells: _Cells, views: list[_View]) -> Alignment | None:
+def _align(frame: PosedFrame, cells: _Cells, views: list[SeenView]) -> Alignment | None:
     """Where the frame was by the views of its camera; None without such views."""
     views = [v for v in views if v.camera_id == frame.camera_id and v.near.shape == cells.near.shape]
     if not views:
         return None
     views = [views[i] for i in sorted({round(i) for i in np.linspace(0, len(views) - 1, ALIGN_VIEWS)})]
     v, u = (ALIGN_STRIDE * i for i in np.nonzero(cells.inside[::ALIGN_STRIDE, ::ALIGN_STRIDE]))
-    points = _points(frame, cells, v, u).astype(np.float32)
-    sloped = SlopedViews(
-        np.stack([v.T_camera_world for v in views]),
-        np.array([v.focal for v in views], np.float32),
-        np.array([v.centre for v in views], np.float32),
-        np.stack([v.slopes for v in views]),
-    )
-    return align_pose(points, frame.T_world_camera, sloped, (MARGIN_M, MARGIN_PER_M))
+    return align_pose(_points(frame, cells, v, u).astype(np.float32), frame.T_world_camera, views)
 
 
 def _points(frame: PosedFrame, cells: _Cells, v: Int64, u: Int64) -> Float64:
     """(N, 3) in the camera, of cells at rows ``v`` and columns ``u``."""
-    focal, centre = _intrinsics(frame, cells.size)
+    return cells.inside[v, u][:, None] * _rays(u, v, *_intrinsics(frame, cells.size))
+
+
+def _rays(u: Int64, v: Int64, focal: tuple[float, float], centre: tuple[float, float]) -> Float64:
+    """(N, 3) directions with z = 1."""
     rays = np.stack(((u - centre[0]) / focal[0], (v - centre[1]) / focal[1], np.ones(len(u))), axis=1)
-    return cells.inside[v, u][:, None] * rays
+    return rays.astype(np.float64)
 
 
 def _cells(depth: Float32, depth_max_m: float) -> _Cells:
@@ -328,23 +275,21 @@ def _intrinsics(frame: PosedFrame, size: int) -> tuple[tuple[float, float], tupl
     return (k.fx / size, k.fy / size), ((k.cx + 0.5) / size - 0.5, (k.cy + 0.5) / size - 0.5)
 
 
-def _view(frame: PosedFrame, cells: _Cells) -> _View:
+def _view(frame: PosedFrame, cells: _Cells) -> SeenView:
     near = np.where(cells.full, cells.near, 0).astype(np.float32)
     around = cv2.erode(near, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
-    focal, centre = _intrinsics(frame, cells.size)
-    return _View(
+    return SeenView(
         frame.camera_id,
         frame.stamp_ns,
         invert_pose(frame.T_world_camera),
-        focal,
-        centre,
+        *_intrinsics(frame, cells.size),
         cells.near,
         np.asarray(around, np.float32),
         depth_slopes(cells.inside),
     )
 
 
-def _seen_before(frame: PosedFrame, cells: _Cells, views: list[_View]) -> tuple[Bool, Bool]:
+def _seen_before(frame: PosedFrame, cells: _Cells, views: list[SeenView]) -> tuple[Bool, Bool]:
     """Cells (h, w) where a view saw free space, and where one of some time ago saw a surface."""
     v, u = np.nonzero(cells.inside)
     points = np.ascontiguousarray(transform(frame.T_world_camera, _points(frame, cells, v, u)).T, np.float32)
@@ -410,7 +355,7 @@ _NEIGHBOURS = (
 )
 
 
-def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> NDArray[np.bool_]:
+def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> Bool:
     """Pixels (H, W) of moving cells and those next to them that are as near as what moves there."""
     if not moving.any():
         return np.zeros(depth.shape, np.bool_)
@@ -441,27 +386,8 @@ class Alignment(NamedTuple):
     misfit: float
 
 
-class SlopedViews(NamedTuple):
-    """V views of one size.
-
-    Args:
-        T_camera_world: (V, 4, 4).
-        focal, centre: (V, 2) in cells, whose centres have whole numbers.
-        slopes: (V, 3, h, w) of ``depth_slopes``.
-    """
-
-    T_camera_world: Float64
-    focal: Float32
-    centre: Float32
-    slopes: Float32
-
-
 def depth_slopes(depth_m: Float32) -> Float32:
-    """(3, h, w) depth, metres, and its change from cell to cell along rows and columns; NaN at edges and holes.
-
-    Args:
-        depth_m: (h, w) 0 = none.
-    """
+    """(3, h, w) depth, metres, and its change from cell to cell along rows and columns; NaN at edges and holes."""
     z = np.where(depth_m > 0, depth_m, np.float32(np.nan))
     slopes = np.full((3, *z.shape), np.nan, np.float32)
     slopes[0, 1:-1, 1:-1] = z[1:-1, 1:-1]
@@ -471,19 +397,15 @@ def depth_slopes(depth_m: Float32) -> Float32:
     return slopes
 
 
-def align_pose(points: Float32, T_world_camera: Float64, views: SlopedViews, margin: tuple[float, float]) -> Alignment:
-    """Correct a pose by what views saw.
+def align_pose(points: Float32, T_world_camera: Float64, views: Sequence[SeenView]) -> Alignment:
+    """Correct a pose (4, 4) by what views of one size saw, given points (N, 3) that the frame measured, in its camera.
 
-    Args:
-        points: (N, 3) that the frame measured, in its camera, metres.
-        T_world_camera: (4, 4) as given.
-        views: To align with.
-        margin: Metres, and metres a metre of depth: residuals beyond ``CUTS`` of it are something else.
+    Residuals beyond ``CUTS`` of the margin are something else.
     """
     T, moved, misfit = T_world_camera, np.zeros(6), np.inf
     prior = np.repeat((SIGMA_M**-2, SIGMA_RAD**-2), 3)
     for cut in CUTS:
-        jacobian, residual, weight, misfit = _residuals(points, T, views, margin, cut)
+        jacobian, residual, weight, misfit = _residuals(points, T, views, cut)
         if not len(residual):
             return Alignment(T_world_camera, np.zeros(6), misfit)
         scale = _INDEPENDENT / (weight.sum() * _SIGMA_DEPTH_M**2)
@@ -497,30 +419,32 @@ def align_pose(points: Float32, T_world_camera: Float64, views: SlopedViews, mar
 
 
 def _residuals(
-    points: Float32, T_world_camera: Float64, views: SlopedViews, margin: tuple[float, float], cut: float
+    points: Float32, T_world_camera: Float64, views: Sequence[SeenView], cut: float
 ) -> tuple[Float64, Float64, Float64, float]:
     """Of points that count: d residual / d (translation, rotation) (M, 6) in the camera, residual (M,), weight (M,);
     and the misfit of all."""
-    T_view_camera = views.T_camera_world @ T_world_camera
+    focal, centre = (np.array(values, np.float32) for values in zip(*((v.focal, v.centre) for v in views), strict=True))
+    slopes = np.stack([v.slopes for v in views])
+    T_view_camera = np.stack([v.T_camera_world for v in views]) @ T_world_camera
     R = T_view_camera[:, :3, :3].astype(np.float32)
     p = R @ points.T + T_view_camera[:, :3, 3:].astype(np.float32)  # V 3 N
-    xy = p[:, :2] / np.maximum(p[:, 2:], _NEAREST_M) * views.focal[..., None] + views.centre[..., None]
+    xy = p[:, :2] / np.maximum(p[:, 2:], _NEAREST_M) * focal[..., None] + centre[..., None]
     cell = np.rint(xy).astype(np.int32)
-    h, w = views.slopes.shape[2:]
+    h, w = slopes.shape[2:]
     x, y = cell[:, 0], cell[:, 1]
     view, number = np.nonzero((p[:, 2] > _NEAREST_M) & (x >= 0) & (y >= 0) & (x < w) & (y < h))
-    depth, along_x, along_y = views.slopes.transpose(1, 0, 2, 3)[:, view, y[view, number], x[view, number]]
+    depth, along_x, along_y = slopes.transpose(1, 0, 2, 3)[:, view, y[view, number], x[view, number]]
     off = xy[view, :, number] - cell[view, :, number]
     q = p[view, :, number]  # M 3
     residual = depth + along_x * off[:, 0] + along_y * off[:, 1] - q[:, 2]  # NaN at edges
-    relative = residual / (margin[0] + margin[1] * q[:, 2])
+    relative = residual / (MARGIN_M + MARGIN_PER_M * q[:, 2])
     fits, compared = int((np.abs(relative) < 1).sum()), int(np.isfinite(relative).sum())
     if fits < max(LEAST_POINTS, LEAST_FRACTION * compared):
         return np.empty((0, 6)), np.empty(0), np.empty(0), np.inf if compared >= LEAST_POINTS else 0.0
     misfit = float(np.median(np.abs(relative[relative < 1])))
     use = np.abs(relative) < cut
     q, view, number, residual = q[use], view[use], number[use], residual[use]
-    slope = np.stack((along_x[use], along_y[use]), axis=1) * views.focal[view] / q[:, 2:]
+    slope = np.stack((along_x[use], along_y[use]), axis=1) * focal[view] / q[:, 2:]
     normal = np.concatenate((slope, -1 - (slope * q[:, :2]).sum(axis=1, keepdims=True) / q[:, 2:]), axis=1)
     # A slanted surface, and a distant one, is less sure; what nears the cut counts less.
     weight = (1 - (relative[use] / cut) ** 2) ** 2 / ((normal**2).sum(axis=1) * q[:, 2] ** 2)

@@ -9,7 +9,6 @@ and those after them.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,9 +26,9 @@ from semantic_mapper.localization.relocalizer import (
     sighting,
 )
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.map_types import CorrectedPoses
-from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import Float64, PosedFrame, UInt8
+from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.types import Float64, PosedFrame
 
 REMEMBERED = 10  # frames that may
 HELD = 30  # frames, at most; older ones are given up
@@ -50,40 +49,13 @@ class Taken:
     given_up: tuple[tuple[PosedFrame, str], ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraPose:
-    """Where a frame was taken.
-
-    Args:
-        camera_id, stamp_ns: Of the frame.
-        T_map_camera: (4, 4) float64; None while its place in the map is not known.
-        reason: Why it is not; empty otherwise.
-    """
-
-    camera_id: str
-    stamp_ns: int
-    T_map_camera: Float64 | None
-    reason: str = ""
-
-
-class PoseInMap:
-    """Where the last frame was taken, ``last``, for any thread; None before the first."""
-
-    def __init__(self) -> None:
-        self.last: CameraPose | None = None
-
-
 class OdometrySessions:
     """Which odometry sessions are known in a map, and the search for those that are not.
 
     Args:
-        voxel_map: With its places.
-        classify: Class ids (h, w) of a frame as its pixels alone tell them; they have to agree with the map's. None =
-            classes are not looked at.
+        pipeline: Its map, with its places; classes of a frame have to agree with it. ``pose_in_map`` is given the pose
+            of every frame. While the map is being corrected, no world is looked for.
         own_first: The first world that comes is the map's own, as in a map that begins empty.
-        pose_in_map: Is given the pose of every frame.
-        motion: By how much frames to come of a world are moved later on, (4, 4); see ``MapCorrector.motion``.
-        correcting: Whether the map is about to move; no world is looked for meanwhile.
 
     Attributes:
         known: T_map_world (4, 4) by world.
@@ -92,27 +64,15 @@ class OdometrySessions:
         reason: Why the last frame was not found; empty where it was, or needs no search.
     """
 
-    def __init__(
-        self,
-        voxel_map: VoxelMap,
-        classify: Callable[[PosedFrame], UInt8] | None = None,
-        *,
-        own_first: bool = True,
-        pose_in_map: PoseInMap | None = None,
-        motion: Callable[[int], Float64] = lambda world: np.eye(4),
-        correcting: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self._map = voxel_map
-        self._classify = classify
+    def __init__(self, pipeline: MappingPipeline, *, own_first: bool = True) -> None:
+        self._pipeline = pipeline
+        self._corrector = pipeline.corrector
         self._own_first = own_first
-        self._motion = motion
-        self._correcting = correcting
         self._held: deque[PosedFrame] = deque()
         self._sightings: dict[int, deque[Sighting]] = {}
         self.known: dict[int, Float64] = {}
         self.found = 0
         self.refused: Counter[str] = Counter()
-        self._pose_in_map = pose_in_map or PoseInMap()
         self.reason = ""
 
     @property
@@ -129,13 +89,14 @@ class OdometrySessions:
 
     def where(self, world: int) -> Float64:
         """T_map_world (4, 4) of a known world, for frames that come now."""
-        return move(self._motion(world), self.known[world])
+        return move(self._corrector.motion(world), self.known[world])
 
-    def in_map(self, poses: CorrectedPoses, world_by_frame: Mapping[tuple[str, int], int]) -> CorrectedPoses:
-        """Corrected poses, each in the world of its frame (``MapCorrector.world_by_frame``), in that of the map.
+    def in_map(self, poses: CorrectedPoses) -> CorrectedPoses:
+        """Corrected poses, each in the world of its frame, in that of the map.
 
         Of frames that are not known the pose stays as it is.
         """
+        world_by_frame = self._corrector.world_by_frame()
         by_stamp = {stamp_ns: world for (_, stamp_ns), world in world_by_frame.items()}
         moved: dict[Any, Float64] = {}
         for key, pose in poses.items():
@@ -154,11 +115,12 @@ class OdometrySessions:
         if frame.world in self.known:
             return Taken(ready=(self._at(frame),))
         if not self._held:
-            _log.info("world_sought", camera=frame.camera_id, seq=frame.seq, places=len(self._map.places))
+            places = len(self._pipeline.voxel_map.places)
+            _log.info("world_sought", camera=frame.camera_id, seq=frame.seq, places=places)
         self._held.append(frame)
         given_up = ((self._held.popleft(), self._why()),) if len(self._held) > HELD else ()
         if not self._look(frame):
-            self._pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, None, self.reason)
+            self._pipeline.pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, None, self.reason)
             return Taken(given_up=given_up)
         ready = [f for f in self._held if f.world in self.known]
         self._held = deque(f for f in self._held if f.world not in self.known)
@@ -177,12 +139,13 @@ class OdometrySessions:
         """A frame of a known world."""
         pose = move(self.known[frame.world], frame.T_world_camera)
         self.reason = ""
-        self._pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, move(self._motion(frame.world), pose))
+        in_map = move(self._corrector.motion(frame.world), pose)
+        self._pipeline.pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, in_map)
         return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
 
     def _look(self, frame: PosedFrame) -> bool:
         """Look for a frame; True where its world has become known."""
-        if self._correcting():
+        if self._corrector.status.running:
             self._sightings.clear()  # of the map as it was
             self.reason = "the map is being corrected"
             return False
@@ -199,14 +162,13 @@ class OdometrySessions:
             self.reason = consensus.refusal
             return False
         agreeing = consensus.agreeing
-        self.known[frame.world] = move(invert_pose(self._motion(frame.world)), agreed(agreeing))
+        self.known[frame.world] = move(invert_pose(self._corrector.motion(frame.world)), agreed(agreeing))
         self.found += 1
         del self._sightings[frame.world]
         _log.info("world_found", camera=frame.camera_id, seq=frame.seq, agreeing=len(agreeing), held=len(self._held))
         return True
 
     def _find(self, frame: PosedFrame) -> Relocalized | NotFound:
-        depth = None if frame.depth_sigma_m is not None else frame.depth_m
-        finder = Relocalizer(self._map.places.places, self._map, self._map.label_set.ignore_id)
-        classify = self._classify
-        return finder.find(frame.rgb, depth, frame.intrinsics, None if classify is None else lambda: classify(frame))
+        depth, voxel_map = None if frame.depth_sigma_m is not None else frame.depth_m, self._pipeline.voxel_map
+        finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
+        return finder.find(frame.rgb, depth, frame.intrinsics, lambda: self._pipeline.classify(frame))

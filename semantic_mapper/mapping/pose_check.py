@@ -64,15 +64,11 @@ _CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
 
 
 class PoseCheck:
-    """Compares keyframes as they come; changes nothing.
-
-    Args:
-        depth_max_m: Range of the map; depth beyond ``FAR`` times as much is not compared.
+    """Compares keyframes as they come; changes nothing. Depth beyond ``FAR`` times the map's range is not compared.
 
     Attributes:
         compared: Keyframes that overlap with earlier ones and were compared.
-        worst: Largest ``recent`` so far; None before ``MIN_KEYFRAMES``.
-        worst_contradicting: Largest ``contradicting`` so far; None before ``MIN_KEYFRAMES``.
+        worst, worst_contradicting: Largest ``recent`` and ``contradicting`` so far; None before ``MIN_KEYFRAMES``.
         warning: What is wrong and how to fix it, for people; empty where all is well. Stays once it is there, as the
             map keeps what was fused.
     """
@@ -179,12 +175,7 @@ class PoseCheck:
 def disagreement(pairs: Sequence[tuple[Keyframe, Keyframe]], limit_m: float) -> float | None:
     """Lower quartile of |z - depth| / depth over the pixels where a keyframe's points fall on depth of its partner.
 
-    Args:
-        pairs: Compared in both directions.
-        limit_m: Depth beyond is not compared.
-
-    Returns:
-        Fraction of the depth; None where fewer than ``MIN_PIXELS`` can be compared.
+    Pairs are compared in both directions, depth beyond ``limit_m`` is not; None where fewer than ``MIN_PIXELS`` can be.
     """
     parts = [part for a, b in pairs for part in (_differences(a, b, limit_m)[0], _differences(b, a, limit_m)[0])]
     if sum(map(len, parts)) < MIN_PIXELS:
@@ -201,12 +192,7 @@ def _overlap(keyframes: Sequence[Keyframe], limit_m: float) -> float:
 def fraction_seen_through(a: Keyframe, b: Keyframe, limit_m: float) -> float | None:
     """Fraction of the pixels where points of one keyframe lie before the depth of the other by more than ``BEFORE``.
 
-    Args:
-        a, b: Compared in both directions.
-        limit_m: Depth beyond is not compared.
-
-    Returns:
-        None where the two overlap in less than ``MIN_OVERLAP`` of their pixels with depth.
+    None where the two overlap in less than ``MIN_OVERLAP`` of their pixels with depth.
     """
     (there, of_a), (back, of_b) = _differences(a, b, limit_m), _differences(b, a, limit_m)
     compared = len(there) + len(back)
@@ -226,10 +212,8 @@ def _oldest_neighbours(new: Keyframe, keyframes: Sequence[Keyframe], but: Sequen
 
 
 def _differences(a: Keyframe, b: Keyframe, limit_m: float) -> tuple[Float64, int]:
-    """Depth of ``a``, carried into ``b``, less the depth that ``b`` has there, and how many pixels of ``a`` have depth.
-
-    Returns:
-        (N,) differences as fractions of the depth of ``b``, and the number of pixels that were carried.
+    """Depth of ``a``, carried into ``b``, less the depth that ``b`` has there, (N,) as fractions of the depth of
+    ``b``; and how many pixels of ``a`` were carried.
     """
     depth = a.depth_m[::STEP, ::STEP].astype(np.float64)
     row, column = np.nonzero((depth > 0) & (depth < limit_m))

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError, WeightsError
 from semantic_mapper.fields.nesf import (
@@ -29,12 +28,12 @@ from semantic_mapper.fields.nesf import (
 )
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.up_axis import find_up
+from semantic_mapper.mapping.files.floor_plan import find_up
 from semantic_mapper.mapping.fusion.fuse import PROBABILITY_FLOOR, SURFACE_WEIGHT
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import Bool, Float32, Float64, Int64
+from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64
 
 TILE_M = 8.0
 OVERLAP_M = 1.9
@@ -55,16 +54,12 @@ class UpFrame(NamedTuple):
 
 
 class SurfaceVoxels(NamedTuple):
-    """Voxels near the surface in some blocks.
+    """Voxels near the surface in some blocks: block (N, 3) and voxel (N,) of each, and what the network takes of them.
 
-    Args:
-        key: (N, 3) int32 block of each.
-        at: (N,) int64 voxel in the block.
-        points: What the network takes of them.
-        core: (N,) bool: so near the surface that they make up the cells.
+    ``core`` (N,) are so near the surface that they make up the cells.
     """
 
-    key: NDArray[np.int32]
+    key: Int32
     at: Int64
     points: SurfacePoints
     core: Bool
@@ -77,14 +72,9 @@ class SurfaceVoxels(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RefineReport:
-    """What became of the surface.
-
-    Args:
-        before, after: Voxels of the surface by class name; "unknown" last.
-        surface: Voxels of the surface.
-        relabelled: Of them, those with another class than before.
-        filled: Those that had no votes and have a class now.
-        voted: Whether anything had votes.
+    """What became of the surface: its voxels by class name before and after ("unknown" last), and of them all, those
+    with another class than before, and those that had no votes and have a class now. ``voted``: whether anything had
+    votes.
     """
 
     before: dict[str, int]
@@ -99,7 +89,7 @@ class _Written(NamedTuple):
     """New evidence of voxels (N,), not yet in the map, and the place of their tile along x."""
 
     column: int
-    key: NDArray[np.int32]
+    key: Int32
     at: Int64
     evidence: Float32
     votes: Float32
@@ -325,12 +315,12 @@ def _tiles(voxel_map: VoxelMap) -> Iterator[tuple[int, Int64, Int64]]:
             yield place[0], start, end
 
 
-def _voxels(key: NDArray[np.int32], at: Int64) -> Int64:
+def _voxels(key: Int32, at: Int64) -> Int64:
     inside = np.stack((at % BLOCK_SIDE, at // BLOCK_SIDE % BLOCK_SIDE, at // BLOCK_SIDE**2), axis=1)
     return key.astype(np.int64) * BLOCK_SIDE + inside
 
 
-def _gradients(grid: BlockGrid, keys: NDArray[np.int32], blocks: NDArray[np.int32], row: Int64, at: Int64) -> Float32:
+def _gradients(grid: BlockGrid, keys: Int32, blocks: Int32, row: Int64, at: Int64) -> Float32:
     """Unit normals (N, 3) of voxels, towards free space; zeros where neighbours say nothing."""
     buffers = grid.buffers()
     index = np.full(np.ptp(keys, axis=0) + 3, -1, np.int64)

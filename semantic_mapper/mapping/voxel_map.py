@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.places import Place, PlaceStore, moved_place, shared_places
-from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.files.map_file import BlockPart, MapManifest, open_map
 from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
@@ -25,34 +25,37 @@ from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budg
 from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, clear_in_view, depth_bounds
 from semantic_mapper.mapping.fusion.fuse import (
     SURFACE_WEIGHT,
-    check_depth,
+    checked_depth,
     frame_votes,
     fuse_blocks,
     make_limits,
     probability_table,
-    trusted_depth,
 )
-from semantic_mapper.mapping.map_scale import require_same_scale, scale_name
-from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView, require_same_scale, scale_name
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.changes import (
     NONE_CLEARED,
     BlockChanges,
-    ChosenBlocks,
     ClearedBlocks,
     CopiedChanges,
-    choose_blocks,
-    copy_changes,
-    read_changes,
+    Decision,
+    oldest_first,
+    packed_parts,
 )
-from semantic_mapper.mapping.views.ray_casting import cast_view, read_points
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.mapping.surface import (
+    cast_view,
+    join_meshes,
+    open3d_grid,
+    read_points,
+    surface_voxels,
+    triangle_mesh,
+)
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, PosedFrame
 
 # One lock for all maps of a process: growth moves the memory that readers look at, and merging takes two maps at once.
 _KERNEL_LOCK = threading.RLock()
 
-BoolImage = NDArray[np.bool_]
 BLOCKS_A_VERSION = 256  # of a map that takes over another one
 POINT_FIELDS = ("xyz", "rgb", "label", "confidence", "measured")
 
@@ -92,13 +95,8 @@ class VoxelMap:
         self.cleared = 0
         self._cleared_rows = NONE_CLEARED
         self._bounds = NO_BOUNDS  # of the last frame that cleared
-        self._grid = BlockGrid(
-            config.voxel_size_m,
-            len(label_set),
-            config.initial_blocks,
-            config.max_blocks,
-            int(config.memory_mb * 1e6),
-        )
+        memory_bytes, blocks = int(config.memory_mb * 1e6), (config.initial_blocks, config.max_blocks)
+        self._grid = BlockGrid(config.voxel_size_m, len(label_set), *blocks, memory_bytes)
         self.truncation_m = config.truncation_voxels * config.voxel_size_m
 
     def note_scale(self, known: bool) -> None:
@@ -114,21 +112,11 @@ class VoxelMap:
         return self._grid.block_count
 
     @property
-    def block_bytes(self) -> int:
-        """Bytes that each takes in memory."""
-        return self._grid.block_bytes
-
-    @property
     def stored_blocks(self) -> int:
         """Those of them that are on disk because of ``memory_mb``."""
         return self._grid.stored_count
 
-    @property
-    def stored_bytes(self) -> int:
-        """Bytes that these take on disk."""
-        return self._grid.stored_bytes
-
-    def changed_since(self, version: int) -> NDArray[np.int32]:
+    def changed_since(self, version: int) -> Int32:
         """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order.
 
         After a new ``epoch`` these are all blocks of the map, and those of before are gone.
@@ -137,25 +125,23 @@ class VoxelMap:
             return unpack_keys(self._grid.versions_since(version)[0])
 
     def changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> BlockChanges:
-        """The blocks changed after ``version`` was ``since``, in compact form.
+        """The blocks changed after ``version`` was ``since`` (0: the whole map), in compact form.
 
-        Args:
-            since: 0 for the whole map; else the ``version`` of the changes before.
-            limit: At most this many blocks, those that have been waiting longest, but never less than one whole version
-                (a frame; a loaded map is one version); 0 = all. A caller that goes on asking with the version they got
-                comes to the present map.
-            min_weight: Voxels of less weight count as not observed; > 0. 1 = only what was measured.
+        At most ``limit`` blocks (0 = all), those that have been waiting longest, but never less than one whole version
+        (a frame; a loaded map is one version): a caller that goes on asking with the version they got comes to the
+        present map. Voxels of less than ``min_weight`` count as not observed; 1 = only what was measured.
 
         Raises:
             MapError: ``since`` is not a version of this map, or a bad ``limit`` or ``min_weight``.
         """
         with _KERNEL_LOCK:
-            return read_changes(self._grid, self._choose_changes(since, limit, min_weight))
+            return self._choose_changes(since, limit, min_weight).compact()
 
     def copy_changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> CopiedChanges:
         """As ``changes``, but only copied here: another thread makes them compact, which is most of the work."""
         with _KERNEL_LOCK:
-            return copy_changes(self._grid, self._choose_changes(since, limit, min_weight))
+            chosen = self._choose_changes(since, limit, min_weight)
+            return dataclasses.replace(chosen, parts=tuple(chosen.parts))
 
     @property
     def memory_bytes(self) -> int:
@@ -167,9 +153,9 @@ class VoxelMap:
         frame: PosedFrame,
         depth_m: Float32,
         probabilities: Float32 | None,
-        known: BoolImage | None = None,
+        known: Bool | None = None,
         *,
-        rows: NDArray[np.int32] | None = None,
+        rows: Int32 | None = None,
         trust: Float32 | None = None,
         measured: bool = True,
     ) -> int:
@@ -198,7 +184,7 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if frame.intrinsics.distorted:
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        depth, weights = trusted_depth(check_depth(depth_m, frame.intrinsics, where), trust, where)
+        depth, weights = checked_depth(depth_m, trust, frame.intrinsics, where)
         table = None
         if probabilities is not None:
             table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
@@ -218,32 +204,25 @@ class VoxelMap:
             bounds = NO_BOUNDS
             if clears:
                 bounds = self._bounds = depth_bounds(depth, self.config.depth_max_m, self._bounds)
-            cleared: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+            cleared: list[tuple[Int64, Int64]] = []
             for blocks in self.changing(packed):
-                voxels = fuse_blocks(
-                    blocks,
-                    self._grid.buffers(),
-                    camera,
-                    self._limits,
-                    depth,
-                    rgb,
-                    weights,
-                    votes,
-                    measured=measured,
-                    bounds=bounds,
-                )
-                cleared.append((pack_keys(self._grid.buffers().keys[blocks]), voxels))
+                buffers = self._grid.buffers()
+                scene = blocks, buffers, camera, self._limits, depth, rgb, weights, votes
+                cleared.append((pack_keys(buffers.keys[blocks]), fuse_blocks(*scene, measured=measured, bounds=bounds)))
             if clears:
                 cleared += clear_in_view(self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version)
-                for keys, voxels in cleared:
-                    self.cleared += int(voxels.sum())
-                    some = np.flatnonzero(voxels)
-                    version, stamp = np.full(len(some), self.version), np.full(len(some), frame.stamp_ns)
-                    cleared_rows = ClearedBlocks(keys[some], voxels[some], version, stamp)
-                    self._cleared_rows = self._cleared_rows.followed_by(cleared_rows)
+                self._note_cleared(cleared, frame.stamp_ns)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
         return len(packed)
+
+    def _note_cleared(self, cleared: Sequence[tuple[Int64, Int64]], stamp_ns: int) -> None:
+        for keys, voxels in cleared:
+            self.cleared += int(voxels.sum())
+            some = np.flatnonzero(voxels)
+            version, stamp = np.full(len(some), self.version), np.full(len(some), stamp_ns)
+            rows = ClearedBlocks(keys[some], voxels[some], version, stamp)
+            self._cleared_rows = self._cleared_rows.followed_by(rows)
 
     @contextmanager
     def locked(self) -> Iterator[BlockGrid]:
@@ -251,7 +230,7 @@ class VoxelMap:
         with _KERNEL_LOCK:
             yield self._grid
 
-    def changing(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
+    def changing(self, packed: Int64) -> Iterator[Int32]:
         """Bring blocks with unique packed keys (B,) into memory for a pass that changes them; hold the lock meanwhile.
 
         Yields:
@@ -286,10 +265,8 @@ class VoxelMap:
             self.epoch += 1
 
     def points(self, min_weight: float = SURFACE_WEIGHT) -> MapPoints:
-        """Points of the surface, at most three a voxel, in a fixed order.
-
-        Args:
-            min_weight: Voxels of less weight are left out; > 0. 1 = only what was measured.
+        """Points of the surface, at most three a voxel, in a fixed order; voxels of less than ``min_weight`` are left
+        out (1 = only what was measured).
         """
         _check_min_weight(min_weight)
         parts: list[MapPoints] = []
@@ -333,11 +310,7 @@ class VoxelMap:
         return open3d_grid(keys, self.config.voxel_size_m, **flat, label=self.changes(0, min_weight=1e-9).label)
 
     def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> MapView:
-        """The map as a camera would see it, up to ``depth_max_m`` away.
-
-        Args:
-            T_world_camera: (4, 4) float64.
-            intrinsics: Of the view wanted; pixel centres are integers.
+        """The map as a camera (4, 4) would see it, up to ``depth_max_m`` away; pixel centres are integers.
 
         Raises:
             PoseError: the pose is not a rigid transform.
@@ -348,7 +321,7 @@ class VoxelMap:
             depth_m, rgb, channel, confidence, measured = cast_view(self._grid, camera, intrinsics, self.config)
         return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence, measured)
 
-    def block_state(self, keys: NDArray[np.int32] | None = None) -> dict[str, NDArray[np.generic]]:
+    def block_state(self, keys: Int32 | None = None) -> dict[str, NDArray[np.generic]]:
         """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
 
         Returns:
@@ -485,16 +458,30 @@ class VoxelMap:
             for place in other.places.places:
                 self.places.add(moved_place(place, T_self_other))
 
-    def _choose_changes(self, since: int, limit: int, min_weight: float) -> ChosenBlocks:
+    def _choose_changes(self, since: int, limit: int, min_weight: float) -> CopiedChanges:
+        """The changes; their blocks are read under the lock."""
         _check_min_weight(min_weight)
-        decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
-        chosen = choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
-        cleared = self._cleared_rows.between(since, chosen.version)
-        return chosen._replace(scale_known=self.scale_known, cleared=cleared)
+        if not 0 <= since <= self.version or limit < 0:
+            raise MapError(
+                f"changes since version {since}, limit {limit}: versions of this map go from 0 to {self.version}, and "
+                "a limit is not negative; a mirror of another map restarts from version 0"
+            )
+        packed, changed_at = self._grid.versions_since(since)
+        rows, version = oldest_first(changed_at, limit, self.version)
+        packed = packed[rows]
+        return CopiedChanges(
+            since,
+            version,
+            self.version,
+            self.epoch,
+            unpack_keys(packed),
+            Decision(self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight),
+            packed_parts(self._grid, packed),
+            self.scale_known,
+            self._cleared_rows.between(since, version),
+        )
 
-    def _read(
-        self, grid: BlockGrid, voxels: Float64
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32, BoolImage]:
+    def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32, Bool]:
         decision = (self.label_set, self.config.vote_discount, self.config.unknown_below)
         return read_points(voxels, grid.index, grid.buffers(), *decision)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
-from semantic_mapper.mapping.files.up_axis import find_up
-from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.files.floor_plan import find_up
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.queries.checks import check_direction
 from semantic_mapper.queries.instances import LEAST_OVERLAP, Instance, InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror

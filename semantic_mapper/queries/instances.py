@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
-from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_types import CorrectionStatus, MapPoints
-from semantic_mapper.mapping.odometry_sessions import CameraPose
+from semantic_mapper.mapping.map_types import CameraPose, CorrectionStatus, MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers

@@ -17,7 +17,7 @@ from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.geometry import NEAREST_Z_M, invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.fit import Budget, cosine_rate, fit
+from semantic_mapper.training.fit import Budget, FitProgress, cosine_rate, descend, fit
 from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, SourceViews, UInt8
@@ -25,7 +25,6 @@ from semantic_mapper.types import PosedFrame, SourceViews, UInt8
 WARP_TOLERANCE = 0.04  # fraction of z by which a keyframe's depth may disagree and still show the same surface
 LEARNING_RATE, FINAL_LEARNING_RATE = 1e-3, 5e-5  # along half a cosine
 COLOUR_JITTER = 0.2  # as in the fields' own training
-_GAMMA = 2.2  # of the camera's pictures
 
 
 class UNetConfig(Config, frozen=True):
@@ -35,7 +34,6 @@ class UNetConfig(Config, frozen=True):
     steps: int = 0  # this many instead of ``seconds``; 0 = seconds
     width: int = 320
     batch: int = 4
-    darkest: float = 1.0  # images of a step are scaled by a number from this to 1, in linear light; 1 = they are not
     seed: int = 0
 
 
@@ -68,22 +66,25 @@ class UNetBaseline:
             batch = [views[i] for i in order]
             if float(torch.rand(1, generator=generator)) < 0.5:
                 batch = [mirrored_view(v) for v in batch]
-            sources = jitter_colours(stack_sources(batch), COLOUR_JITTER, generator)
-            if self.config.darkest < 1:
-                sources = _dimmed(sources, self.config.darkest, generator)
+            sources = self.varied(stack_sources(batch), generator)
             channel = torch.stack([v.channel for v in batch])
             with self.net.encoder.batch_statistics():
                 logits = self.net.predict_image(to_device(sources, self.device))
             loss = functional.cross_entropy(logits, channel.to(self.device), ignore_index=IGNORE)
-            optimiser.zero_grad()
-            loss.backward()  # pyright: ignore[reportUnknownMemberType]
-            optimiser.step()
-            return float(loss.detach())
+            return descend(optimiser, loss)
 
-        budget = Budget(0.0 if self.config.steps else self.config.seconds, self.config.steps)
-        steps = fit(learn, budget, None if on_progress is None else lambda p: on_progress(p.fraction))
+        def follow(progress: FitProgress) -> None:
+            if on_progress is not None:
+                on_progress(progress.fraction)
+
+        budget = Budget(0.0 if self.config.steps else self.config.seconds, self.config.steps, on_progress=follow)
+        steps = fit(learn, budget)
         self.net.eval()
         return steps
+
+    def varied(self, sources: SourceViews, generator: torch.Generator) -> SourceViews:
+        """Images of a step in other light."""
+        return jitter_colours(sources, COLOUR_JITTER, generator)
 
     def predict(self, frame: PosedFrame) -> UInt8:
         """Class ids (H, W) of one image at full size."""
@@ -94,11 +95,6 @@ class UNetBaseline:
             full = functional.interpolate(logits, size=frame.rgb.shape[:2], mode="bilinear", align_corners=False)
             channel = full[0].argmax(0)
         return self.label_set.to_ids(channel.cpu().numpy())
-
-
-def _dimmed(sources: SourceViews, darkest: float, generator: torch.Generator) -> SourceViews:
-    light = darkest + (1 - darkest) * torch.rand(len(sources.rgb), 1, 1, 1, generator=generator)
-    return replace(sources, rgb=sources.rgb * light ** (1 / _GAMMA))
 
 
 class WarpBaseline:

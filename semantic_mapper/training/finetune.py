@@ -1,66 +1,72 @@
-"""Few-step finetuning on labelled keyframes of one scene (S-Ray section 4.2).
+"""Finetuning on labelled keyframes of one scene (S-Ray section 4.2); held-out rays decide which weights are kept.
 
-Held-out rays decide which weights are kept.
+Steps draw rays of a query view rendered from other views, or single images. All draws are made on the CPU, so that they
+are the same whatever the device. Kinds of fields that hold one scene are fitted in ways of their own (``FITTERS``).
 """
 
 from __future__ import annotations
 
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
 import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 
-from semantic_mapper.config import SRayConfig, to_plain
-from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.config import SamplingConfig, SRayConfig, to_plain
+from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
 from semantic_mapper.fields.device import choose_device, encoder_in_bfloat16, to_device
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.scene.grid import GridField
+from semantic_mapper.fields.scene.irt import IRT
+from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.volume import sample_guided
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.config import FinetuneConfig
+from semantic_mapper.training.config import FinetuneConfig, StepConfig
 from semantic_mapper.training.fit import (
-    BestWeights,
     Budget,
+    Fitted,
     HeldOut,
     OnProgress,
+    State,
     cosine_rate,
+    descend,
     fit,
+    held_out_blocks,
     make_optimiser,
     set_rates,
 )
-from semantic_mapper.training.losses import IGNORE, semantic_loss
-from semantic_mapper.training.step import (
-    classifies_images,
-    encode_once,
-    fit_class_rows,
-    pick_views,
-    step_on_images,
-    step_on_rays,
-)
+from semantic_mapper.training.frame_rays import usable_frames
+from semantic_mapper.training.grid_fit import fit_scene
+from semantic_mapper.training.irt import fit_irt
+from semantic_mapper.training.losses import IGNORE, guess_loss, image_loss, ray_loss, semantic_loss
+from semantic_mapper.training.panoptic import fit_panoptic
 from semantic_mapper.training.views import (
     LabelledView,
     draw_pixels,
+    guided_rays,
+    jitter_colours,
+    mirrored_view,
     query_rays,
     stack_sources,
     view_from_frame,
     view_overlap,
+    withhold_depth,
 )
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import FieldRender, PosedFrame
 
 _log = get_logger(__name__)
 
 FINAL_LEARNING_RATE, WEIGHT_DECAY, GRADIENT_CLIP = 5e-5, 1e-4, 10.0
-PROBE_STEPS = 40  # of the classifier alone, on features as they are, before the first ray
-HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
 FEW_STEPS = 10  # fewer are worth a warning: a slow machine, or a small budget
 HELD_OUT_RAYS = 6144  # over all keyframes: a look must not cost more the more keyframes there are
 HELD_OUT_SOURCES = 7  # that a held-out ray is rendered from, next to its own image: those that see most of its view
@@ -68,21 +74,26 @@ HELD_OUT_SOURCES = 7  # that a held-out ray is rendered from, next to its own im
 # the other views may look at something else there (docs/decisions/0018-images-in-finetuning.md).
 OWN_VIEW_FACTOR = 4.0
 OWN_VIEW_FACTOR_WITHOUT_DEPTH = 1e3
+LEAST_WORTH = 0.05  # of a view that sees nothing of the query: it may still be drawn, to learn what is no use
+VIEWS_MIN, VIEWS_MAX = 3, 5  # source views of a step
+OWN_VIEW_FRACTION = 0.3  # how often the query view is itself a source, as when the current frame is mapped
+BALANCED_FRACTION = 0.5  # of rays drawn with all classes equally likely
+DEPTH_DROPOUT = 0.15  # fraction of source views, and of steps for the query's prior, without depth
+LABEL_DROPOUT = 0.3  # fraction of source views without known labels
+PRIOR_NOISE = 0.01  # sigma of the depth prior's error as a fraction of z
+COLOUR_JITTER = 0.2
+SOURCE_LOSS = 0.25  # weight of the class loss on labelled source views: teaches the encoder densely
+IMAGES = 4  # of a step on single images
+MIRRORED = 0.5  # of them
+IMAGE_BALANCE, IMAGE_DEPTH = 0.25, 0.05  # of steps on images: see ``image_loss``; weight of ``guess_loss``
+PROBE_RATE = 0.03  # of Adam: rows of classes that are new to the weights start from nothing
+PROBE_STEPS = 40  # of the classifier alone, on features as they are, before the first ray
+PROBE_BALANCE = 0.5  # see ``image_loss``
 
+Fitter = Callable[[Sequence[PosedFrame], LabelSet, LearnedField | None, FinetuneConfig, Budget], Fitted]
 
-@dataclass(slots=True)
-class _Scene:
-    """The views to learn from (held-out blocks ignored), the same to look at (all else ignored), and who sees whom.
-
-    Args:
-        queries: Views with something to learn; the others are source views only.
-        overlap: (n, n) of ``view_overlap``.
-    """
-
-    train: Sequence[LabelledView]
-    held_out: Sequence[LabelledView]
-    queries: Sequence[int]
-    overlap: torch.Tensor
+# Kinds that are fitted to a scene in a way of their own. Kinds that build on GridField add a row.
+FITTERS: dict[str, Fitter] = {GridField.kind: fit_scene, IRT.kind: fit_irt, Panoptic.kind: fit_panoptic}
 
 
 def finetune(
@@ -93,31 +104,78 @@ def finetune(
     on_progress: OnProgress | None = None,
     stopped: Callable[[], object] = bool,
     seen_stamps_ns: Iterable[int] = (),
+    kind: str | None = None,
 ) -> Checkpoint:
-    """Fit a field to the labelled keyframes ``frames``; never worse on held-out rays than where it started.
+    """Fit a field to keyframes of one scene; never worse on held-out rays than where it started.
 
     Args:
-        frames: Keyframes with poses; at least 2, one of them labelled. Those without labels are source views only.
+        frames: With poses; those with impossible ones are left out. Labelled ones say the classes, the others help with
+            geometry. At least 2, one of them labelled, but for ``kind`` "grid", which learns no classes.
         label_set: Classes of their labels, and of the result.
-        start: Weights to start from, adapted to ``label_set`` by class name; None = random. A field of which nothing is
-            trained yet learns with batch norms that are alive.
+        start: Weights to start from, adapted to ``label_set`` by class name; None = random. Kinds that hold one scene
+            take its config and its box alone, "panoptic" also its boxes.
         config: At least one of ``seconds`` and ``steps`` set.
         on_progress: Called after every step.
         stopped: Called before every step; once it returns anything true, the best weights so far are the result.
         seen_stamps_ns: Frames that ``start`` was fitted to; the result remembers them with its own.
+        kind: Of the field; None = that of ``start``, or S-Ray.
 
     Raises:
-        FrameError: fewer than two frames, or none with labels.
-        ConfigError: no budget, or no GPU where one is requested.
+        FrameError: too few frames or labels, or poses that do not fit the images.
+        ConfigError: no budget, boxes that cannot be, or no GPU where one is requested.
+        WeightsError: a ``start`` whose classes are others, of a kind that cannot be adapted.
     """
-    check_budget(config)
+    budget = Budget(config.seconds, config.steps, config.evaluations, on_progress, stopped)
+    fitter = FITTERS.get(kind or (SRay.kind if start is None else start.kind), _fit_keyframes)
+    made = fitter(usable_frames(frames), label_set, start, config, budget)
+    recipe = {
+        "kind": "scene fit" if made.model.holds_scene else "finetune",
+        "width": config.width,
+        "config": to_plain(config),
+        "seconds": round(budget.elapsed_s, 1),
+        **made.figures,
+        "train_stamps_ns": sorted({int(f.stamp_ns) for f in made.labelled} | {int(s) for s in seen_stamps_ns}),
+    }
+    anchors = [] if made.model.holds_scene else [anchor_from_frame(f, config.width) for f in made.labelled]
+    return Checkpoint(made.model.cpu().eval(), tuple(anchors), recipe)
+
+
+@dataclass(slots=True)
+class _Scene:
+    """The views to learn from (held-out blocks ignored), the same to look at (all else ignored), and who sees whom."""
+
+    train: Sequence[LabelledView]
+    held_out: Sequence[LabelledView]
+    queries: Sequence[int]  # views with something to learn; the others are source views only
+    overlap: torch.Tensor  # (n, n) of ``view_overlap``
+
+
+def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator: torch.Generator) -> _Scene:
+    sizes = [(view.intrinsics.height, view.intrinsics.width) for view in views]
+    pairs = [
+        (view, held_out_blocks(height, width, config.held_out_fraction, generator))
+        for view, (height, width) in zip(views, sizes, strict=True)
+    ]
+    train = [replace(view, channel=torch.where(mask, IGNORE, view.channel)) for view, mask in pairs]
+    held_out = [replace(view, channel=torch.where(mask, view.channel, IGNORE)) for view, mask in pairs]
+    queries = [i for i, view in enumerate(train) if bool((view.channel != IGNORE).any())]
+    return _Scene(train, held_out, queries or range(len(views)), view_overlap(views))
+
+
+def _fit_keyframes(
+    frames: Sequence[PosedFrame],
+    label_set: LabelSet,
+    start: LearnedField | None,
+    config: FinetuneConfig,
+    budget: Budget,
+) -> Fitted:
+    """Fit S-Ray, or another field that encodes images, to labelled keyframes."""
     labelled = [f for f in frames if f.label is not None]
     if len(frames) < 2 or not labelled:
         raise FrameError(
             f"finetuning needs at least 2 frames, one of them labelled, got {len(frames)} with {len(labelled)} "
             "labelled; label more frames"
         )
-    budget = Budget(config.seconds, config.steps, config.evaluations)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
@@ -125,43 +183,21 @@ def finetune(
     device = choose_device(config.device, 0)
     model.to(device)
     with encoder_in_bfloat16(model, device):
-        best, steps, own_view = _run(model, scene, config, budget, generator, on_progress, stopped)
-    model.load_state_dict(best.state)
-    recipe: dict[str, Any] = {
-        "kind": "finetune",
-        "width": config.width,
-        "config": to_plain(config),
+        held_out, steps, own_view = _run(model, scene, config, budget, generator)
+    model.load_state_dict(held_out.best)
+    figures = {
         "steps": steps,
-        "best_step": best.step,
-        "seconds": round(budget.elapsed_s, 1),
-        "held_out_loss": best.loss,
-        "held_out_accuracy": best.accuracy,
+        "best_step": held_out.step,
+        "held_out_loss": held_out.loss,
+        "held_out_accuracy": held_out.accuracy,
         "own_view": own_view,
-        "train_stamps_ns": sorted({int(f.stamp_ns) for f in labelled} | {int(s) for s in seen_stamps_ns}),
     }
-    anchors = tuple(anchor_from_frame(f, config.width) for f in labelled)
-    return Checkpoint(model.cpu().eval(), anchors, recipe)
-
-
-def check_budget(config: FinetuneConfig) -> None:
-    """Refuse a fit without end.
-
-    Raises:
-        ConfigError: neither ``seconds`` nor ``steps`` is set.
-    """
-    if config.seconds <= 0 and config.steps <= 0:
-        raise ConfigError("a fit needs a budget: set seconds, steps, or both")
+    return Fitted(model, figures, labelled)
 
 
 def _run(
-    model: LearnedField,
-    scene: _Scene,
-    config: FinetuneConfig,
-    budget: Budget,
-    generator: torch.Generator,
-    on_progress: OnProgress | None,
-    stopped: Callable[[], object],
-) -> tuple[BestWeights, int, dict[str, float]]:
+    model: LearnedField, scene: _Scene, config: FinetuneConfig, budget: Budget, generator: torch.Generator
+) -> tuple[HeldOut, int, dict[str, float]]:
     """The best weights, the number of steps, and how much the own view counts."""
     optimiser = make_optimiser(model, config.learning_rate, WEIGHT_DECAY)
     encoder = model.image_encoder
@@ -169,24 +205,24 @@ def _run(
     if alive:
         _settle_norms(model, scene.train)
     elif encoder is not None:
-        encoder.freeze_backbones()  # a few keyframes are no match for a million photographs
+        encoder.freeze(*encoder.backbones())  # a few keyframes are no match for a million photographs
 
     def look() -> tuple[float, float]:
         if alive:
             _settle_norms(model, scene.train)
         return _evaluate(model, scene, config)
 
-    def state() -> dict[str, torch.Tensor]:
+    def state() -> State:
         return copy.deepcopy(model.state_dict())
 
     images_from, images_until = config.frozen_encoder_fraction, _end_of_images(model, config)
-    own_view = _weigh_own_view(model, scene, config)
-    with budget.looking():
-        best = BestWeights(*look(), 0, state())
+    own_view = _weigh_own_view(model, scene, images_from < images_until)
     # Random weights get worse before they get better.
-    held_out = HeldOut(look, state, best, 0 if alive else config.patience, images_until)
+    held_out = HeldOut(look, state, 0 if alive else config.patience, images_until)
+    with budget.looking():
+        held_out.judge(0)
     encoded = None if alive else _linear_probe(model, scene, config, held_out)
-    if not math.isfinite(held_out.best.loss):
+    if not math.isfinite(held_out.loss):
         _log.warning("nothing_held_out", reason="too few labelled pixels; the last weights are kept, not the best")
     labelled = [scene.train[i] for i in scene.queries]
 
@@ -200,28 +236,41 @@ def _run(
                 query, sources = pick_views(scene.queries, scene.overlap, generator)
                 kept = encoded if fraction < images_from else None
                 loss = step_on_rays(model, scene.train, query, sources, config.step, generator, kept)
-        if loss is None:
-            return None
-        optimiser.zero_grad()
-        loss.backward()  # pyright: ignore[reportUnknownMemberType]
-        torch.nn.utils.clip_grad_norm_(model.parameters(), GRADIENT_CLIP)
-        optimiser.step()
-        return float(loss.detach())
+        return None if loss is None else descend(optimiser, loss, GRADIENT_CLIP)
 
-    steps = fit(learn, budget, on_progress, stopped, held_out)
-    if steps < FEW_STEPS and not stopped():
+    steps = fit(learn, budget, held_out)
+    if steps < FEW_STEPS and not budget.stopped():
         _log.warning(
             "few_steps", steps=steps, reason="the budget was used up before anything could be learned; raise it"
         )
-    return held_out.best, steps, own_view
+    return held_out, steps, own_view
 
 
 def _end_of_images(model: LearnedField, config: FinetuneConfig) -> float:
     """Fraction of the budget until which steps are on images; 0 where a kind says nothing of them, or the encoder is to
     stay what it is."""
-    if config.encoder_rate == 0 or not classifies_images(model):
+    if config.encoder_rate == 0 or not model.classifies_images:
         return 0.0
     return config.frozen_encoder_fraction + (1 - config.frozen_encoder_fraction) * config.image_fraction
+
+
+def _weigh_own_view(model: LearnedField, scene: _Scene, learns_images: bool) -> dict[str, float]:
+    """Let the own image, which steps on images fit to this scene, count more than one view among others.
+
+    Returns:
+        The factors; empty where the encoder learns nothing of the scene, or where no view has depth: then every ray
+        needs the other views.
+    """
+    has_depth = any(bool((view.depth_m > 0).any()) for view in scene.train)
+    if not (learns_images and has_depth and model.weigh_own_view(OWN_VIEW_FACTOR, OWN_VIEW_FACTOR_WITHOUT_DEPTH)):
+        return {}
+    return {"factor": OWN_VIEW_FACTOR, "factor_without_depth": OWN_VIEW_FACTOR_WITHOUT_DEPTH}
+
+
+def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:
+    """Norms that are alive take the statistics of all views: running means lag behind weights that change fast."""
+    if model.image_encoder is not None:
+        calibrate(model.image_encoder, to_device(stack_sources(views), next(model.parameters()).device))
 
 
 def _linear_probe(model: LearnedField, scene: _Scene, config: FinetuneConfig, held_out: HeldOut) -> EncodedViews | None:
@@ -233,39 +282,41 @@ def _linear_probe(model: LearnedField, scene: _Scene, config: FinetuneConfig, he
     """
     if model.needs_own_view:
         return None
-    encoded = encode_once(model, scene.train, with_labels=config.step.known_labels)
-    if fit_class_rows(model, encoded, scene.train, PROBE_STEPS):
-        after = _evaluate(model, scene, config)
-        if held_out.best.beaten_by(after[0]):
-            held_out.best = BestWeights(*after, 0, held_out.state())
-        else:
-            model.load_state_dict(held_out.best.state)
+    device = next(model.parameters()).device
+    with torch.no_grad():
+        encoded = model.encode(to_device(stack_sources(scene.train, with_labels=config.step.known_labels), device))
+    if fit_class_rows(model, encoded, scene.train, PROBE_STEPS) and not held_out.judge(0)[2]:
+        model.load_state_dict(held_out.best)
     return encoded
 
 
-def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:
-    """Norms that are alive take the statistics of all views: running means lag behind weights that change fast."""
-    if model.image_encoder is not None:
-        calibrate(model.image_encoder, to_device(stack_sources(views), next(model.parameters()).device))
+def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[LabelledView], steps: int) -> bool:
+    """Fit the class rows of ``model`` to the labelled pixels of ``views``; nothing else changes.
 
+    Convex, since the classifier is linear, and cheap, since nothing is rendered or encoded: what is left for the steps
+    on rays is what they alone can do. Kinds of fields that say nothing of images by themselves are left as they are.
 
-def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator: torch.Generator) -> _Scene:
-    train: list[LabelledView] = []
-    held_out: list[LabelledView] = []
-    for view in views:
-        height, width = view.channel.shape
-        mask = held_out_blocks(height, width, config.held_out_fraction, generator)
-        train.append(replace(view, channel=torch.where(mask, IGNORE, view.channel)))
-        held_out.append(replace(view, channel=torch.where(mask, view.channel, IGNORE)))
-    queries = [i for i, view in enumerate(train) if bool((view.channel != IGNORE).any())]
-    return _Scene(train, held_out, queries or range(len(views)), view_overlap(views))
+    Args:
+        encoded: The same views, encoded by ``model``.
+        views: Their labels count, at the size of the features.
+        steps: Over all views at once.
 
-
-def held_out_blocks(height: int, width: int, fraction: float, generator: torch.Generator) -> torch.Tensor:
-    """Mask (H, W) of blocks of an image that are held out."""
-    rows, columns = -(-height // HELD_OUT_BLOCK), -(-width // HELD_OUT_BLOCK)
-    blocks = torch.rand(rows, columns, generator=generator) < fraction
-    return blocks.repeat_interleave(HELD_OUT_BLOCK, 0).repeat_interleave(HELD_OUT_BLOCK, 1)[:height, :width]
+    Returns:
+        Whether anything was fitted.
+    """
+    rows = [model.get_parameter(name) for name in model.class_rows]
+    channel = torch.stack([view.channel for view in views]).to(encoded.feature.device)
+    optimiser = torch.optim.Adam(rows, PROBE_RATE)
+    for _ in range(steps):
+        logits = model.source_logits(encoded)
+        if logits is None:
+            return False
+        gradients = torch.autograd.grad(image_loss(logits, channel, PROBE_BALANCE), rows)
+        for row, gradient in zip(rows, gradients, strict=True):
+            row.grad = gradient
+        optimiser.step()
+    optimiser.zero_grad()
+    return steps > 0
 
 
 def _evaluate(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> tuple[float, float]:
@@ -273,7 +324,7 @@ def _evaluate(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> tup
     image, and from the others that see most of it, with their training labels if the config makes them known."""
     generator = torch.Generator().manual_seed(config.seed)
     rays_a_view = min(config.held_out_rays, max(1, HELD_OUT_RAYS // len(scene.queries)))
-    sampling, device = config.step.sampling, next(model.parameters()).device
+    device = next(model.parameters()).device
     losses: list[float] = []
     right, counted = 0, 0
     model.eval()
@@ -283,15 +334,9 @@ def _evaluate(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> tup
             flat = draw_pixels(view.channel, rays_a_view, 0.5, generator, len(model.label_set))
             if len(flat) == 0:
                 continue
-            prior = view.depth_m.flatten()[flat]
-            rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
-            others = [] if model.needs_own_view else _views_that_see(scene, i)
-            sources = encoded.select(torch.tensor([*others, i], device=device))
-            known = sources.channel.clone()
-            known[-1] = IGNORE  # a mapper's current frame has no labels
-            z = sample_guided(rays, sampling).to(device)
-            render, _ = model.render_samples(to_device(rays, device), z, replace(sources, channel=known))
-            channel = targets.channel.to(device)
+            others = [] if model.needs_own_view else [j for j in views_that_see(scene.overlap[i]) if j != i]
+            sources = encoded.select(torch.tensor([*others[:HELD_OUT_SOURCES], i], device=device))
+            render, channel = render_as_mapped(model, view, flat, sources, config.step.sampling)
             losses.append(float(semantic_loss(render.logits, channel)))
             right += int(((render.logits.argmax(1) == channel) & render.known).sum())
             counted += len(flat)
@@ -299,21 +344,122 @@ def _evaluate(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> tup
     return float(np.mean(losses)) if losses else float("inf"), right / max(counted, 1)
 
 
-def _views_that_see(scene: _Scene, view: int) -> list[int]:
-    """Numbers of the other views that see most of a view."""
-    order = scene.overlap[view].argsort(descending=True, stable=True)
-    return order[order != view][:HELD_OUT_SOURCES].tolist()
+def views_that_see(overlap: torch.Tensor) -> list[int]:
+    """Numbers of views by how much of another they see (n,), most first."""
+    return overlap.argsort(descending=True, stable=True).tolist()
 
 
-def _weigh_own_view(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> dict[str, float]:
-    """Let the own image, which steps on images fit to this scene, count more than one view among others.
+def render_as_mapped(
+    model: LearnedField, view: LabelledView, flat: torch.Tensor, sources: EncodedViews, sampling: SamplingConfig
+) -> tuple[FieldRender, torch.Tensor]:
+    """Pixels (R,) of a view as a mapper renders them, and their classes (R,).
+    ``sources``: the last one is the view itself, whose labels a mapper does not know."""
+    device = next(model.parameters()).device
+    prior = view.depth_m.flatten()[flat]
+    rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
+    known = sources.channel.clone()
+    known[-1] = IGNORE
+    z = sample_guided(rays, sampling).to(device)
+    render, _ = model.render_samples(to_device(rays, device), z, replace(sources, channel=known))
+    return render, targets.channel.to(device)
 
-    Returns:
-        The factors; empty where the encoder learns nothing of the scene, or where no view has depth: then every ray
-        needs the other views.
+
+def pick_views(
+    queries: Sequence[int],
+    overlap: torch.Tensor,
+    generator: torch.Generator,
+    own_view_fraction: float = OWN_VIEW_FRACTION,
+) -> tuple[int, list[int]]:
+    """Draw a query view of ``queries``, and its source views: the more one sees of the query, the likelier it is.
+    ``overlap``: (n, n) of ``view_overlap``, of all views of one scene."""
+    query = queries[int(torch.randint(len(queries), (1,), generator=generator))]
+    worth = overlap[query] + LEAST_WORTH
+    worth[query] = 0
+    size = int(torch.randint(VIEWS_MIN, VIEWS_MAX + 1, (1,), generator=generator))
+    size = max(1, min(size, len(overlap) - 1))
+    sources = torch.multinomial(worth, size, generator=generator).tolist() if len(overlap) > 1 else [query]
+    if float(torch.rand(1, generator=generator)) < own_view_fraction:
+        sources = [*sources[: max(0, size - 1)], query]
+    return query, sources
+
+
+def step_on_rays(
+    model: LearnedField,
+    views: Sequence[LabelledView],
+    query: int,
+    sources: Sequence[int],
+    config: StepConfig,
+    generator: torch.Generator,
+    encoded: EncodedViews | None = None,
+) -> torch.Tensor | None:
+    """Loss of rays of ``views[query]`` rendered from ``views[sources]``; None where the query has no labelled pixel.
+
+    Args:
+        encoded: All views, where the image encoder is frozen. Colours are not jittered and no depth of source views is
+            withheld then: both would need features of their own.
     """
-    has_images = _end_of_images(model, config) > config.frozen_encoder_fraction
-    has_depth = any(bool((view.depth_m > 0).any()) for view in scene.train)
-    if not (has_images and has_depth and model.weigh_own_view(OWN_VIEW_FACTOR, OWN_VIEW_FACTOR_WITHOUT_DEPTH)):
-        return {}
-    return {"factor": OWN_VIEW_FACTOR, "factor_without_depth": OWN_VIEW_FACTOR_WITHOUT_DEPTH}
+    view, device = views[query], next(model.parameters()).device
+    flat = draw_pixels(view.channel, config.rays, BALANCED_FRACTION, generator, len(model.label_set))
+    if len(flat) == 0:
+        return None
+    rays, targets, z = guided_rays(
+        view,
+        flat,
+        config.sampling,
+        generator,
+        noise=PRIOR_NOISE,
+        withheld=DEPTH_DROPOUT,
+        samples_without_depth=config.samples_without_depth,
+    )
+    rays, targets, z = to_device(rays, device), to_device(targets, device), z.to(device)
+    if encoded is None:
+        stacked = stack_sources([views[i] for i in sources], with_labels=config.known_labels)
+        if stacked.channel is not None:
+            stacked = replace(stacked, channel=_withheld(stacked.channel, query, sources, generator))
+        stacked = withhold_depth(stacked, DEPTH_DROPOUT, generator)
+        chosen = model.encode(jitter_colours(to_device(stacked, device), COLOUR_JITTER, generator))
+    else:
+        chosen = encoded.select(torch.tensor(list(sources), device=device))
+        if config.known_labels:
+            chosen = replace(chosen, channel=_withheld(chosen.channel, query, sources, generator))
+    render, _ = model.render_samples(rays, z, chosen)
+    loss = ray_loss(render, targets).total
+    logits = model.source_logits(chosen)
+    if logits is None:
+        return loss
+    channel = torch.stack([views[i].channel for i in sources]).to(device)
+    return loss + SOURCE_LOSS * image_loss(logits, channel, 0.0)
+
+
+def _withheld(channel: torch.Tensor, query: int, sources: Sequence[int], generator: torch.Generator) -> torch.Tensor:
+    """Known labels (m, H, W) of the sources without those of a random fraction, and without the query's own: a robot's
+    current frame has none."""
+    keep = torch.rand(len(sources), generator=generator) >= LABEL_DROPOUT
+    keep &= torch.tensor([i != query for i in sources])
+    return torch.where(keep.to(channel.device)[:, None, None], channel, IGNORE)
+
+
+def step_on_images(model: LearnedField, views: Sequence[LabelledView], generator: torch.Generator) -> torch.Tensor:
+    """Loss of what a field that classifies images makes of some of the views, each by itself.
+
+    An image costs a fraction of what rays from several views cost; gradients flow into the encoder and the classifier.
+    """
+    views = [views[i] for i in torch.randperm(len(views), generator=generator).tolist()[:IMAGES]]
+    views = [mirrored_view(v) if float(torch.rand(1, generator=generator)) < MIRRORED else v for v in views]
+    # All without depth or none: norms take their statistics from images of one kind.
+    colours_only = float(torch.rand(1, generator=generator)) < DEPTH_DROPOUT
+    stacked = stack_sources(views, with_labels=True)
+    device = next(model.parameters()).device
+    sources = withhold_depth(replace(stacked, channel=None), float(colours_only), generator)
+    sources = jitter_colours(to_device(sources, device), COLOUR_JITTER, generator)
+    encoder = model.image_encoder
+    assert encoder is not None and stacked.channel is not None
+    with encoder.batch_statistics():
+        encoded = model.encode(sources)
+        logits = model.source_logits(encoded)
+    assert logits is not None
+    loss = image_loss(logits, stacked.channel.to(device), IMAGE_BALANCE)
+    if encoded.geometry.any():  # a field without geometry holds zeros
+        # Images without depth learn to guess it.
+        loss = loss + IMAGE_DEPTH * guess_loss(encoded.geometry, sources.depth_m, stacked.depth_m.to(device))
+    return loss

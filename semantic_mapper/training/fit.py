@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.types import PosedFrame
 
-BACKBONE = "backbone"
-ENCODER = "encoder"
-REST = "rest"
+BACKBONE, ENCODER, REST = "backbone", "encoder", "rest"  # groups of parameters
+HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
 
 State = dict[str, torch.Tensor]
 
@@ -34,50 +36,60 @@ class FitProgress:
 OnProgress = Callable[[FitProgress], None]
 
 
-@dataclass(slots=True)
-class BestWeights:
-    """Loss (infinite where nothing is held out) and accuracy of held-out rays, and the weights that gave them."""
+class Fitted(NamedTuple):
+    """What a fit has made: a field, figures for its recipe, and the frames whose labels were used."""
 
-    loss: float
-    accuracy: float
-    step: int
-    state: State
-
-    def beaten_by(self, loss: float) -> bool:
-        """Whether weights with this loss go before these; where nothing is held out, later ones do."""
-        return loss < self.loss or not math.isfinite(self.loss)
+    model: LearnedField
+    figures: dict[str, Any]
+    labelled: Sequence[PosedFrame] = ()
 
 
 class Budget:
-    """How much of a budget is used; from the time that is left, a last look at held-out rays is set aside.
+    """How long a fit may take, who follows it, and who may end it; it begins now.
 
     Args:
-        seconds: From now on; 0 = only steps count.
+        seconds: Of wall-clock time, the last look at held-out rays included; 0 = only steps count.
         steps: 0 = only seconds count.
         looks: At held-out rays, over the whole budget.
+        on_progress: Called after every step.
+        stopped: Called before every step; once it returns something true, the fit ends.
+
+    Raises:
+        ConfigError: neither seconds nor steps.
     """
 
-    def __init__(self, seconds: float, steps: int, looks: int = 1) -> None:
-        self._seconds, self._steps, self._looks = seconds, steps, looks
+    def __init__(
+        self,
+        seconds: float,
+        steps: int,
+        looks: int = 1,
+        on_progress: OnProgress | None = None,
+        stopped: Callable[[], object] = bool,
+    ) -> None:
+        if seconds <= 0 and steps <= 0:
+            raise ConfigError("a fit needs a budget: set seconds, steps, or both")
+        self.seconds, self.steps, self.looks = seconds, steps, looks
+        self.on_progress, self.stopped = on_progress, stopped
         self._began = time.monotonic()
-        self._look_s = 0.0
+        self._last_look_s = 0.0
         self._looked = 0
+        self._given = 0.0
 
     @property
     def elapsed_s(self) -> float:
-        """Since it was made."""
+        """Since it began."""
         return time.monotonic() - self._began
 
     def used(self, step: int) -> float:
-        """Fraction of the budget that is used after ``step`` steps."""
-        left_for_steps = max(self._seconds - self._look_s, 1e-9) if self._seconds > 0 else 0.0
-        return budget_fraction(step, self.elapsed_s, steps=self._steps, seconds=left_for_steps)
+        """Fraction of the budget that is used after ``step`` steps; time for one more look is set aside."""
+        left_for_steps = max(self.seconds - self._last_look_s, 1e-9) if self.seconds > 0 else 0.0
+        return budget_fraction(step, self.elapsed_s, steps=self.steps, seconds=left_for_steps)
 
     def look_due(self, fraction: float) -> bool:
         """Whether it is time for the next look, which is then counted; at the end of the budget it always is."""
-        if fraction * self._looks < self._looked + 1 and fraction < 1:
+        if fraction * self.looks < self._looked + 1 and fraction < 1:
             return False
-        self._looked = int(fraction * self._looks)
+        self._looked = int(fraction * self.looks)
         return True
 
     @contextmanager
@@ -85,48 +97,62 @@ class Budget:
         """Round each look: the next one is expected to take as long."""
         began = time.monotonic()
         yield
-        self._look_s = time.monotonic() - began
+        self._last_look_s = time.monotonic() - began
+
+    def part(self, until: float, *, steps: int | None = None) -> Budget:
+        """The budget of the next part of a fit, which ends at a fraction of this one: its time, and its progress.
+
+        Args:
+            until: A part that comes late has a twentieth of the time until there at least.
+            steps: Of the part; None = as many as the whole may have.
+        """
+        first, self._given = self._given, until
+        seconds = max(until * self.seconds - self.elapsed_s, 0.05 * until * self.seconds)
+
+        def on_progress(progress: FitProgress) -> None:
+            if self.on_progress is not None:
+                self.on_progress(replace(progress, fraction=first + (until - first) * progress.fraction))
+
+        return Budget(seconds, self.steps if steps is None else steps, self.looks, on_progress, self.stopped)
 
 
 @dataclass(slots=True)
 class HeldOut:
-    """How a fit is judged while it runs.
+    """How a fit is judged while it runs, and the weights that were best."""
 
-    Args:
-        look: Loss and accuracy of held-out rays.
-        state: A copy of the weights.
-        best: Those to beat.
-        patience: Looks without a better loss before the fit stops early; 0 = it does not.
-        patient_until: Fraction of the budget before which looks do not count for that.
-    """
+    look: Callable[[], tuple[float, float]]  # loss (infinite where nothing is held out) and accuracy of held-out rays
+    state: Callable[[], State]  # a copy of the weights
+    patience: int = 0  # looks without a better loss before the fit stops early; 0 = it does not
+    patient_until: float = 0.0  # fraction of the budget before which looks do not count for that
+    # Of the best weights so far
+    loss: float = math.inf
+    accuracy: float = math.nan
+    step: int = 0
+    best: State = field(default_factory=dict[str, torch.Tensor])
 
-    look: Callable[[], tuple[float, float]]
-    state: Callable[[], State]
-    best: BestWeights
-    patience: int = 0
-    patient_until: float = 0.0
+    def judge(self, step: int) -> tuple[float, float, bool]:
+        """Look, and keep the weights where they are better or nothing is held out: loss, accuracy, and whether."""
+        loss, accuracy = self.look()
+        better = loss < self.loss or not math.isfinite(self.loss)
+        if better:
+            self.loss, self.accuracy, self.step, self.best = loss, accuracy, step, self.state()
+        return loss, accuracy, better
 
 
-def fit(
-    learn: Callable[[float], float | None],
-    budget: Budget,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
-    held_out: HeldOut | None = None,
-) -> int:
-    """Learn until the budget is used; ``held_out.best`` then has the weights that were best.
+def fit(learn: Callable[[float], float | None], budget: Budget, held_out: HeldOut | None = None) -> int:
+    """Learn until the budget is used; ``held_out`` then has the weights that were best.
+
+    A fit that is stopped ends after one more look.
 
     Args:
         learn: One step, at a fraction of the budget; returns its loss, None = there was nothing to learn from.
-        on_progress: Called after every step.
-        stopped: Called before every step; once it returns something true, the fit ends after one more look.
 
     Returns:
         The number of steps.
     """
     step, stale = 0, 0
-    latest = (math.nan, math.nan) if held_out is None else (held_out.best.loss, held_out.best.accuracy)
-    while (fraction := budget.used(step)) < 1 and not stopped():
+    loss_there, accuracy = (math.nan, math.nan) if held_out is None else (held_out.loss, held_out.accuracy)
+    while (fraction := budget.used(step)) < 1 and not budget.stopped():
         if held_out is not None and 0 < held_out.patience <= stale:
             break
         loss = learn(fraction)
@@ -134,31 +160,26 @@ def fit(
         if loss is None:
             continue
         fraction = budget.used(step)
-        improved = False
+        better = False
         if held_out is not None and budget.look_due(fraction):
             with budget.looking():
-                latest = held_out.look()
-            improved = _keep_better(held_out, latest, step)
-            stale = 0 if improved or fraction < held_out.patient_until else stale + 1
-        if on_progress is not None:
-            on_progress(FitProgress(step, min(fraction, 1.0), loss, *latest, improved))
-    if held_out is not None and stopped() and step > 0:  # what was learned since the last look
-        _keep_better(held_out, held_out.look(), step)
+                loss_there, accuracy, better = held_out.judge(step)
+            stale = 0 if better or fraction < held_out.patient_until else stale + 1
+        if budget.on_progress is not None:
+            budget.on_progress(FitProgress(step, min(fraction, 1.0), loss, loss_there, accuracy, better))
+    if held_out is not None and budget.stopped() and step > 0:  # what was learned since the last look
+        held_out.judge(step)
     return step
 
 
-def _keep_better(held_out: HeldOut, seen: tuple[float, float], step: int) -> bool:
-    if not held_out.best.beaten_by(seen[0]):
-        return False
-    held_out.best = BestWeights(*seen, step, held_out.state())
-    return True
-
-
-def part_of(on_progress: OnProgress | None, first: float, last: float) -> OnProgress | None:
-    """Progress of a part of a fit, which takes it from the fraction ``first`` to ``last``."""
-    if on_progress is None:
-        return None
-    return lambda p: on_progress(replace(p, fraction=first + (last - first) * p.fraction))
+def descend(optimiser: torch.optim.Optimizer, loss: torch.Tensor, clip: float = math.inf) -> float:
+    """One step down a loss, with gradients of at most this norm; returns the loss."""
+    optimiser.zero_grad()
+    loss.backward()  # pyright: ignore[reportUnknownMemberType]
+    if math.isfinite(clip):
+        torch.nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], clip)
+    optimiser.step()
+    return float(loss.detach())
 
 
 def budget_fraction(step: int, elapsed_s: float, *, steps: int, seconds: float) -> float:
@@ -168,9 +189,11 @@ def budget_fraction(step: int, elapsed_s: float, *, steps: int, seconds: float) 
     return max(by_steps, by_time)
 
 
-def time_left(seconds: float, began: float) -> float:
-    """Seconds left of a budget that began at a time of ``time.monotonic``: a twentieth of it at least."""
-    return max(seconds - (time.monotonic() - began), 0.05 * seconds)
+def held_out_blocks(height: int, width: int, fraction: float, generator: torch.Generator) -> torch.Tensor:
+    """Mask (H, W) of blocks of an image that are held out."""
+    rows, columns = -(-height // HELD_OUT_BLOCK), -(-width // HELD_OUT_BLOCK)
+    blocks = torch.rand(rows, columns, generator=generator) < fraction
+    return blocks.repeat_interleave(HELD_OUT_BLOCK, 0).repeat_interleave(HELD_OUT_BLOCK, 1)[:height, :width]
 
 
 def cosine_rate(fraction: float, first: float, last: float) -> float:
@@ -178,16 +201,16 @@ def cosine_rate(fraction: float, first: float, last: float) -> float:
     return last + (first - last) * 0.5 * (1 + math.cos(math.pi * fraction))
 
 
-def make_optimiser(field: LearnedField, learning_rate: float, weight_decay: float) -> torch.optim.AdamW:
+def make_optimiser(model: LearnedField, learning_rate: float, weight_decay: float) -> torch.optim.AdamW:
     """AdamW over all parameters; scales, shifts and biases do not decay."""
-    encoder = field.image_encoder
+    encoder = model.image_encoder
     part_of_id: dict[int, str] = {}
     if encoder is not None:
         part_of_id |= {id(p): ENCODER for p in encoder.parameters()}
         part_of_id |= {id(p): BACKBONE for backbone in encoder.backbones() for p in backbone.parameters()}
     groups = [
         {
-            "params": [p for p in field.parameters() if part_of_id.get(id(p), REST) == part and (p.ndim > 1) == decays],
+            "params": [p for p in model.parameters() if part_of_id.get(id(p), REST) == part and (p.ndim > 1) == decays],
             "weight_decay": weight_decay if decays else 0.0,
             "part": part,
         }

@@ -19,21 +19,13 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRays:
-    """Pixels of F frames, P in all, frame by frame and row by row.
+    """Pixels of F frames, P in all, frame by frame and row by row."""
 
-    Args:
-        intrinsics: Of each frame, at working width; sizes may differ.
-        T_world_camera: (F, 4, 4) float32.
-        first: (F + 1,) number of each frame's first pixel.
-        rgb: (P, 3) uint8.
-        depth_m: (P,) z in metres, 0 = none.
-    """
-
-    intrinsics: tuple[CameraIntrinsics, ...]
-    T_world_camera: Float32
-    first: Int64
-    rgb: UInt8
-    depth_m: Float32
+    intrinsics: tuple[CameraIntrinsics, ...]  # of each frame, at working width; sizes may differ
+    T_world_camera: Float32  # (F, 4, 4) float32
+    first: Int64  # (F + 1,) number of each frame's first pixel
+    rgb: UInt8  # (P, 3) uint8
+    depth_m: Float32  # (P,) z in metres, 0 = none
 
     def __len__(self) -> int:
         return int(self.first[-1])
@@ -55,6 +47,10 @@ class FrameRays:
         origin = np.ascontiguousarray(self.T_world_camera[frame, :3, 3])
         return RayBatch(torch.from_numpy(origin), torch.from_numpy(direction), near, far, none)
 
+    def colours(self, pixels: Int64) -> torch.Tensor:
+        """Colours (R, 3) in [0, 1] of pixels (R,)."""
+        return torch.from_numpy(self.rgb[pixels] / np.float32(255))
+
     def pixels_of(self, frame: int) -> Int64:
         """Numbers of all pixels of a frame, row by row."""
         return np.arange(self.first[frame], self.first[frame + 1])
@@ -65,11 +61,7 @@ class FrameRays:
 
 
 def frame_rays(frames: Sequence[PosedFrame], width: int) -> FrameRays:
-    """The pixels of frames at a working width.
-
-    Raises:
-        FrameError: no frames.
-    """
+    """The pixels of frames at a working width. Raises FrameError: no frames."""
     if not frames:
         raise FrameError("there are no frames to take rays from")
     intrinsics = tuple(working_intrinsics(f.intrinsics, width) for f in frames)

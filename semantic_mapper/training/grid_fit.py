@@ -9,21 +9,28 @@ from __future__ import annotations
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
 import torch
 from torch import nn
 
-from semantic_mapper.config import GridConfig, GridFieldConfig, to_plain
-from semantic_mapper.errors import ConfigError, FrameError
-from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field, field_config
-from semantic_mapper.fields.scene.grid import HAZE, NOTHING, GridField, SceneGrid, at_resolution, sky_texels
+from semantic_mapper.config import GridConfig, GridFieldConfig
+from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.learned import LearnedField, build_field
+from semantic_mapper.fields.scene.grid import (
+    HAZE,
+    NOTHING,
+    GridField,
+    SceneGrid,
+    Trunk,
+    at_resolution,
+    ray_fraction,
+    sky_texels,
+)
 from semantic_mapper.fields.scene.march import (
     BIAS,
     LossWeights,
@@ -40,8 +47,8 @@ from semantic_mapper.fields.scene.march import (
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import FinetuneConfig
-from semantic_mapper.training.fit import Budget, OnProgress, fit, part_of, time_left
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
+from semantic_mapper.training.fit import Budget, Fitted, descend, fit
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays
 from semantic_mapper.training.scene_box import check_parallax, scene_box
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 
@@ -63,56 +70,45 @@ FEATURE_RATE, TRUNK_RATE = 2e-2, 2e-3
 GRID_UNTIL = 0.6  # fraction of the time, where features are fitted to the grid afterwards
 
 
+LeaveOut = Callable[[Sequence[PosedFrame], FrameRays], Bool]  # pixels (P,) that show something else than the scene
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GridFit:
-    """A fitted grid.
-
-    Args:
-        grid: The grid.
-        steps: That it was fitted for.
-        seconds: Wall-clock time.
-        psnr: Of held-out frames in dB, each with the gain that fits it best if exposure was fitted; NaN where none were
-            rendered: none held out, or stopped.
-        mean_colour_psnr: The same of images of their mean colour.
-        frames: F frames that it was fitted to.
-        gains: (F, 3) their exposure.
-    """
+    """A fitted grid."""
 
     grid: SceneGrid
     steps: int
-    seconds: float
+    # Of held-out frames in dB, each with the gain that fits it best if exposure was fitted; NaN where none were
+    # rendered: none held out, or stopped
     psnr: float
-    mean_colour_psnr: float
-    frames: tuple[PosedFrame, ...]
-    gains: Float32
+    frames: tuple[PosedFrame, ...]  # f frames that it was fitted to for ``steps`` steps
+    gains: Float32  # (F, 3) their exposure
 
 
 def fit_grid(
     frames: Sequence[PosedFrame],
     config: FinetuneConfig,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
+    budget: Budget | None = None,
     box: GridConfig | None = None,
-    leave_out: Callable[[Sequence[PosedFrame], FrameRays], Bool] | None = None,
+    leave_out: LeaveOut | None = None,
 ) -> GridFit:
     """Fit a grid to posed images.
 
     Args:
-        frames: Of a scene that stands still; sizes and cameras may differ. Frames with impossible poses are left out.
-        config: Budget, box and resolution; without ``steps`` those of ``config.grid``.
-        on_progress: Called after every step with the mean squared error of its rays.
-        stopped: Called before every step; once it returns anything true, the grid so far is the result.
+        frames: Of a scene that stands still, with rigid poses; sizes and cameras may differ.
+        config: Box and resolution.
+        budget: None = that of ``config``; without steps those of ``config.grid``.
         box: Instead of the one that ``config`` describes.
-        leave_out: Which pixels (P,) of the frames show something else than the scene.
+        leave_out: Which pixels show something else than the scene.
 
     Raises:
         FrameError: too few frames, poses that only turn, or held-out views rendered hardly better than by their mean
             colour.
         ConfigError: a box that cannot be.
     """
-    budget = Budget(config.seconds, config.steps or config.grid.steps)
+    budget = budget or Budget(config.seconds, config.steps or config.grid.steps)
     every = config.grid.held_out
-    frames = usable_frames(frames)
     held_out = frames[every - 1 :: every] if every else []
     seen = [f for i, f in enumerate(frames) if not every or (i + 1) % every]
     if len(seen) < MIN_FRAMES:
@@ -121,10 +117,10 @@ def fit_grid(
     check_parallax(frames, box)
     rays = frame_rays(seen, config.width)
     fitter = _Fitter(rays, box, config, None if leave_out is None else leave_out(seen, rays))
-    steps = fit(fitter.learn, budget, on_progress, stopped)
+    steps = fit(fitter.learn, budget)
     complete = budget.used(steps) >= 1
     grid = fitter.finish()
-    shown = [] if stopped() else held_out[:: -(-len(held_out) // PSNR_VIEWS) or 1]
+    shown = [] if budget.stopped() else held_out[:: -(-len(held_out) // PSNR_VIEWS) or 1]
     psnr, mean_psnr = held_out_psnr(grid, shown, config)
     if psnr < mean_psnr + MIN_GAIN_DB and complete:
         raise FrameError(
@@ -133,8 +129,7 @@ def fit_grid(
             "T_world_camera in metres, camera axes x right, y down, z forward; the scene must stand still, and the box "
             "must hold what is seen"
         )
-    gains = np.exp(fitter.log_gain).astype(np.float32)
-    return GridFit(grid, steps, budget.elapsed_s, psnr, mean_psnr, tuple(seen), gains)
+    return GridFit(grid, steps, psnr, tuple(seen), np.exp(fitter.log_gain).astype(np.float32))
 
 
 def grid_of_depth(rays: FrameRays, config: GridConfig, unseen: float = HAZE) -> SceneGrid:
@@ -335,36 +330,29 @@ def view_fraction(rays: FrameRays, config: GridConfig, near_m: float) -> Float32
 
 
 def fit_geometry(
-    kind: str,
     frames: Sequence[PosedFrame],
     label_set: LabelSet,
     start: LearnedField | None,
+    shape: GridFieldConfig,
+    kind: str,
     config: FinetuneConfig,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
-    shape: GridFieldConfig | None = None,
-    leave_out: Callable[[Sequence[PosedFrame], FrameRays], Bool] | None = None,
+    budget: Budget,
+    leave_out: LeaveOut | None = None,
 ) -> tuple[GridField, GridFit]:
-    """A field of ``kind`` (a ``GridField``) whose grid shows the frames, and how well it does.
+    """A field of a kind that stands on a grid, which shows the frames, and how well it does.
 
     Args:
-        start: Gives the kind's config, and its box if it is fitted, unless ``config.grid`` names one; its weights are
-            not looked at.
-        config: ``seconds`` bounds the time and ``steps``, if not 0, is the number of steps.
-        shape: Config of the kind in place of ``start``'s, but for the box.
-        leave_out: As of ``fit_grid``.
+        start: Gives its box if it is fitted, unless ``config.grid`` names one; its weights are not looked at.
+        shape: Config of the kind, but for the box.
+        budget: Of this part; see ``fit_grid``.
 
     Raises:
         FrameError, ConfigError: of ``fit_grid``.
     """
-    given = start.config if isinstance(start, GridField) else field_config(kind, {})
-    if not isinstance(given, GridFieldConfig):
-        raise ConfigError(f"a field of kind '{kind}' has no scene grid; kinds with one build on GridField")
-    fitted = isinstance(start, GridField) and start.fitted
-    box = given.grid if fitted and config.grid.box_m is None else None
-    found = fit_grid(frames, config, on_progress, stopped, box, leave_out)
+    box = start.config.grid if isinstance(start, GridField) and start.fitted and config.grid.box_m is None else None
+    found = fit_grid(frames, config, budget, box, leave_out)
     torch.manual_seed(config.seed)  # of what the kind draws
-    field = build_field(kind, msgspec.structs.replace(shape or given, grid=found.grid.config), label_set)
+    field = build_field(kind, msgspec.structs.replace(shape, grid=found.grid.config), label_set)
     assert isinstance(field, GridField)
     field.grid = found.grid
     field.fitted_steps += found.steps
@@ -376,40 +364,44 @@ def fit_scene(
     label_set: LabelSet,
     start: LearnedField | None,
     config: FinetuneConfig,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
-    seen_stamps_ns: Iterable[int] = (),
-) -> Checkpoint:
-    """Fit a plain ``GridField``: geometry and colour, no classes. Arguments and errors as of ``fit_geometry``."""
-    began = time.monotonic()
-    until = GRID_UNTIL if isinstance(start, GridField) and start.trunk is not None else 1.0
-    part = msgspec.structs.replace(config, seconds=until * config.seconds)
-    progress = part_of(on_progress, 0, until)
-    field, found = fit_geometry(GridField.kind, frames, label_set, start, part, progress, stopped)
+    budget: Budget,
+) -> Fitted:
+    """Fit a plain ``GridField``: geometry and colour, no classes. ``start`` gives its config, and its box if fitted."""
+    shape = start.config if isinstance(start, GridField) else GridFieldConfig()
+    part = budget.part(GRID_UNTIL if shape.features else 1.0, steps=config.steps or config.grid.steps)
+    field, geometry = fit_geometry(frames, label_set, start, shape, GridField.kind, config, part)
     if field.trunk is not None:
-        part = msgspec.structs.replace(config, seconds=time_left(config.seconds, began))
-        fit_trunk(field, found, part, part_of(on_progress, until, 1.0), stopped)
-    return scene_checkpoint(field, found, config, time.monotonic() - began, seen_stamps_ns)
+        fit_trunk(field, geometry, config, budget.part(1.0, steps=trunk_steps(config)))
+    return Fitted(field, grid_figures(geometry))
 
 
-def fit_trunk(
-    field: GridField,
-    geometry: GridFit,
-    config: FinetuneConfig,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
-) -> float:
+def grid_figures(geometry: GridFit) -> dict[str, Any]:
+    """What a recipe says of a grid."""
+    return {"steps": geometry.steps, "psnr": None if math.isnan(geometry.psnr) else round(geometry.psnr, 2)}
+
+
+def trunk_steps(config: FinetuneConfig) -> int:
+    """Steps of ``fit_trunk``."""
+    return min(config.steps or TRUNK_STEPS, TRUNK_STEPS)
+
+
+def trunk_optimiser(trunk: Trunk, *others: nn.Module) -> torch.optim.Adam:
+    """Adam for features, and for the networks that read them."""
+    networks = [p for name, p in trunk.named_parameters() if name != "features"]
+    networks += [p for module in others for p in module.parameters()]
+    groups = [{"params": [trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
+    return torch.optim.Adam(groups, fused=True)  # without temporaries as large as the features
+
+
+def fit_trunk(field: GridField, geometry: GridFit, config: FinetuneConfig, budget: Budget) -> float:
     """Fit features, trunk and colour head to the frames of a grid's fit; the geometry stays.
 
     Returns the PSNR of the last steps' rays in dB.
     """
-    trunk = field.trunk
-    assert trunk is not None
+    assert field.trunk is not None
     rng = np.random.default_rng(config.seed)
     rays = frame_rays(geometry.frames, config.width)
-    networks = [p for name, p in trunk.named_parameters() if name != "features"]
-    groups = [{"params": [trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
-    optimiser = torch.optim.Adam(groups, fused=True)  # without temporaries as large as the features
+    optimiser = trunk_optimiser(field.trunk)
     errors: list[float] = []
 
     def learn(fraction: float) -> float:
@@ -418,36 +410,11 @@ def fit_trunk(
         with torch.no_grad():
             samples = field.march(batch, TRUNK_SAMPLES, torch.from_numpy(rng.random(len(pixels), np.float32)))
             behind = field.grid.sky_colour(batch.direction) * samples.light[:, None]
-            weight = samples.weight * (samples.opacity / samples.weight.sum(1).clamp_min(1e-6))[:, None]
+            weight = ray_fraction(samples)
         gain = torch.from_numpy(geometry.gains[rays.frame_of(pixels)])
         seen = gain * ((weight[..., None] * field.colour(samples)).sum(1) + behind)
-        loss = nn.functional.mse_loss(seen, torch.from_numpy(rays.rgb[pixels] / np.float32(255)))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        errors.append(float(loss.detach()))
+        errors.append(descend(optimiser, nn.functional.mse_loss(seen, rays.colours(pixels))))
         return errors[-1]
 
-    fit(learn, Budget(config.seconds, min(config.steps or TRUNK_STEPS, TRUNK_STEPS)), on_progress, stopped)
+    fit(learn, budget)
     return psnr_of(float(np.mean(errors[-50:]))) if errors else math.nan
-
-
-def scene_checkpoint(
-    field: GridField,
-    geometry: GridFit,
-    config: FinetuneConfig,
-    seconds: float,
-    seen_stamps_ns: Iterable[int] = (),
-    labelled: Sequence[PosedFrame] = (),
-) -> Checkpoint:
-    """The weights with their recipe; ``labelled`` are frames whose labels were used."""
-    recipe = {
-        "kind": "scene fit",
-        "width": config.width,
-        "config": to_plain(config),
-        "steps": geometry.steps,
-        "seconds": round(seconds, 1),
-        "psnr": None if math.isnan(geometry.psnr) else round(geometry.psnr, 2),
-        "train_stamps_ns": sorted({int(f.stamp_ns) for f in labelled} | {int(s) for s in seen_stamps_ns}),
-    }
-    return Checkpoint(field.eval(), (), recipe)

@@ -9,8 +9,7 @@ from __future__ import annotations
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -20,7 +19,6 @@ from torch.nn import functional
 
 from semantic_mapper.config import IRTConfig
 from semantic_mapper.errors import FrameError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.grid import RaySamples
 from semantic_mapper.fields.scene.irt import IRT, RayTexture, at_measured, no_texture, surface
@@ -28,20 +26,9 @@ from semantic_mapper.geometry import camera_matrix, invert_pose
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import FinetuneConfig
-from semantic_mapper.training.finetune import check_budget, held_out_blocks
-from semantic_mapper.training.fit import (
-    BestWeights,
-    Budget,
-    HeldOut,
-    OnProgress,
-    State,
-    cosine_rate,
-    fit,
-    part_of,
-    time_left,
-)
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.grid_fit import GridFit, fit_geometry, fit_trunk, scene_checkpoint
+from semantic_mapper.training.fit import Budget, Fitted, HeldOut, State, cosine_rate, descend, fit, held_out_blocks
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays
+from semantic_mapper.training.grid_fit import fit_geometry, fit_trunk, grid_figures, trunk_steps
 from semantic_mapper.training.losses import IGNORE, RAREST, semantic_loss
 from semantic_mapper.training.views import jittered
 from semantic_mapper.types import PosedFrame
@@ -61,19 +48,12 @@ LOOK_RAYS = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledRays:
-    """All pixels of the labelled frames, F of one size.
+    """All pixels of the labelled frames, F of one size."""
 
-    Args:
-        rays: Of the frames.
-        rgb: (F, 3, H + 2 margin, W + 2 margin) uint8, continued beyond the edges.
-        channel: (F H W,) int64, -1 = not labelled.
-        held_out: (F H W,) bool.
-    """
-
-    rays: FrameRays
-    rgb: torch.Tensor
-    channel: torch.Tensor
-    held_out: torch.Tensor
+    rays: FrameRays  # of the frames
+    rgb: torch.Tensor  # (F, 3, H + 2 margin, W + 2 margin) uint8, continued beyond the edges
+    channel: torch.Tensor  # (F H W,) int64, -1 = not labelled
+    held_out: torch.Tensor  # (F H W,) bool
 
     def patches(self, pixels: torch.Tensor, side: int) -> torch.Tensor:
         """Colours (R, 3, side, side) in [0, 1] round pixels (R,)."""
@@ -91,54 +71,51 @@ def fit_irt(
     label_set: LabelSet,
     start: LearnedField | None,
     config: FinetuneConfig,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
-    seen_stamps_ns: Iterable[int] = (),
-) -> Checkpoint:
+    budget: Budget,
+) -> Fitted:
     """Fit an ``IRT``: geometry and texture from all frames, classes from those with labels.
 
     Args:
         frames: With poses; one of them labelled, at least.
-        label_set: Of the labels.
         start: Gives config and box; its weights are not looked at.
-        config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its parts.
-        on_progress: Called after every step.
-        stopped: Called before every step; once it returns anything true, the best weights so far are the result.
-        seen_stamps_ns: Frames that ``start`` was fitted to.
+        budget: ``steps``, if not 0, is the number of steps of each of its three parts.
 
     Raises:
         FrameError: no labelled frame, one class only, or what ``fit_grid`` refuses.
         WeightsError: ``start`` has other classes.
-        ConfigError: no budget.
     """
-    check_budget(config)
     if start is not None and start.label_set != label_set:
         raise WeightsError(
             f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit without them"
         )
-    began = time.monotonic()
-    labelled = [f for f in usable_frames(frames) if f.label is not None]
+    labelled = [f for f in frames if f.label is not None]
     rays = labelled_rays(labelled, label_set, config)
-    field, geometry = _fit_scene(frames, rays, label_set, start, config, on_progress, stopped)
-    classes = ClassFit(field, rays, config)
-    best, steps = classes.run(time_left(config.seconds, began), part_of(on_progress, TRUNK_UNTIL, 1.0), stopped)
-    checkpoint = scene_checkpoint(field, geometry, config, time.monotonic() - began, seen_stamps_ns, labelled)
-    figures = {
+    shape = start.shape if isinstance(start, IRT) else IRTConfig()
+    shape = msgspec.structs.replace(
+        shape,
+        variant=config.irt.variant or shape.variant,
+        carried=len(labelled) if config.irt.carry_labels else 0,
+        carried_size=rays.rays.image_size(0),
+    )
+    part = budget.part(GRID_UNTIL, steps=config.steps or config.grid.steps)
+    known = start if isinstance(start, IRT) else None
+    field, geometry = fit_geometry(frames, label_set, known, shape, IRT.kind, config, part)
+    assert isinstance(field, IRT)
+    fit_trunk(field, geometry, config, budget.part(TRUNK_UNTIL, steps=trunk_steps(config)))
+    held_out, steps = ClassFit(field, rays, config).run(budget.part(1.0))
+    figures = grid_figures(geometry) | {
         "steps": steps,
-        "best_step": best.step,
-        "held_out_loss": best.loss,
-        "held_out_accuracy": best.accuracy,
+        "best_step": held_out.step,
+        "held_out_loss": held_out.loss,
+        "held_out_accuracy": held_out.accuracy,
         "grid_steps": geometry.steps,
     }
-    return Checkpoint(checkpoint.model, (), checkpoint.recipe | figures)
+    return Fitted(field, figures, labelled)
 
 
 def labelled_rays(frames: Sequence[PosedFrame], label_set: LabelSet, config: FinetuneConfig) -> LabelledRays:
     """The pixels of labelled frames, some of them held out.
-
-    Raises:
-        FrameError: no labelled frame, frames of several sizes, or fewer than two classes.
-    """
+    Raises FrameError: no labelled frame, frames of several sizes, or fewer than two classes."""
     if not frames:
         raise FrameError("no frame has a label and a usable pose; give labelled keyframes (--keyframes)")
     rays = frame_rays(frames, config.width)
@@ -161,32 +138,6 @@ def labelled_rays(frames: Sequence[PosedFrame], label_set: LabelSet, config: Fin
     return LabelledRays(rays, padded, flat, torch.cat(masks) & (flat >= 0))
 
 
-def _fit_scene(
-    frames: Sequence[PosedFrame],
-    labelled: LabelledRays,
-    label_set: LabelSet,
-    start: LearnedField | None,
-    config: FinetuneConfig,
-    on_progress: OnProgress | None,
-    stopped: Callable[[], object],
-) -> tuple[IRT, GridFit]:
-    """Geometry, colours and features of all frames; they stay as they are from then on."""
-    began = time.monotonic()
-    count, size = len(labelled.rays.intrinsics), labelled.rays.image_size(0)
-    shape = start.shape if isinstance(start, IRT) else IRTConfig()
-    variant = config.irt.variant or shape.variant
-    carried = count if config.irt.carry_labels else 0
-    shape = msgspec.structs.replace(shape, variant=variant, carried=carried, carried_size=size)
-    known = start if isinstance(start, IRT) else None
-    part = msgspec.structs.replace(config, seconds=GRID_UNTIL * config.seconds)
-    progress = part_of(on_progress, 0, GRID_UNTIL)
-    field, geometry = fit_geometry(IRT.kind, frames, label_set, known, part, progress, stopped, shape)
-    assert isinstance(field, IRT)
-    part = msgspec.structs.replace(config, seconds=time_left(TRUNK_UNTIL * config.seconds, began))
-    fit_trunk(field, geometry, part, part_of(on_progress, GRID_UNTIL, TRUNK_UNTIL), stopped)
-    return field, geometry
-
-
 class ClassFit:
     """The second part of a fit: what reads classes learns, all else stays as it is."""
 
@@ -206,26 +157,20 @@ class ClassFit:
             order = torch.randperm(len(self.looked_at), generator=self.generator)
             self.looked_at = self.looked_at[order[:LOOK_RAYS].sort().values]
 
-    def run(
-        self, seconds: float, on_progress: OnProgress | None = None, stopped: Callable[[], object] = bool
-    ) -> tuple[BestWeights, int]:
+    def run(self, budget: Budget) -> tuple[HeldOut, int]:
         """Learn until the budget is used; the field then has the weights that were best on what was held out.
-
-        Args:
-            seconds: 0 = only steps count.
 
         Returns:
             These weights, and the number of steps.
         """
-        held_out = HeldOut(self._look, self._state, BestWeights(math.inf, math.nan, 0, self._state()))
+        held_out = HeldOut(self._look, self._state, best=self._state())
         steps = 0
-        if not stopped():
+        if not budget.stopped():
             carry_labels(self.field, self.data.rays, self.taught, self.config.grid.near_m)
-            budget = Budget(seconds, self.config.steps, self.config.evaluations)
-            steps = fit(self._learn, budget, on_progress, stopped, held_out)
-            self.field.load_state_dict(held_out.best.state, strict=False)
+            steps = fit(self._learn, budget, held_out)
+            self.field.load_state_dict(held_out.best, strict=False)
             carry_labels(self.field, self.data.rays, self.data.channel, self.config.grid.near_m)
-        return held_out.best, steps
+        return held_out, steps
 
     def _learn(self, fraction: float) -> float:
         """One step, at a fraction of the budget."""
@@ -241,14 +186,10 @@ class ClassFit:
         kept = torch.rand(len(self.data.rays.intrinsics), generator=self.generator) >= dropped
         logits = self.field.logits(samples, texture, self._carried(pixels, samples, kept))
         loss = semantic_loss(logits, channel, weight)
-        total = loss
         if self.field.image_head is not None and bool(texture.there.any()):
             by_image = self.field.image_head(texture.values[texture.there])
-            total = loss + IMAGE_LOSS * semantic_loss(by_image, channel[texture.there], weight[texture.there])
-        self.optimiser.zero_grad()
-        total.backward()
-        self.optimiser.step()
-        return float(loss.detach())
+            loss = loss + IMAGE_LOSS * semantic_loss(by_image, channel[texture.there], weight[texture.there])
+        return descend(self.optimiser, loss)
 
     def _look(self) -> tuple[float, float]:
         """Loss and accuracy of what was held out, as a consumer with the frame's own image sees it."""

@@ -28,10 +28,7 @@ class Loss:
 
 def semantic_loss(logits: torch.Tensor, channel: torch.Tensor, weight: torch.Tensor | None = None) -> torch.Tensor:
     """Cross-entropy over the rays (S-Ray Eq. 14), ignored rays masked; 0 where all are ignored.
-
-    Args:
-        weight: (R,) what each ray counts; None = all alike.
-    """
+    ``weight``: (R,) what each ray counts; None = all alike."""
     if weight is not None:
         each = functional.cross_entropy(logits, channel, ignore_index=IGNORE, reduction="none")
         weight = weight * (channel != IGNORE)

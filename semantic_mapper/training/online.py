@@ -1,61 +1,195 @@
-"""One round of learning next to a mapper: finetune on the keyframes so far, and judge by those that were held out.
+"""Learning next to a mapper: labelled keyframes that come one by one, and rounds of finetuning on them.
 
-The image encoder is frozen, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights
-can be put in the place of old ones at once.
+The pool knows which keyframes to learn from, which to judge by, and which have been validated. In a round the image
+encoder is frozen, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights can be put in
+the place of old ones at once.
 """
 
 from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, SegmentationMetrics
-from semantic_mapper.fields.base import EncodedViews, stack_views
+from semantic_mapper.fields.base import stack_views
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.learned import LearnedField, encode_alike
-from semantic_mapper.fields.volume import sample_guided
+from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import OnlineConfig
-from semantic_mapper.training.finetune import finetune
+from semantic_mapper.training.finetune import HELD_OUT_SOURCES, finetune, render_as_mapped, views_that_see
 from semantic_mapper.training.fit import OnProgress
-from semantic_mapper.training.keyframe_pool import Key, KeyframeSplit, key_of
 from semantic_mapper.training.losses import IGNORE
-from semantic_mapper.training.views import (
-    LabelledView,
-    draw_pixels,
-    query_rays,
-    stack_sources,
-    view_from_frame,
-    view_overlap,
-)
+from semantic_mapper.training.views import draw_pixels, stack_sources, view_from_frame, view_overlap
 from semantic_mapper.types import PosedFrame
 
-SOURCES = 7  # keyframes that a held-out ray is rendered from, next to its own image
 RAYS = 1024  # of each held-out keyframe
+Key = tuple[str, int]  # camera_id, stamp_ns
+MAX_TRIALS = 3  # rounds without success that a keyframe may take part in before it is dropped
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeSplit:
+    """The keyframes of one round."""
+
+    train: tuple[PosedFrame, ...]  # labelled keyframes to learn from
+    held_out: tuple[PosedFrame, ...]  # labelled keyframes that are never learned from
+    validated: frozenset[Key] = frozenset()  # keys of those with which the weights in use were found better
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kept:
+    """A keyframe of the pool."""
+
+    frame: PosedFrame  # with labels in the classes of the pool
+    held_out: bool  # whether it is never learned from
+    # Version of the first weights that were taken after a round with it; None = none yet
+    validated_by: int | None = None
+    trials: int = 0  # rounds without success since it came
+
+
+class KeyframePool:
+    """A bounded set of labelled keyframes in the classes of one label set.
+
+    Args:
+        label_set: Of the weights.
+        held_out_every: Of this many keyframes, the last one is held out, for good.
+        capacity: Keyframes kept; past it the oldest is dropped.
+    """
+
+    def __init__(self, label_set: LabelSet, *, held_out_every: int, capacity: int) -> None:
+        self._label_set = label_set
+        self._held_out_every = held_out_every
+        self._capacity = capacity
+        self._kept: dict[Key, Kept] = {}
+        self._received = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def new(self) -> int:
+        """Keyframes that have not been in a round."""
+        return sum(k.validated_by is None and not k.trials for k in self._kept.values())
+
+    @property
+    def kept(self) -> tuple[Kept, ...]:
+        """All, the oldest first."""
+        return tuple(self._kept.values())
+
+    def add(self, frame: PosedFrame, label_set: LabelSet) -> None:
+        """Add a keyframe; one of the same camera and time is replaced, and no longer validated.
+
+        Args:
+            frame: With labels.
+            label_set: Of these; classes are translated by name, those that the weights lack are not learned.
+
+        Raises:
+            FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed.
+        """
+        frame = self._translated(frame, label_set)
+        before = self._kept.pop(key_of(frame), None)
+        self._received += before is None
+        self._put(Kept(frame, self._received % self._held_out_every == 0 if before is None else before.held_out))
+
+    def restore(self, kept: Kept, label_set: LabelSet) -> None:
+        """Add a keyframe of an earlier pool with its state there; the oldest first.
+        Raises FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed."""
+        kept = replace(kept, frame=self._translated(kept.frame, label_set))
+        self._received += 1
+        self._put(kept)
+
+    def split(self) -> KeyframeSplit:
+        """The keyframes of a round that begins now."""
+        return KeyframeSplit(
+            tuple(k.frame for k in self.kept if not k.held_out),
+            tuple(k.frame for k in self.kept if k.held_out),
+            frozenset(key for key, k in self._kept.items() if k.validated_by is not None),
+        )
+
+    def validate(self, keys: Collection[Key], version: int) -> None:
+        """Weights of a round with these keyframes are in use."""
+        for key in self._not_validated(keys):
+            self._kept[key] = replace(self._kept[key], validated_by=version, trials=0)
+
+    def reject(self, keys: Collection[Key], *, worse: bool) -> int:
+        """A round with these keyframes had no success: those not validated get ``MAX_TRIALS`` such rounds.
+
+        Args:
+            keys: Of the round.
+            worse: It made the weights worse: those not validated are dropped at once.
+
+        Returns:
+            How many were dropped.
+        """
+        for key in self._not_validated(keys):
+            trials = MAX_TRIALS if worse else self._kept[key].trials + 1
+            self._kept[key] = replace(self._kept[key], trials=trials)
+        return self._drop(lambda k: k.trials >= MAX_TRIALS)
+
+    def return_to(self, version: int) -> int:
+        """Drop what was validated by later weights alone, after a roll-back; returns how many."""
+        return self._drop(lambda k: k.validated_by is not None and k.validated_by > version)
+
+    def _not_validated(self, keys: Collection[Key]) -> list[Key]:
+        return [key for key in keys if key in self._kept and self._kept[key].validated_by is None]
+
+    def _put(self, kept: Kept) -> None:
+        self._kept[key_of(kept.frame)] = kept
+        if len(self._kept) > self._capacity:
+            del self._kept[next(iter(self._kept))]
+
+    def _drop(self, condition: Callable[[Kept], bool]) -> int:
+        before = len(self._kept)
+        self._kept = {key: kept for key, kept in self._kept.items() if not condition(kept)}
+        return before - len(self._kept)
+
+    def _translated(self, frame: PosedFrame, label_set: LabelSet) -> PosedFrame:
+        where = f"keyframe seq={frame.seq} of camera '{frame.camera_id}'"
+        check_pose(frame.T_world_camera, where)
+        if frame.label is None:
+            raise FrameError(f"{where}: has no label image")
+        label_set.to_channels(frame.label, where)  # refuses ids that its own label set lacks
+        label = self._label_set.to_ids(self._label_set.channel_map_from(label_set))[frame.label]
+        if not (label != self._label_set.ignore_id).any():
+            raise FrameError(
+                f"{where}: none of its pixels is of a class that the weights know; they know "
+                f"{', '.join(self._label_set.names)}"
+            )
+        size, first = _size(frame), next(iter(self._kept.values()), None)
+        if first is not None and size != _size(first.frame):
+            raise FrameError(
+                f"{where}: {size[0]}x{size[1]} pixels, but those before have "
+                f"{'x'.join(map(str, _size(first.frame)))}; keyframes must be of one size"
+            )
+        return replace(frame, label=label)
+
+
+def key_of(frame: PosedFrame) -> Key:
+    """What tells a keyframe from all others."""
+    return frame.camera_id, frame.stamp_ns
+
+
+def _size(frame: PosedFrame) -> tuple[int, int]:
+    return frame.intrinsics.width, frame.intrinsics.height
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnlineResult:
-    """Outcome of a round.
+    """Outcome of a round."""
 
-    Args:
-        checkpoint: The new weights.
-        score, parent_score: mIoU on all held-out keyframes, new and in use, in 0..1.
-        keys: Keyframes that took part.
-        refusal: Why the new weights are not worth offering; empty = they are.
-        worse: Whether they are refused because they do worse: then the labels are to blame. Others may only be too few.
-    """
-
-    checkpoint: Checkpoint
+    checkpoint: Checkpoint  # the new weights
+    # mIoU on all held-out keyframes, new and in use, in 0..1
     score: float
     parent_score: float
-    keys: frozenset[Key]
-    refusal: str = ""
+    keys: frozenset[Key]  # keyframes that took part
+    refusal: str = ""  # why the new weights are not worth offering; empty = they are
+    # Whether they are refused because they do worse: then the labels are to blame. Others may only be too few.
     worse: bool = False
 
 
@@ -131,34 +265,27 @@ def judge(
     Args:
         sources: Keyframes to render from, with the labels that are known to the field.
     """
-    width, sampling = config.finetune.width, config.finetune.step.sampling
-    label_set = model.label_set
-    views = [view_from_frame(f, label_set, width) for f in (*sources, *held_out)]
+    sampling, label_set = config.finetune.step.sampling, model.label_set
+    views = [view_from_frame(f, label_set, config.finetune.width) for f in (*sources, *held_out)]
     overlap = view_overlap(views)
     generator = torch.Generator().manual_seed(config.finetune.seed)
     matrices: list[ConfusionMatrix] = []
     model.eval()
     with torch.inference_mode():
-        encoded = [_encode(model, view, known=True) for view in views[: len(sources)]]
+        encoded = [model.encode(stack_sources([view], with_labels=True)) for view in views]
         for i, view in enumerate(views[len(sources) :], len(sources)):
             matrix = ConfusionMatrix(label_set)
             matrices.append(matrix)
-            best = overlap[i, : len(sources)].argsort(descending=True, stable=True)[:SOURCES]
             flat = draw_pixels(view.channel, RAYS, 0.5, generator, len(label_set))
             if len(flat) == 0:
                 continue
-            looked_on = stack_views([*(encoded[j] for j in best.tolist()), _encode(model, view, known=False)])
-            prior = view.depth_m.flatten()[flat]
-            rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
-            render, _ = model.render_samples(rays, sample_guided(rays, sampling), looked_on)
+            best = views_that_see(overlap[i, : len(sources)])[:HELD_OUT_SOURCES]
+            looked_on = stack_views([*(encoded[j] for j in best), encoded[i]])
+            render, channel = render_as_mapped(model, view, flat, looked_on, sampling)
             said = torch.where(render.known, render.logits.argmax(1), IGNORE)
-            matrix.update(label_set.to_ids(targets.channel.numpy()), label_set.to_ids(said.numpy()))
+            matrix.update(label_set.to_ids(channel.numpy()), label_set.to_ids(said.numpy()))
             on_judged()
     return matrices
-
-
-def _encode(model: LearnedField, view: LabelledView, *, known: bool) -> EncodedViews:
-    return model.encode(stack_sources([view], with_labels=known))
 
 
 def _shares_views(keyframes: KeyframeSplit, label_set: LabelSet, config: OnlineConfig) -> bool:

@@ -1,14 +1,14 @@
-"""Fit a Panoptic NeRF to one scene: geometry first, then density, colours and classes together, guided by boxes."""
+"""Fit a Panoptic NeRF to one scene: geometry first, then density, colours and classes together, guided by boxes.
+
+Pixels that show boxes that move are left out of the scene, and fill these boxes' own grids in the end.
+"""
 
 from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,30 +17,29 @@ from torch.nn import functional
 
 from semantic_mapper.config import BoxConfig
 from semantic_mapper.errors import ConfigError, FrameError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.scene.boxes import MAX_INTERVALS
-from semantic_mapper.fields.scene.grid import NOTHING, RaySamples, heaviest, ray_fraction
+from semantic_mapper.fields.scene.boxes import MovingBoxes, RaysInBox
+from semantic_mapper.fields.scene.grid import NOTHING, OPAQUE, RaySamples, SceneGrid, ray_fraction
 from semantic_mapper.fields.scene.march import adam_grid
-from semantic_mapper.fields.scene.panoptic import BoxesOnRays, Panoptic, merged_classes
+from semantic_mapper.fields.scene.panoptic import CORE, LOOSE_M, BoxesOnRays, Panoptic, merged_classes
+from semantic_mapper.fields.scene.primitives import ALONE_NS, Primitive
+from semantic_mapper.geometry import invert_pose
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.boxes import fill_boxes, nothing_in_view, shown_boxes
 from semantic_mapper.training.config import FinetuneConfig, PanopticFitConfig
-from semantic_mapper.training.finetune import check_budget
-from semantic_mapper.training.fit import Budget, OnProgress, fit, part_of, time_left
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
+from semantic_mapper.training.fit import Budget, Fitted, descend, fit
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays
 from semantic_mapper.training.grid_fit import (
     BETA1,
     BETA2,
-    FEATURE_RATE,
-    TRUNK_RATE,
     fit_geometry,
-    scene_checkpoint,
+    grid_figures,
+    grid_of_depth,
+    trunk_optimiser,
     view_fraction,
 )
-from semantic_mapper.types import Bool, Int64, PosedFrame
+from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame
 
 GRID_UNTIL = 0.35  # fraction of the time for geometry and colours alone
 SAMPLES = 8  # of a ray, those of greatest weight
@@ -51,54 +50,38 @@ LEAST = 1e-4  # of the probability that a pseudo label has: below, it has no gra
 POINT_WEIGHT = 0.05  # from which on a sample says what is there
 DEPTH_REACH = 0.05  # 1 / m, of inverse depth: a larger error counts linearly
 SURVEYED = 20000  # rays that say how much of the images boxes cover
-LOOKED_AT = 2000  # of these together: where many boxes overlap, each ray takes a table of pairs
 FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is warned about
 FEW_MATCHED = 0.5  # fraction of the pseudo labels that are possible on their ray, below which the log is warned about
 LEARNED = 10  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
 EMPTY_EVERY = 50  # steps between two looks at which cells are empty
+PAIRS = 1 << 20  # of boxes and cameras that are looked at together
+ELSEWHERE = 0.05  # of z, by which measured depth lies before a box or behind it where a pixel shows something else
+LEAST_PIXELS = 50  # measured inside of a box in all frames, below which nothing is known of its inside
+OPAQUE_RAW = 9.0  # raw density of a box of whose inside nothing is known
+FAR_M = 1e4  # z of what does not hide anything of a box
+SPREAD = 5  # voxels over which colours are averaged
 _log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PseudoRays:
-    """All pixels of F frames with their pseudo labels.
+    """All pixels of F frames with their pseudo labels."""
 
-    Args:
-        rays: Of the frames.
-        channel: (P,) int64, -1 = none.
-        gain: (F, 3) exposure of the frames.
-        still: Numbers of the pixels that show what stands still.
-    """
-
-    rays: FrameRays
-    channel: torch.Tensor
-    gain: torch.Tensor
-    still: Int64
+    rays: FrameRays  # of the frames
+    channel: torch.Tensor  # (P,) int64, -1 = none
+    gain: torch.Tensor  # (F, 3) exposure of the frames
+    still: Int64  # numbers of the pixels that show what stands still
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What boxes and pseudo labels have to do with each other.
+    """What boxes and pseudo labels have to do with each other."""
 
-    Args:
-        boxes: That stand still.
-        seen: Of these, boxes that any surveyed ray meets.
-        moving: Boxes that move, and are followed.
-        lost: Boxes that move, and that no frame shows at their times.
-        covered: Fraction of pixels whose ray meets a box.
-        matched: Fraction of pixels with a pseudo label whose class is possible on their ray.
-        crowded: Fraction of pixels whose ray meets more boxes than are looked at, ``MAX_INTERVALS``.
-        ambiguous: Fraction of pixels whose surface is in boxes of several classes.
-    """
-
+    # How many stand still, and how many of these any surveyed ray meets
     boxes: int
     seen: int
-    covered: float
-    matched: float
-    crowded: float = 0.0
-    ambiguous: float = math.nan
-    moving: int = 0
-    lost: int = 0
+    covered: float  # fraction of pixels whose ray meets a box
+    matched: float  # fraction of pixels with a pseudo label whose class is possible on their ray
 
 
 def fit_panoptic(
@@ -106,73 +89,70 @@ def fit_panoptic(
     label_set: LabelSet,
     start: LearnedField | None,
     config: FinetuneConfig,
-    on_progress: OnProgress | None = None,
-    stopped: Callable[[], object] = bool,
-    seen_stamps_ns: Iterable[int] = (),
-) -> Checkpoint:
-    """Fit a ``Panoptic``.
+    budget: Budget,
+) -> Fitted:
+    """Fit a ``Panoptic``; stopped before its classes are learned, these are those of the boxes alone.
 
     Args:
         frames: With poses; their label images are the pseudo labels.
         label_set: Of these and of the boxes.
         start: A ``Panoptic`` with the boxes; its weights are not looked at. Without boxes pseudo labels alone teach,
             where ``config`` leaves out the losses that need some.
-        config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
-        on_progress: Called after every step.
-        stopped: Called before every step; once it returns anything true, the field so far is the result. With less than
-            ``LEARNED`` steps of the second part its classes are those of the boxes alone (``fixed``).
-        seen_stamps_ns: Frames whose true labels those who made the pseudo labels have learned from.
+        budget: ``steps``, if not 0, is the number of steps of each of its two parts.
 
     Raises:
-        ConfigError: no boxes, none of them in view, no class in common with the pseudo labels, or no budget.
+        ConfigError: no boxes, none of them in view, or no class in common with the pseudo labels.
         FrameError: no pseudo label, or what ``fit_grid`` refuses.
         WeightsError: ``start`` has other classes.
     """
-    check_budget(config)
     by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
     if not isinstance(start, Panoptic) or (by_boxes and not start.shape.boxes):
         raise ConfigError("a field of kind 'panoptic' needs boxes; give a file of them (--boxes)")
     if start.label_set != label_set:
         raise WeightsError(f"the boxes are of label set '{start.label_set.name}', the labels of '{label_set.name}'")
-    began = time.monotonic()
-    usable = held_out_unlabelled(usable_frames(frames), config.grid.held_out)
-    everything = pseudo_rays(usable, label_set, config.width)
-    boxes, lost = _followed(start, usable, everything.rays)
+    frames = held_out_unlabelled(frames, config.grid.held_out)
+    everything = pseudo_rays(frames, label_set, config.width)
+    boxes, lost = _followed(start, frames, everything.rays)
     if by_boxes and not boxes:
         raise ConfigError(
             f"no box is in view of any frame: {lost} move, and no frame shows them at the times of their stamps. Are "
             "the stamps the log's, in nanoseconds?"
         )
-    survey = replace(survey_boxes(start, everything, config), moving=len(start.moving) - lost, lost=lost)
-    shape = msgspec.structs.replace(start.shape, boxes=boxes)
-    part = msgspec.structs.replace(config, seconds=GRID_UNTIL * config.seconds)
-    progress = part_of(on_progress, 0, GRID_UNTIL)
-    movers = start.moving
+    survey = survey_boxes(start, everything, config)
 
     def shows_movers(seen: Sequence[PosedFrame], rays: FrameRays) -> Bool:
-        return shown_boxes(movers, seen, rays)[0]
+        return shown_boxes(start.moving, seen, rays)[0]
 
-    leave_out = shows_movers if len(movers) else None
-    field, grid = fit_geometry(start.kind, usable, label_set, start, part, progress, stopped, shape, leave_out)
+    field, grid = fit_geometry(
+        frames,
+        label_set,
+        start,
+        msgspec.structs.replace(start.shape, boxes=boxes),
+        Panoptic.kind,
+        config,
+        budget.part(GRID_UNTIL, steps=config.steps or config.grid.steps),
+        shows_movers if len(start.moving) else None,
+    )
     assert isinstance(field, Panoptic)
     data = pseudo_rays(grid.frames, label_set, config.width)
     still = np.flatnonzero(~shows_movers(grid.frames, data.rays))
     data = replace(data, gain=torch.from_numpy(grid.gains), still=still)
-    steps = JointFit(field, data, config).run(
-        time_left(config.seconds, began), part_of(on_progress, GRID_UNTIL, 1.0), stopped
-    )
-    if steps < LEARNED and stopped():
+    steps = JointFit(field, data, config).run(budget.part(1.0))
+    if steps < LEARNED and budget.stopped():
         field.shape = field.config = msgspec.structs.replace(field.shape, classes="fixed")
     fill_boxes(field, grid.frames, data.rays, grid.gains, config.grid.near_m)
-    survey = replace(survey, ambiguous=ambiguous_fraction(field, everything, config))
-    taught = [f for f in usable if f.label is not None and not f.label_is_pseudo]
-    checkpoint = scene_checkpoint(field, grid, config, time.monotonic() - began, seen_stamps_ns, taught)
-    figures: dict[str, Any] = {name: getattr(survey, name) for name in ("boxes", "seen", "moving", "lost")}
-    figures |= {name: round(getattr(survey, name), 4) for name in ("covered", "matched", "crowded", "ambiguous")}
-    figures["labelled_frames"] = sum(f.label is not None for f in usable)
-    figures["frames"] = len(usable)
-    recipe = checkpoint.recipe | {"grid_steps": grid.steps, "steps": steps, "panoptic": figures}
-    return Checkpoint(checkpoint.model, (), recipe)
+    found = {
+        "boxes": survey.boxes,
+        "seen": survey.seen,
+        "covered": round(survey.covered, 4),
+        "matched": round(survey.matched, 4),
+        "moving": len(start.moving) - lost,
+        "lost": lost,
+        "labelled_frames": sum(f.label is not None for f in frames),
+        "frames": len(frames),
+    }
+    figures = grid_figures(grid) | {"grid_steps": grid.steps, "steps": steps, "panoptic": found}
+    return Fitted(field, figures, [f for f in frames if f.label is not None and not f.label_is_pseudo])
 
 
 def held_out_unlabelled(frames: Sequence[PosedFrame], every: int) -> list[PosedFrame]:
@@ -189,10 +169,7 @@ def held_out_unlabelled(frames: Sequence[PosedFrame], every: int) -> list[PosedF
 
 def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -> PseudoRays:
     """The pixels of frames with their label images.
-
-    Raises:
-        FrameError: no frame has one, or nothing is known in any of them.
-    """
+    Raises FrameError: no frame has one, or nothing is known in any of them."""
     rays = frame_rays(frames, width)
     if all(f.label is None for f in frames):
         raise FrameError("no frame has a pseudo label; give a folder of them or weights that make some (--pseudo)")
@@ -213,10 +190,7 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
 
 def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> Survey:
     """How many pixels meet boxes.
-
-    Raises:
-        ConfigError: no pixel does, or boxes and pseudo labels have no class in common.
-    """
+    Raises ConfigError: no pixel does, or boxes and pseudo labels have no class in common."""
     if not len(field.primitives):
         return Survey(0, 0, 0.0, 1.0)
     pixels = _some_pixels(data, config.seed)
@@ -239,23 +213,11 @@ def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> S
         )
     channel = data.channel[torch.from_numpy(pixels)]
     matched = possible(field.on_ray(found), group, channel)[channel >= 0].float().mean().item()
-    crowded = (found.count > MAX_INTERVALS).float().mean().item()
     if matched < FEW_MATCHED:
         _log.warning(
             "few_labels_match", matched=round(matched, 4), reason="most name a class that no box on their ray has"
         )
-    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched, crowded)
-
-
-def ambiguous_fraction(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> float:
-    """Fraction of pixels whose surface is in boxes of more than one class."""
-    several = 0
-    for pixels in np.split(_some_pixels(data, config.seed), SURVEYED // LOOKED_AT):
-        with torch.no_grad():
-            samples = heaviest(field.march(data.rays.rays(pixels, config.grid.near_m)), 1)
-            named = field.boxes_on(samples).named[:, 0].sum(-1)
-        several += int(((named > 1) & (samples.opacity > 0.5)).sum())
-    return several / SURVEYED
+    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched)
 
 
 def possible(on_ray: torch.Tensor, group: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
@@ -304,11 +266,8 @@ class JointFit:
         self.rng = np.random.default_rng(config.seed)
         self.group = merged_classes(field.label_set, field.shape.merge)
         assert field.trunk is not None
-        networks = [p for name, p in field.trunk.named_parameters() if name != "features"]
-        networks += [*field.head.parameters(), *field.classifier.parameters()]
-        groups = [{"params": [field.trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
-        self.optimiser = torch.optim.Adam(groups)
-        self.rates = [FEATURE_RATE, TRUNK_RATE]
+        self.optimiser = trunk_optimiser(field.trunk, field.head, field.classifier)
+        self.rates = [group["lr"] for group in self.optimiser.param_groups]
         field.grid.values.requires_grad_(True)
         values = field.grid.values.detach().numpy()
         self.first, self.second = np.zeros_like(values), np.zeros_like(values)
@@ -317,9 +276,9 @@ class JointFit:
         self.step = 0
         self._empty_cells()
 
-    def run(self, seconds: float, on_progress: OnProgress | None = None, stopped: Callable[[], object] = bool) -> int:
-        """Learn until the budget is used (``seconds`` 0 = only steps count); returns the number of steps."""
-        steps = fit(self.learn, Budget(seconds, self.config.steps), on_progress, stopped)
+    def run(self, budget: Budget) -> int:
+        """Learn until the budget is used; returns the number of steps."""
+        steps = fit(self.learn, budget)
         self._empty_cells()
         self.field.grid.values.requires_grad_(False)
         self.field.eval()
@@ -340,20 +299,17 @@ class JointFit:
         behind = field.grid.sky_colour(batch.direction) * samples.light[:, None]
         colour = (share[..., None] * field.trunk.colour(r, batch.direction)).sum(1) + behind
         gain = self.data.gain[torch.from_numpy(self.data.rays.frame_of(pixels))]
-        truth = torch.from_numpy(self.data.rays.rgb[pixels] / np.float32(255))
-        loss = functional.mse_loss(gain * colour, truth)
+        loss = functional.mse_loss(gain * colour, self.data.rays.colours(pixels))
         loss = loss + DEPTH * self._depth_loss(samples, share, pixels)
         channel = self.data.channel[torch.from_numpy(pixels)]
         boxes = field.boxes_on(samples)
         learned = field.learned(samples, r)
         semantics = semantic_losses(field, samples, boxes, learned, channel, self.group, config.panoptic)
         loss = loss + SEMANTICS * semantics
-        self.optimiser.zero_grad()
         field.grid.values.grad = None
-        loss.backward()
-        self.optimiser.step()
+        total = descend(self.optimiser, loss)
         self._step_density(DENSITY_RATE * left)
-        return float(loss.detach())
+        return total
 
     def _depth_loss(self, samples: RaySamples, share: torch.Tensor, pixels: np.ndarray) -> torch.Tensor:
         """Huber of inverse depth, where depth is known, in units of its reach."""
@@ -404,3 +360,193 @@ def _followed(start: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays) ->
 
 def _some_pixels(data: PseudoRays, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, len(data.rays), SURVEYED)
+
+
+def boxes_in_view(boxes: Sequence[Primitive], frames: Sequence[PosedFrame]) -> Bool:
+    """Which boxes (P,) may be in the image of a frame, none of those that are for certain (what hides them is ignored).
+
+    A box is taken as the ball round it, and an image as the cone through its corners. Boxes that move are looked at
+    where they are at the time of each frame.
+
+    Args:
+        boxes: P of them.
+        frames: With rigid poses, at any size.
+
+    Raises:
+        ConfigError: no box may be in any image.
+    """
+    balls = [_ball(box) for box in boxes]
+    centre = np.array([c for c, _ in balls]).reshape(-1, 3)
+    radius = np.array([r for _, r in balls])
+    still = np.array([not box.moves for box in boxes], np.bool_)
+    cone = np.array([_half_angle(frame) for frame in frames])
+    pose = np.array([frame.T_world_camera for frame in frames]).reshape(-1, 4, 4)
+    seen = np.zeros(len(boxes), np.bool_)
+    at = np.array([box.T_world_box for box in boxes]).reshape(-1, 4, 4)
+    world = np.einsum("pij,pj->pi", at[:, :3, :3], centre) + at[:, :3, 3]
+    part = max(PAIRS // max(len(frames), 1), 1)
+    for chosen in np.split(np.flatnonzero(still), range(part, int(still.sum()), part)):
+        seen[chosen] = _meets(world[chosen], radius[chosen, None], pose, cone).any(1)
+    for number in np.flatnonzero(~still).tolist():
+        seen[number] = _moving_meets(boxes[number], centre[number], radius[number], frames, cone)
+    if len(boxes) and not seen.any():
+        raise nothing_in_view(world, world, pose[:, :3, 3], moving=not still.all())
+    return seen
+
+
+def nothing_in_view(low: Float64, high: Float64, cameras: Float64 | Float32, moving: bool = False) -> ConfigError:
+    """That no box is in view of any frame, with where boxes (P, 3) and cameras (F, 3) are."""
+    times = ", and the stamps of those that move the log's, in nanoseconds" if moving else ""
+    return ConfigError(
+        f"no box is in view of any frame: boxes lie from {_metres(low.min(0))} to {_metres(high.max(0))}, cameras from "
+        f"{_metres(cameras.min(0))} to {_metres(cameras.max(0))}. Are the boxes in the log's world frame{times}?"
+    )
+
+
+def _ball(box: Primitive) -> tuple[Float64, float]:
+    """Centre (3,) in the box's axes and radius of a ball round it and what may still be of its class."""
+    low, high = -box.size / 2, box.size / 2
+    if box.vertices is not None:
+        low, high = box.vertices.min(0), box.vertices.max(0)
+    elif box.polygon is not None:
+        low, high = (np.append(f(box.polygon, axis=0), z) for f, z in ((np.min, low[2]), (np.max, high[2])))
+    return (low + high) / 2, float(np.linalg.norm((high - low) / 2 + LOOSE_M))
+
+
+def _half_angle(frame: PosedFrame) -> float:
+    """Of the cone round the optical axis that holds the image, radians."""
+    k = frame.intrinsics
+    x = max(k.cx + 0.5, k.width - 0.5 - k.cx) / k.fx
+    y = max(k.cy + 0.5, k.height - 0.5 - k.cy) / k.fy
+    return float(np.arctan(np.hypot(x, y)))
+
+
+def _meets(centre: Float64, radius: Float64, pose: Float64, cone: Float64) -> Bool:
+    """Which balls (P,) meet the cones of which cameras (F,): (P, F). ``radius`` (P, 1)."""
+    away = centre[:, None] - pose[None, :, :3, 3]
+    z = np.einsum("pfi,fi->pf", away, pose[:, :3, 2])
+    distance = np.linalg.norm(away, axis=-1)
+    angle = np.arccos(np.clip(z / np.maximum(distance, 1e-9), -1, 1))
+    wide = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
+    return (distance <= radius) | (angle <= cone + wide)
+
+
+def _moving_meets(box: Primitive, centre: Float64, radius: float, frames: Sequence[PosedFrame], cone: Float64) -> bool:
+    assert box.stamps is not None
+    times = [t for t, _ in box.stamps]
+    margin = max((max(times) - min(times)) // 2, ALONE_NS)
+    for frame, angle in zip(frames, cone, strict=True):
+        if not min(times) - margin <= frame.stamp_ns <= max(times) + margin:
+            continue
+        pose = box.pose_at(frame.stamp_ns)
+        if pose is None:
+            continue
+        world = pose[:3, :3] @ centre + pose[:3, 3]
+        camera = np.asarray(frame.T_world_camera, np.float64)[None]
+        if _meets(world[None], np.array([[radius]]), camera, np.array([angle])).any():
+            return True
+    return False
+
+
+def _metres(xyz: Float64 | Float32) -> str:
+    return "(" + ", ".join(f"{x:.2f}" for x in xyz) + ") m"
+
+
+def shown_boxes(boxes: MovingBoxes, frames: Sequence[PosedFrame], rays: FrameRays) -> tuple[Bool, Int64]:
+    """Which pixels (P,) of frames may show a box that moves, and how many may show each box (M,)."""
+    shown, count = np.zeros(len(rays), np.bool_), np.zeros(len(boxes), np.int64)
+    for number, frame in enumerate(frames):
+        for met, pixels in _met(boxes, frame, rays, number):
+            depth = torch.from_numpy(rays.depth_m[pixels])
+            enter, leave = _ends(met)
+            known = depth > 0
+            elsewhere = known & ((depth < (1 - ELSEWHERE) * enter) | (depth > (1 + ELSEWHERE) * leave))
+            shown[pixels[~elsewhere.numpy()]] = True
+            count[met.number] += int((~elsewhere).sum())
+    return shown, count
+
+
+def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, gains: Float32, near_m: float) -> None:
+    """Fill the grids of the boxes that move from depth images and colours; the scene's own grid is fitted.
+
+    What the scene itself has at a measured depth, such as the road under a car, is not of the box. Where no frame
+    measures the inside of a box, its core is full.
+
+    Args:
+        field: Its boxes that move are filled.
+        frames: F of them.
+        rays: Of the frames.
+        gains: (F, 3) exposure of the frames.
+        near_m: From which on rays look.
+    """
+    boxes = field.moving
+    depths = [np.zeros_like(rays.depth_m) for _ in boxes.primitives]
+    measured = np.zeros(len(boxes), np.int64)
+    for number, frame in enumerate(frames):
+        for met, pixels in _met(boxes, frame, rays, number):
+            depth = rays.depth_m[pixels].copy()
+            surface = _scene_depth(field, rays, pixels, near_m)
+            depth[(depth > 0) & (surface > 0) & (depth > (1 - ELSEWHERE) * surface)] = FAR_M
+            depths[met.number][pixels] = depth
+            measured[met.number] += int(met.found.inside(torch.from_numpy(depth)[:, None]).any(-1).sum())
+    poses = rays.T_world_camera.astype(np.float64)
+    for box, depth in enumerate(depths):
+        T_box_camera = poses.copy()
+        for number, frame in enumerate(frames):
+            T_world_box = boxes.primitives[box].pose_at(frame.stamp_ns)
+            if T_world_box is not None:
+                T_box_camera[number] = invert_pose(T_world_box) @ poses[number]
+        own = replace(rays, T_world_camera=T_box_camera.astype(np.float32), depth_m=depth)
+        grid = boxes.grid(box)
+        if measured[box] < LEAST_PIXELS:
+            _fill_core(grid)
+            continue
+        filled = grid_of_depth(own, grid.config, NOTHING)
+        grid.load_state_dict(filled.state_dict())
+        _paint(grid, own, gains)
+
+
+def _fill_core(grid: SceneGrid) -> None:
+    """Make the core of a box opaque, with round edges, as things have; grey."""
+    axes = torch.meshgrid(*(torch.linspace(-1, 1, n) for n in grid.config.shape), indexing="ij")
+    inside = torch.stack(axes).pow(4).sum(0) <= CORE**4
+    with torch.no_grad():
+        grid.values[..., 0] = torch.where(inside, OPAQUE_RAW, NOTHING)
+    grid.update_occupied()
+
+
+def _paint(grid: SceneGrid, rays: FrameRays, gains: Float32) -> None:
+    """Colours of the measured points in the grid, averaged over some voxels; grey away from them."""
+    pixels = np.flatnonzero((rays.depth_m > 0) & (rays.depth_m < FAR_M))
+    in_grid = grid.rays(rays.rays(pixels, 0.0))
+    vertex = in_grid.points(torch.from_numpy(rays.depth_m[pixels])[:, None])[:, 0].round().long()
+    inside = ((vertex >= 0) & (vertex < torch.tensor(grid.config.shape))).all(1)
+    colour = torch.from_numpy(rays.rgb[pixels] / np.float32(255) / gains[rays.frame_of(pixels)])
+    found = torch.zeros(*grid.config.shape, 4)
+    found.index_put_(tuple(vertex[inside].T), functional.pad(colour[inside], (0, 1), value=1.0), accumulate=True)
+    mean = functional.avg_pool3d(found.permute(3, 0, 1, 2), SPREAD, 1, SPREAD // 2)
+    known = mean[3] > 0
+    painted = torch.logit((mean[:3] / mean[3].clamp_min(1e-9)).clamp(0.01, 0.99)).permute(1, 2, 3, 0)
+    with torch.no_grad():
+        grid.values[..., 1:] = torch.where(known[..., None], painted, torch.zeros(()))
+
+
+def _scene_depth(field: Panoptic, rays: FrameRays, pixels: Int64, near_m: float) -> Float32:
+    """z (R,) of the scene that stands still at pixels, 0 where nothing is."""
+    with torch.no_grad():
+        samples = field.march(rays.rays(pixels, near_m))
+        z = (ray_fraction(samples) * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)
+    return torch.where(samples.opacity > OPAQUE, z, 0.0).numpy()
+
+
+def _ends(met: RaysInBox) -> tuple[torch.Tensor, torch.Tensor]:
+    """z (N,) of the first entry and the last exit."""
+    there = met.found.index >= 0
+    return met.found.enter.amin(1), met.found.leave.masked_fill(~there, -torch.inf).amax(1)
+
+
+def _met(boxes: MovingBoxes, frame: PosedFrame, rays: FrameRays, number: int) -> list[tuple[RaysInBox, Int64]]:
+    """The boxes that pixels of a frame meet, and which pixels."""
+    pixels = rays.pixels_of(number)
+    batch = replace(rays.rays(pixels, 0.0), stamp_ns=frame.stamp_ns)
+    return [(met, pixels[met.ray.numpy()]) for met in boxes.met(batch)]

@@ -42,10 +42,7 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 def scene_box(frames: Sequence[PosedFrame], config: GridFitConfig) -> GridConfig:
     """The box that ``config`` asks for, or what the frames' depth reaches, or what their images show.
-
-    Raises:
-        ConfigError: a box without a volume, or too large for ``voxel_m``.
-    """
+    Raises ConfigError: a box without a volume, or too large for ``voxel_m``."""
     if config.box_m is not None:
         low, high = config.box_m[:3], config.box_m[3:]
     elif any(f.depth_m is not None for f in frames):
@@ -66,11 +63,7 @@ def scene_box(frames: Sequence[PosedFrame], config: GridFitConfig) -> GridConfig
 
 
 def check_parallax(frames: Sequence[PosedFrame], box: GridConfig) -> None:
-    """Refuse cameras that stand in one place.
-
-    Raises:
-        FrameError: they do.
-    """
+    """Refuse cameras that stand in one place. Raises FrameError: they do."""
     position = np.array([f.T_world_camera[:3, 3] for f in frames])
     reach = float(np.linalg.norm(position - position.mean(0), axis=1).max())
     if reach < MIN_PARALLAX * box.voxel_m * max(box.shape):
@@ -159,10 +152,7 @@ class _Features:
 
 def sparse_points(frames: Sequence[PosedFrame]) -> Float64:
     """Points (N, 3) in the world that images show, triangulated; wrong poses leave few.
-
-    Args:
-        frames: With poses, of a scene that stands still; at most 60, evenly spread, are looked at.
-    """
+    ``frames``: with poses, of a scene that stands still; at most 60, evenly spread, are looked at."""
     step = max(1, -(-len(frames) // FRAMES))
     seen = [found for frame in frames[::step] if (found := _features(frame)) is not None]
     if len(seen) < 2:

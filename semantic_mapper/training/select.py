@@ -60,18 +60,13 @@ def choose_keyframes(candidates: Sequence[Candidate], count: int, seed: int) -> 
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """A frame to label.
+    """A frame to label."""
 
-    Args:
-        index: Of the candidate.
-        gain: Fraction of the log's pixels that it adds to what labelled and earlier suggested frames show; None where
-            the frames have no depth.
-        shown: Fraction that all of them show then; None likewise.
-    """
-
-    index: int
+    index: int  # of the candidate
+    # Fraction of the log's pixels that it adds to what labelled and earlier suggested frames show; None where the
+    # frames have no depth
     gain: float | None
-    shown: float | None
+    shown: float | None  # fraction that all of them show then; None likewise
 
 
 def suggest_frames(

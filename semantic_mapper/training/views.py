@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from semantic_mapper.fields.source_views import UNSURE_SPREAD
+from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.base import UNSURE_SPREAD
+from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
 from semantic_mapper.geometry import camera_matrix, transform, unproject
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
@@ -21,26 +23,17 @@ PROBE = 24  # pixels a row of a view that overlap is found with
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledView:
-    """One posed image at training resolution.
+    """One posed image at training resolution."""
 
-    Args:
-        rgb: (3, H, W) float32 in [0, 1].
-        depth_m: (H, W) float32, 0 = none.
-        channel: (H, W) int64 class channels, -1 = ignore.
-        intrinsics: Of (H, W).
-        T_world_camera: (4, 4) float32.
-        computed_m: (H, W) float32 depth that was computed from pictures, 0 = none: what a field is given in the place
-            of ``depth_m``, which remains what it is to render. None = a field is given ``depth_m``.
-        computed_sigma_m: (H, W) float32 its one-sigma spread.
-    """
-
-    rgb: torch.Tensor
-    depth_m: torch.Tensor
-    channel: torch.Tensor
-    intrinsics: CameraIntrinsics
-    T_world_camera: torch.Tensor
+    rgb: torch.Tensor  # (3, H, W) float32 in [0, 1]
+    depth_m: torch.Tensor  # (H, W) float32, 0 = none
+    channel: torch.Tensor  # (H, W) int64 class channels, -1 = ignore
+    intrinsics: CameraIntrinsics  # of (H, W)
+    T_world_camera: torch.Tensor  # (4, 4) float32
+    # (H, W) float32 depth that was computed from pictures, 0 = none: what a field is given in the place of ``depth_m``,
+    # which remains what it is to render. None = a field is given ``depth_m``.
     computed_m: torch.Tensor | None = None
-    computed_sigma_m: torch.Tensor | None = None
+    computed_sigma_m: torch.Tensor | None = None  # (H, W) float32 its one-sigma spread
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,6 +163,39 @@ def query_rays(
         view.depth_m.flatten()[flat_index],
     )
     return rays, targets
+
+
+def guided_rays(
+    view: LabelledView,
+    flat_index: torch.Tensor,
+    sampling: SamplingConfig,
+    generator: torch.Generator,
+    *,
+    noise: float,
+    withheld: float,
+    samples_without_depth: int,
+    blind: bool = False,
+    thinning: int = 1,
+) -> tuple[RayBatch, RayTargets, torch.Tensor]:
+    """Rays of a training step through chosen pixels (R,), what they should render to, and sample depths (R, N).
+
+    Args:
+        noise: Sigma of the depth prior's error as a fraction of z; computed depth has errors of its own.
+        withheld: How often there is no depth prior; ``blind`` = always.
+        samples_without_depth: Of a ray, in steps without a depth prior. One ray in ``thinning`` is rendered in these.
+    """
+    error = 1 + noise * torch.randn(len(flat_index), generator=generator)
+    blind = float(torch.rand(1, generator=generator)) < withheld or blind
+    near_m, far_m = sampling.near_m, sampling.far_m
+    depth_m = view.depth_m if view.computed_m is None else view.computed_m
+    if blind or not bool((depth_m > 0).any()):
+        rays, targets = query_rays(view, flat_index[::thinning], near_m=near_m, far_m=far_m, prior=None)
+        return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, samples_without_depth, generator)
+    prior = depth_m.flatten()[flat_index]
+    if view.computed_m is None:
+        prior = prior * error
+    rays, targets = query_rays(view, flat_index, near_m=near_m, far_m=far_m, prior=prior)
+    return rays, targets, sample_guided(rays, sampling if view.computed_m is None else around_computed(sampling))
 
 
 def view_overlap(views: Sequence[LabelledView]) -> torch.Tensor:

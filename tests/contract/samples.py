@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.mapping.odometry_sessions import CameraPose
+from semantic_mapper.mapping.map_types import CameraPose, MapPoints
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers

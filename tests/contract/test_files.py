@@ -19,7 +19,7 @@ from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.replay.corrected_poses import read_corrections
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.testing import LogReplays
-from semantic_mapper.training.keyframe_pool import KeyframePool
+from semantic_mapper.training.online import KeyframePool
 from semantic_mapper.transport.keys import load_keys
 from tests.contract import entry_points as api
 from tests.contract.golden import (

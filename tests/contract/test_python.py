@@ -19,7 +19,7 @@ _BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 OWN = ("semantic_mapper", "replay", "nodes", "drivers")
 # Not in a code block, but named in the text of the how-tos and CONTRIBUTING.
 NAMED = (
-    ("semantic_mapper.fields.registry", "build_field"),
+    ("semantic_mapper.fields.learned", "build_field"),
     ("semantic_mapper.labels", "ROOMS"),
     ("semantic_mapper.testing", "LogReplays"),
     ("semantic_mapper.testing", "ReplayedMap"),

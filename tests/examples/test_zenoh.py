@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.nodes.bridge.packing import POINT
+from semantic_mapper.nodes.map_feed import POINT
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import free_port
 from tests.queries.scene import LABELS, whole_map

@@ -11,14 +11,13 @@ from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import (
     COMPUTED_DEPTH,
     Checkpoint,
-    adapt_model,
     anchor_from_frame,
     default_checkpoint_path,
     find_checkpoint,
     load_checkpoint,
     save_checkpoint,
 )
-from semantic_mapper.labels import ROOMS, make_label_set
+from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
 from tests.small import tiny_field, tiny_frames
 
@@ -118,27 +117,6 @@ def test_anchors_with_computed_depth_keep_its_spread(tmp_path):
     kept, measured = load_checkpoint(tmp_path / "w").anchors
     assert measured.depth_sigma_m is None
     np.testing.assert_allclose(kept.depth_sigma_m, 0.05 * kept.depth_m, atol=5e-4)
-
-
-def test_an_anchor_without_a_usable_pose_is_refused(tmp_path):
-    path = tmp_path / "w.safetensors"
-    pose = tiny_frames(1)[0].T_world_camera.copy()
-    pose[0, 3] = np.nan
-    lost = dataclasses.replace(tiny_frames(1)[0], T_world_camera=pose)
-    save_checkpoint(Checkpoint(tiny_field(), (anchor_from_frame(lost, 64),)), path)
-    with pytest.raises(WeightsError, match="anchor 0: the pose holds NaN"):
-        load_checkpoint(path)
-
-
-def test_adapted_model_carries_classifier_rows_over_by_name():
-    model = tiny_field()
-    other = make_label_set("other", ["spaceship", "chair", "wall"], ids=[4, 9, 2])
-    adapted = adapt_model(model, other)
-    weight, old = adapted.classifier.weight, model.classifier.weight
-    assert torch.equal(weight[1], old[ROOMS.names.index("chair")])
-    assert torch.equal(weight[2], old[ROOMS.names.index("wall")])
-    assert (weight[0] - old.mean(0)).abs().mean() < 0.5
-    assert torch.equal(adapted.encoder.colour_net.head.weight, model.encoder.colour_net.head.weight)
 
 
 def test_weights_that_ship_are_found_by_name_and_files_come_first(tmp_path, monkeypatch):

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-import torch
 
-from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.imaging import fill_holes
 
@@ -39,37 +36,7 @@ def test_a_hole_takes_the_surface_that_it_looks_like():
     np.testing.assert_allclose(depth_prior(depth_m, rgb), truth, atol=1e-6)
 
 
-def test_without_an_edge_in_the_image_the_sensor_has_its_way():
-    truth, rgb = post_before_wall()
-    np.testing.assert_array_equal(depth_prior(truth, np.full_like(rgb, 120)), truth)
-
-
 def test_a_surface_at_a_grazing_angle_is_one_surface_whatever_its_texture():
     depth_m = np.tile(np.geomspace(0.5, 5.0, WIDTH, dtype=np.float32), (20, 1))
     _, rgb = post_before_wall()
     np.testing.assert_array_equal(depth_prior(depth_m, rgb), depth_m)
-
-
-def test_without_depth_there_is_no_prior():
-    _, rgb = post_before_wall()
-    assert not depth_prior(np.zeros(rgb.shape[:2], np.float32), rgb).any()
-
-
-def test_the_same_bits_on_any_number_of_threads():
-    rng = np.random.default_rng(1)
-    depth_m = rng.choice(np.array([0, 1, 2, 4], np.float32), (40, 60))
-    rgb = rng.integers(0, 256, (40, 60, 3)).astype(np.uint8)
-    count = torch.get_num_threads()
-    try:
-        found: list[bytes] = []
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            found.append(depth_prior(depth_m, rgb).tobytes())
-    finally:
-        torch.set_num_threads(count)
-    assert len(set(found)) == 1
-
-
-def test_an_image_of_another_size_is_refused():
-    with pytest.raises(ShapeError, match="rgb"):
-        depth_prior(np.ones((4, 6), np.float32), np.zeros((4, 5, 3), np.uint8))

@@ -12,12 +12,10 @@ import torch
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.encoder import (
-    BACKBONE_WIDTHS,
     EfficientNetLite0,
     ImageEncoder,
     calibrate,
     surface_maps,
-    up_direction,
 )
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.types import CameraIntrinsics, SourceViews
@@ -64,19 +62,6 @@ def test_statistics_change_inside_batch_statistics_and_nowhere_else():
     assert not all(torch.equal(before[name], t) for name, t in field.named_buffers())
     assert not field.uncalibrated and field.training
     assert not any(m.training for m in field.modules() if isinstance(m, torch.nn.BatchNorm2d))
-
-
-def test_a_backbone_with_statistics_of_its_own_is_calibrated_though_it_has_counted_no_batch():
-    field = encoder(EncoderConfig(channels=(8, 8), blocks=(1, 0), backbone="efficientnet-lite0"))
-    for backbone in field.backbones():
-        for module in backbone.modules():
-            if isinstance(module, torch.nn.BatchNorm2d):
-                assert module.running_mean is not None
-                module.running_mean.fill_(0.1)  # as published weights bring it, their count is not among them
-    field.freeze_backbones()
-    assert field.uncalibrated, "the other norms are fresh"
-    calibrate(field, views(2))
-    assert not field.uncalibrated
 
 
 def test_calibration_makes_a_fresh_encoder_normalise_and_changes_no_weight():
@@ -139,25 +124,6 @@ def test_computed_depth_is_shown_only_to_an_encoder_that_has_learned_from_it():
     assert not torch.equal(shown(computed(given, 0.02)), shown(none))
 
 
-def test_computed_depth_that_is_not_sure_is_a_hole():
-    shown = encoder(msgspec.structs.replace(SMALL_ENCODER, computed_depth=True))
-    given = views(2)
-    spread = torch.full_like(given.depth_m, 0.02)
-    spread[:, :10] = 0.2
-    holes = given.depth_m.clone()
-    holes[:, :10] = 0
-    partly = replace(given, depth_sigma_m=spread * given.depth_m)
-    assert torch.equal(shown(partly), shown(replace(given, depth_m=holes)))
-
-
-@pytest.mark.parametrize("size", [(64, 96), (61, 95), (33, 47)])
-def test_stages_halve_the_image_rounded_up(size: tuple[int, int]):
-    maps = EfficientNetLite0().eval()(torch.rand(2, 3, *size))
-    for k, features in enumerate(maps, 1):
-        expected = tuple(-(-side // 2**k) for side in size)
-        assert features.shape == (2, BACKBONE_WIDTHS[k - 1], *expected)
-
-
 def test_strided_convolutions_look_where_tensorflow_s_do():
     """Of an even size the middle of the first output's window is pixel 1, of an odd one pixel 0."""
     for size, middle in ((8, 1), (9, 0)):
@@ -170,16 +136,10 @@ def test_strided_convolutions_look_where_tensorflow_s_do():
         assert stem(image)[0, 0, 0, 0] == 3
 
 
-def test_blocks_at_the_coarsest_width_are_refused():
-    with pytest.raises(ConfigError, match="last one without blocks"):
-        ImageEncoder(EncoderConfig(backbone="efficientnet-lite0", channels=(8, 8), blocks=(1, 1)), 8)
-
-
 def test_a_frozen_backbone_keeps_weights_and_statistics_while_the_rest_learns():
     encoder = ImageEncoder(SMALL, 8)
-    encoder.freeze_backbones()
-    encoder.freeze_colours(True)
-    encoder.freeze_colours(False)  # which must not wake it
+    encoder.freeze(encoder.colour_net, *encoder.backbones())
+    encoder.freeze(*encoder.backbones())
     before = {name: t.clone() for name, t in encoder.state_dict().items()}
     optimiser = torch.optim.AdamW(encoder.parameters(), 0.1, weight_decay=0.1)
     views = wall_sources([pose_at(0.0), pose_at(0.1)])
@@ -229,9 +189,3 @@ def test_without_depth_there_is_nothing_and_holes_stay_holes():
     assert not maps[0, :, 70:80, 60:90].any()
     assert not maps[1].any()
     assert torch.isfinite(maps).all()
-
-
-def test_up_without_any_normal_is_the_cameras_own():
-    up = up_direction(torch.zeros(1, 3, 8, 8), torch.zeros(1, 8, 8, dtype=torch.bool))
-    torch.testing.assert_close(up[0].abs(), torch.tensor([0.0, 1.0, 0.0]))
-    assert float(up[0, 1]) < 0

@@ -75,11 +75,6 @@ def test_pixels_whose_depth_is_another_than_their_neighbours_have_rays_of_their_
     np.testing.assert_array_equal(depth[:, 25], 2.0)
 
 
-def test_a_plane_that_is_seen_at_an_angle_needs_no_more_rays_than_a_frontal_one():
-    slope = np.broadcast_to(np.linspace(1.0, 4.0, 40, dtype=np.float32), (30, 40)).copy()
-    assert sparse(Halves(), slope)[3] <= sparse(Halves())[3] + 30  # the last columns have nobody on their right
-
-
 def test_the_fraction_is_a_limit_and_the_most_uncertain_go_first():
     prior = np.full((30, 40), 2.0, np.float32)
     prior[10] = 1.0
@@ -88,13 +83,6 @@ def test_the_fraction_is_a_limit_and_the_most_uncertain_go_first():
     assert rays == needed < sparse(Halves(17.5), prior)[3]
     np.testing.assert_array_equal(p.argmax(2), dense(Halves(17.5))[0].argmax(2))
     assert sparse(Halves(), fraction=0.0)[3] == 80
-
-
-def test_what_no_ray_knows_stays_unknown():
-    p, known, _, _ = sparse(Halves(unknown_above=9))
-    expected = dense(Halves(unknown_above=9))
-    np.testing.assert_array_equal(known, expected[1])
-    np.testing.assert_allclose(p[known], expected[0][known], atol=1e-6)
 
 
 def test_images_of_another_size_than_the_view_are_refused():

@@ -6,17 +6,14 @@ import pytest
 import torch
 
 from semantic_mapper.config import GridConfig, GridFieldConfig
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.scene.grid import (
     NOTHING,
     GridField,
     RaySamples,
-    SceneGrid,
     at_resolution,
-    grid_box,
 )
 from tests.fields.scene import WALL_M, pose_at, wall_colour, wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, assert_unknown
@@ -58,13 +55,6 @@ def test_a_fitted_grid_renders_colour_and_depth_and_claims_no_class() -> None:
     assert (render.depth_m - (WALL_M - rays.origin[:, 2]))[inside].abs().max() < 0.1
     assert (render.rgb - wall_colour(hit[:, 0], hit[:, 1]))[inside].abs().max() < 0.1
     assert not render.known.any() and not render.logits.any()
-
-
-def test_rays_that_miss_see_the_sky() -> None:
-    field = wall_field()
-    rays = wall_rays(pose_at(0.0, 3.1415), step=31)  # away from the wall
-    render = field.render(rays, field.encode(wall_sources(POSES[:1])))
-    assert render.opacity.abs().max() == 0 and (render.rgb > 0.99).all() and not render.depth_m.any()
 
 
 def test_an_unfitted_grid_knows_nothing() -> None:
@@ -110,17 +100,6 @@ def test_a_file_holds_the_grid_as_float16_and_gives_it_back(features: int, tmp_p
     assert (tmp_path / "w.safetensors").stat().st_size < 2 * voxels * (1.5 if features else 1.2) + 100_000
     rays, sources = wall_rays(pose_at(0.0), step=31), field.encode(wall_sources(POSES[:1]))
     torch.testing.assert_close(loaded.render(rays, sources).rgb, field.render(rays, sources).rgb, atol=5e-3, rtol=0)
-
-
-def test_voxels_grow_where_a_box_is_too_large_but_not_where_they_are_asked_for() -> None:
-    box = grid_box((0, 0, 0), (100, 100, 100), 1000)
-    assert box.shape[0] ** 3 <= 1 << 24 and box.voxel_m > 0.3
-    with pytest.raises(ConfigError, match=r"voxel_m = 0\.1 makes 1003003001 voxels.* set voxel_m to 0\.39"):
-        grid_box((0, 0, 0), (100, 100, 100), 1000, 0.1)
-    with pytest.raises(ConfigError, match="no volume"):
-        grid_box((0, 0, 0), (1, 0, 1), 64)
-    with pytest.raises(ConfigError, match="raise voxel_m"):
-        SceneGrid(GridConfig(shape=(4096, 4096, 2)))
 
 
 def test_a_resampled_grid_shows_the_same() -> None:

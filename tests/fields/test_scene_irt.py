@@ -8,7 +8,7 @@ import msgspec
 import pytest
 import torch
 
-from semantic_mapper.fields.scene.irt import IRT, CarriedLabels, TextureNet, at_measured, no_texture
+from semantic_mapper.fields.scene.irt import IRT, CarriedLabels, at_measured, no_texture
 from tests.fields.scene import wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, TINY_IRT
 
@@ -42,26 +42,6 @@ def test_without_its_image_a_ray_is_answered_as_with_a_texture_of_zeros(variant:
         with_image = field.render(rays, sources).logits
     torch.testing.assert_close(without, wanted)
     assert (with_image - without).abs().max() > 1e-4
-
-
-def test_variants_without_texture_do_not_look_at_the_image() -> None:
-    for variant in ("B", "RT"):
-        field = fitted(variant=variant)
-        rays, sources = rays_and_sources(field)
-        with torch.no_grad():
-            same = field.render(rays, sources).logits
-            torch.testing.assert_close(field.render(rays, sources.select(torch.tensor([1]))).logits, same)
-
-
-def test_the_texture_of_a_pixel_is_that_of_its_patch_at_the_edge_too() -> None:
-    torch.manual_seed(0)
-    net, rgb = TextureNet(), torch.rand(1, 3, 9, 12)
-    m = net.margin
-    padded = torch.nn.functional.pad(rgb, (m,) * 4, mode="replicate")
-    whole = net(rgb)
-    for row, column in ((0, 0), (4, 6), (8, 11)):
-        patch = padded[:, :, row : row + 2 * m + 1, column : column + 2 * m + 1]
-        torch.testing.assert_close(net.of_patches(patch)[0], whole[0, :, row, column])
 
 
 def test_a_ray_with_measured_depth_ends_there() -> None:

@@ -203,13 +203,3 @@ def test_total_variation_has_the_gradient_of_the_huber_loss_of_neighbours() -> N
     untouched = np.zeros(values.shape, np.float32)
     add_total_variation(len(untouched), values.numpy(), untouched, 1.0, 1.0)
     assert not untouched.any()
-
-
-def test_a_ray_that_misses_or_is_no_number_meets_nothing() -> None:
-    values, occupied = random_grid()
-    origin = torch.tensor([[-5.0, -5, -5], [torch.nan, 1, 1], [4, 4, 4]])
-    direction = torch.tensor([[-1.0, 0, 0], [1, 1, 1], [0, 0, 0]])
-    count = (3,)
-    rays = GridRays(origin, direction, torch.zeros(count), torch.full(count, torch.inf), torch.full(count, 0.5))
-    found = march(values, occupied, rays)
-    assert found.weight.abs().max() == 0 and (found.light == 1).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -71,30 +70,6 @@ def test_intervals_are_where_points_are_inside(primitive: Primitive) -> None:
         assert (found.count == 2).any()
 
 
-def test_rays_through_edges_and_corners_of_aligned_boxes_enter_and_leave_once() -> None:
-    cube = box(size=(2.0, 2.0, 2.0), T=np.eye(4))
-    places = np.array(list(itertools.product((-1.0, -0.5, 0.0, 0.5), repeat=2)))
-    origin = np.c_[places, np.full(len(places), -5.0)]
-    direction = np.tile((0.0, 0.0, 1.0), (len(places), 1))
-    diagonal = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    origin, direction = np.concatenate((origin, 3 * diagonal)), np.concatenate((direction, -diagonal))
-    found = PrimitiveSet([cube]).intervals(rays_of(origin, direction))
-    middle = np.abs(origin[:, :2]).max(1) != 1.0
-    assert (found.count.numpy()[middle] == 1).all()
-    assert found.count.max() == 1
-    np.testing.assert_allclose(found.enter[middle, 0], np.r_[np.full(9, 4.0), np.full(8, 2.0)], atol=1e-6)
-    np.testing.assert_allclose(found.leave[middle, 0], np.r_[np.full(9, 6.0), np.full(8, 4.0)], atol=1e-6)
-
-
-def test_intervals_of_several_are_sorted_and_clipped_and_the_nearest_are_kept() -> None:
-    boxes = [box(i + 1, (1.0, 1.0, 1.0), _at(x)) for i, x in enumerate((5.0, 0.0, 2.0, 5.25))]
-    found = PrimitiveSet(boxes).intervals(rays_of(np.zeros((1, 3)), np.array([(1.0, 0.0, 0.0)]), near=0.25), most=3)
-    assert found.index.tolist() == [[1, 2, 0]]
-    assert found.enter.tolist() == [[0.25, 1.5, 4.5]]
-    assert found.leave.tolist() == [[0.5, 2.5, 5.5]]
-    assert found.count.tolist() == [4]
-
-
 def test_meshes_face_outwards_whatever_the_order_of_their_corners() -> None:
     vertices, faces = prism().mesh()
     mixed = faces.copy()
@@ -119,9 +94,3 @@ def test_open_meshes_and_bad_outlines_are_refused() -> None:
     broken = replace(box(7), shape="mesh", vertices=vertices, faces=faces[1:])
     with pytest.raises(ConfigError, match=r"box 7 \(chair\)"):
         PrimitiveSet([broken])
-
-
-def _at(x: float) -> Float64:
-    T = np.eye(4)
-    T[0, 3] = x
-    return T

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import conv3d, conv_transpose3d
 
-from semantic_mapper.fields.sparse_conv import Down, SubmanifoldConv, Up, cell_levels
+from semantic_mapper.fields.nesf import Down, SubmanifoldConv, Up, cell_levels
 
 SIZE = (8, 4, 12)
 
@@ -15,15 +16,25 @@ def _all_cells() -> np.ndarray:
     return np.stack(np.meshgrid(*(np.arange(s) for s in SIZE), indexing="ij"), -1).reshape(-1, 3) - 4
 
 
+def _kernel(weight: torch.Tensor, side: int, out_first: bool = True) -> torch.Tensor:
+    """Weights (side^3, in, out) as torch's dense convolutions have them."""
+    return weight.view(side, side, side, *weight.shape[1:]).permute(*((4, 3) if out_first else (3, 4)), 0, 1, 2)
+
+
+def dense_conv(conv: SubmanifoldConv, x: torch.Tensor) -> torch.Tensor:
+    return conv3d(x, _kernel(conv.weight, 3), conv.bias, padding=1)
+
+
 def test_down_and_up_over_all_cells_are_the_dense_ones() -> None:
     torch.manual_seed(0)
     down, up = Down(3, 5), Up(5, 3)
     level = cell_levels(_all_cells(), 1)[0]
     x = torch.randn(len(_all_cells()), 3)
-    dense = down.dense(x.T.reshape(1, 3, *SIZE))
+    dense = conv3d(x.T.reshape(1, 3, *SIZE), _kernel(down.weight, 2), down.bias, stride=2)
+    finer = conv_transpose3d(dense, _kernel(up.weight, 2, out_first=False), up.bias, stride=2)
     coarse = down(x, level)
     torch.testing.assert_close(coarse, dense[0].reshape(5, -1).T, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(up(coarse, level), up.dense(dense)[0].reshape(3, -1).T, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(up(coarse, level), finer[0].reshape(3, -1).T, atol=1e-5, rtol=1e-5)
 
 
 def test_absent_cells_count_as_zeros() -> None:
@@ -35,7 +46,7 @@ def test_absent_cells_count_as_zeros() -> None:
     x = torch.zeros(len(every), 3)
     x[kept] = torch.randn(len(kept), 3)
     sparse = conv(x[kept], cell_levels(every[kept], 1)[0])
-    dense = conv.dense(x.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
+    dense = dense_conv(conv, x.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
     torch.testing.assert_close(sparse, dense, atol=1e-5, rtol=1e-5)
 
 
@@ -48,7 +59,7 @@ def test_gradients_of_absent_cells_are_those_of_zeros() -> None:
     x = torch.randn(len(kept), 3, requires_grad=True)
     sparse = conv(x, cell_levels(every[kept], 1)[0])
     full = torch.zeros(len(every), 3).index_copy(0, torch.from_numpy(kept), x)
-    dense = conv.dense(full.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
+    dense = dense_conv(conv, full.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
     mine = torch.autograd.grad((sparse * weight).sum(), [x, conv.weight])
     theirs = torch.autograd.grad((dense * weight).sum(), [x, conv.weight])
     for a, b in zip(mine, theirs, strict=True):

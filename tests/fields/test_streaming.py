@@ -12,7 +12,6 @@ import torch
 from semantic_mapper.config import EncoderConfig, SamplingConfig, SRayConfig
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_layers import contextual_space
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import sample_guided, sample_inverse_depth
 from semantic_mapper.labels import make_label_set
@@ -81,21 +80,6 @@ def test_it_renders_what_the_reference_renders(changes: dict[str, Any], guided: 
     assert_equal(*render_both(field, labelled(wall_sources([*POSES, *BEHIND])), rays, z))
 
 
-@pytest.mark.parametrize("factor", [0.25, 8.0, 1e3])
-def test_the_own_view_counts_as_much_more(factor: float):
-    field = random_field()
-    views = labelled(wall_sources([*POSES, *BEHIND]))
-    for pose in (POSES[1], pose_at(0.2, 0.3)):  # of a source view, and of none
-        rays = wall_rays(pose, step=3)
-        z = sample_guided(rays, SamplingConfig())
-        field.own_view_factor.fill_(1.0)
-        plain = render_both(field, views, rays, z)[0].logits
-        field.own_view_factor.fill_(factor)
-        fast, reference = render_both(field, views, rays, z)
-        assert_equal(fast, reference)
-        assert torch.equal(fast.logits, plain) == (pose is not POSES[1])
-
-
 @pytest.mark.parametrize("filled", [True, False])
 def test_the_own_view_counts_otherwise_on_rays_without_measured_depth(filled: bool):
     field = random_field()
@@ -114,43 +98,6 @@ def test_the_own_view_counts_otherwise_on_rays_without_measured_depth(filled: bo
     assert torch.equal(found[4.0, 1e3][~half], found[1.0, 1e3][~half])
     assert not torch.equal(found[4.0, 4.0][~half], found[4.0, 1e3][~half])
     assert not torch.equal(found[4.0, 1e3][half], found[1.0, 1e3][half])
-
-
-@pytest.mark.parametrize(
-    ("feature_dim", "heads"),
-    [(4, 2), (12, 3), (20, 4), (28, 1), (32, 4), (36, 2), (64, 8)],
-)
-@pytest.mark.parametrize("least", [0.0, 0.05])
-def test_it_covers_all_widths_and_heads(feature_dim: int, heads: int, least: float):
-    field = random_field(feature_dim=feature_dim, heads=heads)
-    rays = wall_rays(pose_at(0.2, 0.3), step=7)
-    z = sample_guided(rays, SamplingConfig())
-    assert_equal(*render_both(field, labelled(wall_sources([*POSES, *BEHIND])), rays, z, least))
-
-
-@pytest.mark.parametrize("heads", [2, 4])
-@pytest.mark.parametrize("views", [1, 8, 16])
-@pytest.mark.parametrize("samples", [2, 9])
-def test_it_covers_all_numbers_of_views_and_samples(heads: int, views: int, samples: int):
-    field = random_field(feature_dim=32, heads=heads)
-    rays = wall_rays(pose_at(0.05), step=23)
-    z = sample_inverse_depth(rays.near_m, rays.far_m, samples)
-    assert_equal(*render_both(field, wall_sources([pose_at(0.03 * i, 0.02 * i) for i in range(views)]), rays, z))
-
-
-def test_it_leaves_out_the_same_hidden_views():
-    field = random_field(4, tokens="samples")
-    views = wall_sources(POSES)
-    depth_m = views.depth_m.clone()
-    depth_m[1, :, ::2] *= 0.6  # bars before the second camera, a post before the fourth
-    depth_m[3, :, 10:16] *= 0.4
-    views = replace(views, depth_m=depth_m)
-    rays = wall_rays(pose_at(0.1), step=3)
-    z = sample_guided(rays, SamplingConfig())
-    space = contextual_space(rays, z, field.encode(views))
-    left_out = space.valid & ~field.mask_occluded(space).valid
-    assert 0.02 < left_out.float().mean() < 0.5
-    assert_equal(*render_both(field, views, rays, z))
 
 
 @pytest.mark.parametrize("least", [0.02, 0.3, 0.5])

@@ -1,8 +1,6 @@
 import pytest
 import torch
 
-from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.source_views import own_view
 from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.types import SourceViews
 from tests.fields.scene import pose_at, wall_rays, wall_sources
@@ -50,44 +48,6 @@ def test_a_query_whose_own_image_is_not_there_is_unknown(query):
     if query is not AWAY:
         return
     assert_unknown(render)
-
-
-def test_a_camera_that_turned_on_the_spot_is_told_from_the_query_camera():
-    poses = [pose_at(0.1, 0.05), pose_at(0.1), pose_at(0.1, -0.05)]
-    index, same = own_view(wall_rays(pose_at(0.1), step=3), unet().encode(wall_sources(poses)))
-    assert same.all() and (index == 1).float().mean() > 0.95
-
-
-@pytest.mark.parametrize("views", [1, 2, 7, 16])
-def test_any_number_of_views_from_1_to_16_renders(views: int):
-    field = unet()
-    encoded = field.encode(wall_sources([pose_at(0.02 * i) for i in range(views)]))
-    render = field.render(wall_rays(pose_at(0.0), step=101), encoded)
-    assert render.known.all() and torch.isfinite(render.logits).all()
-
-
-def test_depth_makes_no_difference():
-    field = unet()
-    rays = wall_rays(POSES[0], step=31)
-    with torch.no_grad():
-        a = field.render(rays, field.encode(wall_sources(POSES)))
-        b = field.render(wall_rays(POSES[0], step=31, prior=0.0), field.encode(wall_sources(POSES, with_depth=False)))
-    torch.testing.assert_close(a.logits, b.logits)
-    assert a.opacity.max() == 0 and a.depth_m.max() == 0
-
-
-def test_a_novel_view_still_gives_a_loss_to_train_on():
-    field = unet().train()
-    encoded = field.encode(wall_sources(POSES))
-    render, _ = field.render_samples(wall_rays(AWAY, step=31), torch.ones(50, 2), encoded)
-    assert render.logits.requires_grad
-    assert field.source_logits(encoded).shape == (4, 3, 16, 24)
-
-
-def test_mismatched_sources_give_a_shape_error():
-    views = wall_sources(POSES)
-    with pytest.raises(ShapeError, match="source depth_m"):
-        unet().encode(SourceViews(views.rgb, views.depth_m[:2], views.K, views.T_world_camera))
 
 
 def test_the_whole_field_passes_gradcheck():

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import torch
 
-from research.peers.config import MVSNeRFConfig, NeuRayConfig, SemanticNeRFConfig
 from semantic_mapper.config import (
     Config,
     EncoderConfig,
@@ -18,8 +18,7 @@ from semantic_mapper.config import (
     SRayConfig,
     UNetFieldConfig,
 )
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.fields.volume import sample_guided
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -38,28 +37,22 @@ POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
 AWAY = pose_at(0.0, 3.14159)
 
 COLOURS_ONLY = EncoderConfig(channels=(8, 16), blocks=(1, 1))
+TINY_SRAY = SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER)
 TINY: dict[str, Config] = {
-    "sray": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
+    "sray": TINY_SRAY,
+    "sray-paper": msgspec.structs.replace(TINY_SRAY, tokens="samples", intra_view_attention=True),
     "unet": UNetFieldConfig(feature_dim=16, encoder=COLOURS_ONLY),
-    "neuray": NeuRayConfig(feature_dim=16, encoder=COLOURS_ONLY),
-    "mvsnerf": MVSNeRFConfig(feature_dim=8, encoder=COLOURS_ONLY, planes=8, volume_channels=4, width=16),
-    "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
-    "grid": GridFieldConfig(grid=GridConfig(origin_m=(-2.0, -2.0, -1.0), voxel_m=0.25, shape=(17, 17, 17))),
+    "grid": GridFieldConfig(grid=TINY_IRT.grid),
     "irt": TINY_IRT,
+    "irt-rttc": msgspec.structs.replace(TINY_IRT, variant="RTTC"),
     "panoptic": PanopticConfig(grid=TINY_IRT.grid, features=4, trunk_width=16),
-    "panoptic_uniform": PanopticConfig(grid=TINY_IRT.grid, features=4, trunk_width=16),
-    **{f"irt-{name}": TINY_IRT for name in ("b", "bc", "rt", "rtt", "rtc", "rttc")},
-    "sray-paper": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
-    "sray-none": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
-    "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
-    "sray-cross": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
 }
 
 
-def tiny(name: str, seed: int = 0, label_set: LabelSet = LABELS) -> LearnedField:
+def tiny(name: str, seed: int = 0, label_set: LabelSet = LABELS, config: Config | None = None) -> LearnedField:
     """Random weights, evaluation mode."""
     torch.manual_seed(seed)
-    return build_field(name, TINY[name], label_set).eval()
+    return build_field(name.split("-")[0], config or TINY[name], label_set).eval()
 
 
 def assert_unknown(render: FieldRender) -> None:

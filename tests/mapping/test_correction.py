@@ -18,7 +18,7 @@ from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction import ALWAYS, PoseCorrection, PosePair
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.voxel_map import BLOCKS_A_VERSION, VoxelMap
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame
 from tests.small import tiny_config, tiny_field, tiny_frames
 
@@ -71,31 +71,6 @@ def bits(voxel_map: VoxelMap) -> dict[str, bytes]:
 def same(a: VoxelMap, b: VoxelMap) -> bool:
     x, y = a.block_state(), b.block_state()
     return a.frames == b.frames and all(x[k].tobytes() == y[k].tobytes() for k in x)
-
-
-def test_what_was_cleared_is_cleared_again_by_a_rebuild() -> None:
-    frames = list(tiny_frames(12))
-    for i in range(4):  # something stands 0.6 m before the camera, then leaves
-        depth = np.array(frames[i].depth_m)
-        depth[24:48, 32:64] = 0.6
-        frames[i] = replace(frames[i], depth_m=depth)
-    frames += [replace(f, seq=100 + f.seq, stamp_ns=f.stamp_ns + 10**10) for f in tiny_frames(12)]
-    pipeline, other = mapped(frames), mapped(frames, voxel_map={"voxel_size_m": 0.05, "clear_free_space": False})
-    assert pipeline.voxel_map.cleared > 20 and not same(pipeline.voxel_map, other.voxel_map)
-    before = bits(pipeline.voxel_map)
-    pipeline.corrector.start({f.stamp_ns: f.T_world_camera for f in frames})
-    finish(pipeline)
-    assert pipeline.corrector.status.completed == 1 and bits(pipeline.voxel_map) == before
-
-
-def test_true_poses_of_all_frames_give_the_geometry_of_true_poses_to_the_bit():
-    frames = tiny_frames()
-    pipeline = mapped(drifted(frames))
-    pipeline.corrector.start(true_poses(frames, 1))
-    finish(pipeline)
-    ours, ideal = pipeline.voxel_map.block_state(), mapped(frames).voxel_map.block_state()
-    for name in ("keys", "tsdf", "weight", "color"):  # what the field rendered along the way differs a little
-        assert ours[name].tobytes() == ideal[name].tobytes(), name
 
 
 @pytest.mark.parametrize("max_frames", [100, 3])
@@ -259,21 +234,6 @@ def test_queries_and_steps_go_on_during_a_rebuild_in_another_thread():
     assert pipeline.voxel_map.frames == 9 and pipeline.corrector.status.completed == 2
 
 
-def test_mirrors_see_every_block_as_changed_and_a_new_epoch_after_a_swap():
-    frames = tiny_frames()
-    pipeline = mapped(drifted(frames))
-    voxel_map = pipeline.voxel_map
-    version, epoch = voxel_map.version, voxel_map.epoch
-    assert version == voxel_map.frames == 6 and len(voxel_map.changed_since(version)) == 0
-    pipeline.corrector.start(true_poses(frames, 1))
-    finish(pipeline)
-    assert pipeline.voxel_map is voxel_map and (voxel_map.version, voxel_map.epoch) == (version + 1, epoch + 1)
-    assert voxel_map.changed_since(version).tobytes() == voxel_map.block_state()["keys"].tobytes()
-    assert len(voxel_map.changed_since(voxel_map.version)) == 0
-    update = pipeline.step(tiny_frames(7)[6])
-    assert len(voxel_map.changed_since(version + 1)) == update.blocks_touched and voxel_map.version == version + 2
-
-
 def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
     frames = tiny_frames(8)
     pipeline = mapped(frames[:6], max_frames=20, voxel_map={"voxel_size_m": 0.01})
@@ -292,20 +252,6 @@ def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
     pipeline.corrector.start({frames[3].stamp_ns: drift(0.5) @ frames[3].T_world_camera})
     finish(pipeline)
     assert pipeline.corrector.status.completed == 1 and pipeline.corrector.status.failure == ""
-
-
-def test_blocks_on_disk_count_as_changed_too():
-    frames = tiny_frames()
-    settings = {"voxel_size_m": 0.01, "depth_max_m": 2.0, "memory_mb": 110}
-    pipeline = mapped(drifted(frames), voxel_map=settings)
-    pipeline.corrector.start(true_poses(frames, 1))
-    finish(pipeline)
-    voxel_map = pipeline.voxel_map
-    assert voxel_map.stored_blocks > 0
-    assert len(voxel_map.changed_since(6)) == voxel_map.block_count > BLOCKS_A_VERSION
-    assert voxel_map.version == 6 + -(-voxel_map.block_count // BLOCKS_A_VERSION)
-    assert len(voxel_map.changed_since(7)) == voxel_map.block_count - BLOCKS_A_VERSION
-    assert len(voxel_map.changed_since(voxel_map.version)) == 0
 
 
 def test_a_damaged_frame_is_left_out_counted_and_logged():

@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 
 from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import DepthConfig
-from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
@@ -152,30 +151,9 @@ def test_a_frame_that_has_to_wait_is_not_mapped_before_it_is_prepared() -> None:
     assert pipeline.step(walk()[0]).fused, "depth of a sensor waits for nothing"
 
 
-def test_a_rebuild_of_a_computed_map_with_the_same_poses_is_the_same_map() -> None:
-    frames = without_depth(walk()[:10])
-    pipeline = mapped(frames, history={"max_frames": 100})
-    before = pipeline.voxel_map.block_state()
-    pipeline.corrector.start({frames[0].stamp_ns: pipeline.corrector.poses()["rooms", frames[0].stamp_ns]})
-    while pipeline.corrector.advance(3):
-        pass
-    assert pipeline.corrector.status.poses == 1
-    after = pipeline.voxel_map.block_state()
-    assert before["weight"].any()
-    for name, values in before.items():
-        assert values.tobytes() == after[name].tobytes(), name
-
-
 def test_trust_is_the_inverse_variance_and_nothing_where_little_is_known() -> None:
     spread = np.array([[0.0, SURE_SPREAD, 2 * SURE_SPREAD, 0.99 * MOST_SPREAD, MOST_SPREAD, 1.0]], np.float32)
     depth = np.full_like(spread, 2.0)
     expected = [[1, 1, 0.25, (SURE_SPREAD / 0.99 / MOST_SPREAD) ** 2, 0, 0]]
     np.testing.assert_allclose(computed_trust(depth, spread * depth), expected, rtol=1e-5)
     assert not computed_trust(np.zeros_like(depth), spread).any()
-
-
-def test_what_is_kept_to_refine_poses_is_bounded() -> None:
-    pipeline = make_pipeline()
-    for number in range(MAX_CAMERAS + 3):
-        pipeline.prepare(replace(without_depth(walk(FINE)[:1])[0], camera_id=f"camera {number}"))
-    assert len(pipeline._frame_depth._refiners) == MAX_CAMERAS

@@ -46,15 +46,6 @@ def test_a_moved_keyframe_stays_on_the_device_that_encoded_it():
     assert moved.encoded.T_camera_world.device.type == "meta" and moved.T_world_camera[0, 3] == 1.0
 
 
-def test_capacity_drops_the_most_redundant_and_never_a_labelled_keyframe():
-    store = KeyframeStore(KeyframeConfig(capacity=3))
-    store.add(keyframe(0, pose(0.0), labelled=True))
-    store.add(keyframe(1, pose(0.01)))
-    store.add(keyframe(2, pose(5.0)))
-    store.add(keyframe(3, pose(10.0)))
-    assert [k.seq for k in store.keyframes] == [0, 2, 3]
-
-
 def test_within_a_room_the_one_nearest_to_another_goes(rng: np.random.Generator):
     """Against brute force over pairs, one at a time."""
     store, truth = KeyframeStore(KeyframeConfig(capacity=12)), list[Keyframe]()

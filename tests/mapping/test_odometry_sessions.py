@@ -15,6 +15,7 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.correction import ALWAYS
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.odometry_sessions import HELD, OdometrySessions
+from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.session import MapSession, Refusal
 from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
@@ -56,12 +57,12 @@ def off(T: Float64, truth: Float64) -> tuple[float, float]:
 
 
 @cache
-def even_map() -> VoxelMap:
-    """Of every other frame; for those that change nothing."""
+def even() -> MappingPipeline:
+    """Has mapped every other frame; for those that change nothing."""
     session = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)
     for frame in walk()[::2]:
         session.process(frame)
-    return session.pipeline.voxel_map
+    return session.pipeline
 
 
 def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
@@ -91,7 +92,7 @@ def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
 
 def test_the_same_room_mirrored_and_another_room_are_refused_with_the_reason() -> None:
     for frames in ([mirrored(f) for f in walk()[1::5]], list(walk(TRAIN_SEEDS[19], 8)[1::3])):
-        sessions = OdometrySessions(even_map(), own_first=False)
+        sessions = OdometrySessions(even(), own_first=False)
         for frame in frames:
             taken = sessions.take(abroad(frame))
             assert not taken.ready
@@ -101,26 +102,16 @@ def test_the_same_room_mirrored_and_another_room_are_refused_with_the_reason() -
 
 
 def test_frames_that_wait_are_bounded_and_the_oldest_are_given_up() -> None:
-    sessions = OdometrySessions(VoxelMap(SETTINGS.voxel_map, even_map().label_set), own_first=False)
+    sessions = OdometrySessions(Mapper.load(None, SETTINGS).pipeline, own_first=False)
     given_up = [f for n in range(HELD + 5) for f, _ in sessions.take(replace(abroad(walk()[0]), seq=n)).given_up]
     assert [f.seq for f in given_up] == [0, 1, 2, 3, 4] and sessions.held == HELD
     assert sessions.refused["no-places"] == HELD + 5
 
 
-def test_no_world_is_found_in_a_map_that_is_about_to_move() -> None:
-    moving = [True]
-    sessions = OdometrySessions(even_map(), own_first=False, correcting=lambda: moving[0])
-    for frame in walk()[1:6]:
-        assert not sessions.take(abroad(frame)).ready
-    assert sessions.reason == "the map is being corrected" and sessions.held == 5
-    moving[0] = False
-    ready = [f.seq for frame in walk()[6:12] for f in sessions.take(abroad(frame)).ready]
-    assert sessions.found == 1 and ready[:5] == [frame.seq for frame in walk()[1:6]]
-
-
-def test_classes_that_are_not_the_maps_are_refused() -> None:
-    ids = even_map().label_set.ids
-    sessions = OdometrySessions(even_map(), lambda frame: np.full((30, 40), ids[-1], np.uint8), own_first=False)
+def test_classes_that_are_not_the_maps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    last = even().label_set.ids[-1]
+    monkeypatch.setattr(even(), "classify", lambda frame: np.full((30, 40), last, np.uint8))
+    sessions = OdometrySessions(even(), own_first=False)
     for frame in walk()[1:8:2]:
         assert not sessions.take(abroad(frame)).ready
     assert sessions.refused["classes"] >= 3
@@ -129,35 +120,37 @@ def test_classes_that_are_not_the_maps_are_refused() -> None:
 def test_frames_are_found_where_a_correction_has_moved_the_map() -> None:
     settings = with_settings(SETTINGS, history=with_settings(SETTINGS.history, max_frames=50))
     session = MapSession(Mapper.load(None, settings), stream_labels=None)
-    for frame in walk()[:8:2]:
+    for frame in walk()[:10:2]:
         session.process(frame)
     shift = np.eye(4)
     shift[:3, 3] = 0.0, 0.5, 0.0
-    poses = {f.stamp_ns: shift @ f.T_world_camera for f in walk()[:8:2]}
+    poses = {f.stamp_ns: shift @ f.T_world_camera for f in walk()[:10:2]}
     session.pipeline.corrector.start(poses, until_ns=ALWAYS)
+    assert not session.process(abroad(walk()[1])), "the map is about to move"
+    assert session.odometry_sessions.reason == "the map is being corrected"
     while session.pipeline.corrector.advance(8):
         pass
     results: list[MapUpdate | Refusal] = []
-    for frame in walk()[1:8:2]:
+    for frame in walk()[3:10:2]:
         results += session.process(abroad(frame))
     last = session.pipeline.pose_in_map.last
     assert results and last is not None and last.T_map_camera is not None
-    assert off(last.T_map_camera, shift @ walk()[7].T_world_camera)[0] < 0.05
+    assert off(last.T_map_camera, shift @ walk()[9].T_world_camera)[0] < 0.05
 
 
 def test_two_maps_of_a_room_find_each_other_and_others_do_not() -> None:
     session = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)
     for frame in walk()[1::2]:
         session.process(abroad(frame))
-    found = find_alignment(even_map(), session.pipeline.voxel_map)
+    found = find_alignment(even().voxel_map, session.pipeline.voxel_map)
     with pytest.raises(MapError, match="would count twice"):
-        even_map().merged(even_map(), np.eye(4))
+        even().voxel_map.merged(even().voxel_map, np.eye(4))
     moved, turned = off(found.T_map_other @ other_world(), np.eye(4))
     assert found.agreeing >= 3 and moved < 0.004 and turned < 0.1  # single views leave 5 to 12 mm
     elsewhere = MapSession(Mapper.load(None, SETTINGS), stream_labels=None)
     for frame in walk(TRAIN_SEEDS[19], 8)[::3]:
         elsewhere.process(frame)
     with pytest.raises(MapError, match=r"of the second \d+ were found"):
-        find_alignment(even_map(), elsewhere.pipeline.voxel_map)
+        find_alignment(even().voxel_map, elsewhere.pipeline.voxel_map)
     with pytest.raises(MapError, match="nothing to find itself by"):
-        find_alignment(even_map(), VoxelMap(SETTINGS.voxel_map, even_map().label_set))
+        find_alignment(even().voxel_map, VoxelMap(SETTINGS.voxel_map, even().voxel_map.label_set))

@@ -19,21 +19,6 @@ def test_open3d_loads_and_has_the_tensor_voxel_grid() -> None:
     assert load_open3d() is load_open3d()
 
 
-def test_importing_the_library_does_not_import_open3d() -> None:
-    done = run_python("import semantic_mapper.mapping.voxel_map, sys; assert 'open3d' not in sys.modules")
-    assert done.returncode == 0, done.stderr
-
-
-def test_nothing_is_printed_when_kernels_start() -> None:
-    code = (
-        "import structlog; structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(40))\n"
-        "from tests.mapping.rendered_views import *\nimport numpy as np\n"
-        "small_map().integrate(frame(), np.ones((120, 160), np.float32), None, None)"
-    )
-    done = run_python(code)
-    assert done.returncode == 0 and done.stdout == "" and "Warning" not in done.stderr, done.stderr
-
-
 def test_missing_system_library_is_named_with_the_mend(tmp_path: Path) -> None:
     package = tmp_path / "open3d"
     package.mkdir()

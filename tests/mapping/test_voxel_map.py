@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.errors import ConfigError, FrameError, MapError, PoseError, ShapeError
+from semantic_mapper.errors import ConfigError, FrameError, MapError, ShapeError
 from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -85,16 +85,6 @@ def test_tsdf_and_colour_equal_open3ds_own_integrate(shape: str) -> None:
         assert difference.max() < 0.05 and np.quantile(np.abs(mine["color"] - color)[both], 0.999) < 0.01
 
 
-def test_sphere_from_all_sides_is_a_sphere_with_its_colour() -> None:
-    voxel_map = small_map()
-    for seq, pose in enumerate(around(CENTER, 1.2, 12)):
-        voxel_map.integrate(frame(pose, seq=seq, rgb=140), sphere_depth(pose, CENTER, 0.4), None, None)
-    points = voxel_map.points()
-    off = np.abs(np.linalg.norm(points.xyz - CENTER, axis=1) - 0.4)
-    assert np.median(off) < 0.003
-    assert (points.rgb[off < 0.02] == 140).all()
-
-
 def test_one_vote_a_voxel_a_frame_near_the_surface_where_known() -> None:
     voxel_map = small_map()
     known = np.zeros((120, 160), bool)
@@ -114,17 +104,6 @@ def test_one_vote_a_voxel_a_frame_near_the_surface_where_known() -> None:
     assert (points.label[points.xyz[:, 0] < -0.05] == 9).all()
     right = points.xyz[:, 0] > 0.05
     assert (points.label[right] == 0).all() and (points.confidence[right] == 0).all()
-
-
-def test_repeated_views_are_discounted() -> None:
-    voxel_map = small_map()
-    for seq in range(20):
-        voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(0, 0.7), None)
-    points = voxel_map.points()
-    middle = np.abs(points.xyz[:, :2]).max(axis=1) < 0.05
-    n_eff = 20 / (1 + 0.75 * 19)
-    expected = 1 / (1 + 2 * (0.15 / 0.7) ** n_eff)
-    np.testing.assert_allclose(points.confidence[middle], expected, atol=0.005)
 
 
 def test_what_the_map_is_unsure_of_is_unknown_wherever_it_is_read(tmp_path: Path) -> None:
@@ -152,49 +131,6 @@ def test_what_the_map_is_unsure_of_is_unknown_wherever_it_is_read(tmp_path: Path
         assert set(np.unique(reading.label)) == {LABELS.ignore_id, 9}
     seen = strict.to_open3d().attribute("label").numpy()
     assert set(np.unique(seen).tolist()) == {LABELS.ignore_id, 9}
-
-
-def test_far_and_grazing_looks_count_less() -> None:
-    near, far = small_map(), small_map()
-    near.integrate(frame(), np.full((120, 160), 1.0, np.float32), sure(0), None)
-    far.integrate(frame(), np.full((120, 160), 4.0, np.float32), sure(0), None)
-    grazing = small_map()
-    # A floor 0.3 m below a camera that looks along it (world y points down).
-    grazing.integrate(frame(), plane_depth(np.eye(4), (0.0, 1.0, 0.0), 0.3), sure(0), None)
-    assert near.block_state()["votes"].max() > 0.99
-    assert 0.2 < far.block_state()["votes"].max() <= 0.25 + 1e-6
-    assert 0.05 < grazing.block_state()["votes"].max() < 0.6
-
-
-def test_weights_and_votes_are_capped_and_the_map_can_still_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(VoxelMapConfig, "max_weight", 4.0)
-    voxel_map = small_map()
-    for seq in range(8):
-        voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(0), None)
-    state = voxel_map.block_state()
-    assert state["weight"].max() == 4 and state["votes"].max() <= 4
-    for seq in range(12):
-        voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(1), None)
-    assert np.bincount(voxel_map.points().label).argmax() == 9
-
-
-def bad_poses() -> dict[str, NDArray[np.float64]]:
-    nan, scaled, mirrored = np.eye(4), np.eye(4), np.diag([-1.0, 1.0, 1.0, 1.0])
-    nan[0, 3] = np.nan
-    scaled[:3, :3] *= 1.1
-    return {"nan": nan, "scaled": scaled, "mirrored": mirrored}
-
-
-@pytest.mark.parametrize("kind", ["nan", "scaled", "mirrored"])
-def test_bad_pose_is_refused_and_changes_nothing(kind: str) -> None:
-    voxel_map = small_map()
-    fuse_sphere(voxel_map, 2)
-    before = voxel_map.block_state()
-    with pytest.raises(PoseError, match="seq=7"):
-        voxel_map.integrate(frame(bad_poses()[kind], seq=7), np.ones((120, 160), np.float32), None, None)
-    with pytest.raises(PoseError):
-        voxel_map.ray_cast(bad_poses()[kind], INTRINSICS)
-    assert same(before, voxel_map.block_state())
 
 
 def test_images_that_do_not_fit_are_refused_by_name() -> None:

@@ -100,7 +100,7 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
         assert eventually(lambda: running.text.count("map_saved") > saves), running.text  # it maps on
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 1, running.text  # frames that were sent while there was no recorder are lost
-        assert "of camera 'rooms' the recorder was restarted" in error_line(running.text)
+        assert "the recorder was restarted, and what was sent meanwhile is missing" in error_line(running.text)
         assert not any(map(is_alive, running.all_pids()))
     with capsys.disabled():
         print("\nback after:", ", ".join(f"{case} {seconds:.2f} s" for case, seconds in took.items()))  # noqa: T201
@@ -116,40 +116,14 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
 
 
 @pytest.mark.slow
-def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
-    long_log: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "up"
-    words = [word for setting in live_settings(long_log, weights, config) for word in ("--set", setting)]
-    with Running("up", LIVE_LAUNCH, *words, "--out", out) as running:
-        running.wait_for_line("map_saved")
-        restarts = 0
-        while not re.search(r"node_restarts .*in_s=[1-9].*node=mapper", running.text):  # so long that it is away
-            os.kill(wait_for_start(running, "mapper", restarts), signal.SIGKILL)
-            restarts += 1
-            running.wait_for_line(rf"node_restarts .*node=mapper .*restarts={restarts}\b")
-        running.process.send_signal(signal.SIGINT)
-        assert running.wait() == 1, running.text
-        assert not any(map(is_alive, running.all_pids()))
-    assert (out / "summary.json").exists(), running.text
-    assert "it had not been restarted yet when the launch ended" in error_line(running.text)
-    saved = VoxelMap.load(out / "map.npz")
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["map"]["blocks"] == saved.block_count > 0
-    assert summary["stopped_by"] and f"saved after {saved.frames} frames" in summary["restarted"]
-    assert {"map.ply", "overview.png", "report.html"} <= {path.name for path in out.iterdir()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
-def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path, signum: signal.Signals) -> None:
+def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path) -> None:
     with Running("up", alone(tmp_path, long_log)) as running:
         running.wait_for_line(r"\beye\].* playing ")
-        os.kill(wait_for_start(running, "eye", 0), signum)
+        os.kill(wait_for_start(running, "eye", 0), signal.SIGTERM)
         pid = wait_for_start(running, "eye", 1)
         assert eventually(lambda: len(re.findall(r"\beye\].* playing ", running.text)) == 2)
         for process in (running.process.pid, pid):  # as a service manager may, and terminals
-            os.kill(process, signum)
+            os.kill(process, signal.SIGTERM)
         assert running.wait() == 0, running.text
         assert not any(map(is_alive, running.all_pids()))
 
@@ -215,12 +189,6 @@ def test_top_shows_a_running_launch(watched: Running) -> None:
     assert shown["launch"]["pid"] == watched.process.pid and shown["launch"]["counters"]["restarts"] == 1
     table = run("view", "--status", f"ipc://{sockets}/launch", "--once").stdout
     assert re.search(rf"eye +\w+ +{pid} ", table)
-
-
-@pytest.mark.slow
-def test_top_says_where_there_is_nothing_to_see(tmp_path: Path) -> None:
-    assert "no socket folder of a launch" in error_line(run("view", "--status", str(tmp_path), "--once").stderr)
-    assert run("view", "--status", "--json").returncode == 2
 
 
 def test_systemd_hears_of_start_life_and_end(long_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from semantic_mapper.nodes.local_server import LocalServer
-from semantic_mapper.nodes.viewer.privacy_proxy import QuietPage
+from semantic_mapper.nodes.viewer.server import QuietPage
 
 
 class Handler(BaseHTTPRequestHandler):

@@ -18,17 +18,16 @@ from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.missing_frames import MissingFrames
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions, RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.nodes.recorder.node import run_recorder
-from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.streams import MAX_MISSED, MissingFrames, Streams
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
-from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
+from semantic_mapper.transport.messages import MAX_COUNT, EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from tests.nodes.support import write_config, write_weights
 from tests.small import INTRINSICS, tiny_frames
@@ -180,3 +179,18 @@ def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path
                 assert stranger.receive(0.2) is None
         with PublicPublisher(own, "", "") as plain:  # free again
             assert plain.public_endpoint == ""
+
+
+def test_missing_numbers_are_counted_camera_by_camera() -> None:
+    missing = MissingFrames()
+    for camera, seq in (("left", 4), ("right", 0), ("left", 7), ("right", 1), ("left", 0), ("left", 1)):
+        missing.note(camera, seq)
+    assert (missing.missed, missing.restarts) == (2, 1)
+
+
+def test_numbers_that_jump_to_the_largest_one_and_back_do_not_overflow_the_count() -> None:
+    missing = MissingFrames()
+    for seq in (0, 2**62, 0, MAX_COUNT, 0, 2**62, MAX_COUNT, MAX_COUNT, 0):
+        missing.note("eye", seq)
+    assert (missing.missed, missing.restarts) == (MAX_MISSED, 4)
+    assert missing.missed + MAX_MISSED < MAX_COUNT  # sums of it can be sent, too

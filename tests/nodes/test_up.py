@@ -131,18 +131,6 @@ def test_nodes_of_a_killed_launcher_write_their_results_and_end(
 
 
 @pytest.mark.slow
-def test_frozen_node_is_found_out_and_killed(long_log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
-    settings = (*_settings(long_log, weights, config), "--set", "heartbeat_s=6")
-    with Running("up", REPLAY_LAUNCH, *settings, "--out", tmp_path / "up") as running:
-        running.wait_for_line("stream_begins")  # a node that starts may be silent for longer
-        os.kill(running.node_pid("camera"), signal.SIGSTOP)
-        assert running.wait() == 1, running.text
-        line = error_line(running.text)
-        assert "node 'camera'" in line and "no sign of life for 6 s" in line
-        assert not any(is_alive(pid) for pid in running.all_pids())
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "delivery"), [("fast", "all"), ("realtime", "newest")])
 def test_without_lockstep_every_frame_is_fused_or_counted_as_dropped(
     mode: str, delivery: str, weights: Path, config: Path, tmp_path: Path
@@ -175,27 +163,6 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
 
 
 @pytest.mark.slow
-def test_damage_of_a_played_log_stands_in_the_summary(weights: Path, config: Path, tmp_path: Path) -> None:
-    log = write_log(tmp_path / "hurt.mcap", repeated_frames(6))
-    data = bytearray(log.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    log.write_bytes(data)
-    done = run("up", REPLAY_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
-    assert done.returncode == 0, done.stderr
-    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
-    assert summary["frames"]["fused"] == 5 and "hurt.mcap" in summary["damaged_stretches"][0]
-
-
-@pytest.mark.slow
-def test_camera_that_cannot_start_ends_the_launch_at_once(weights: Path, config: Path, tmp_path: Path) -> None:
-    missing = tmp_path / "none.mcap"
-    done = run("up", REPLAY_LAUNCH, *_settings(missing, weights, config), "--out", tmp_path / "up")
-    assert done.returncode == 1
-    line = error_line(done.stderr)
-    assert "node 'camera'" in line and "none.mcap" in line and "did not end within" not in line
-
-
-@pytest.mark.slow
 def test_recording_to_a_file_that_exists_touches_neither_it_nor_the_map(
     log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
@@ -209,14 +176,6 @@ def test_recording_to_a_file_that_exists_touches_neither_it_nor_the_map(
 
 def _digests(folder: Path) -> dict[str, str]:
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.iterdir() if p.is_file()}
-
-
-@pytest.mark.slow
-def test_a_log_without_a_usable_frame_fails_as_replay_does(weights: Path, config: Path, tmp_path: Path) -> None:
-    skewed = [dataclasses.replace(f, T_world_camera=f.T_world_camera * 2) for f in tiny_frames(2)]
-    log = write_log(tmp_path / "skewed.mcap", skewed)
-    done = run("up", REPLAY_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
-    assert done.returncode == 1 and "none of 2 frames was mapped" in error_line(done.stderr)
 
 
 @pytest.mark.slow

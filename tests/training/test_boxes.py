@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -14,22 +13,21 @@ import torch
 
 from semantic_mapper.config import PanopticConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.scene.panoptic import Panoptic, box_config, primitive_of
+from semantic_mapper.fields.base import encoded_views
+from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.scene.primitives import Primitive
-from semantic_mapper.fields.source_views import encoded_views
 from semantic_mapper.labels import make_label_set
+from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.panoptic import fit_panoptic
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, PosedFrame
-from tests.training.test_irt import two_planes
 from tests.training.test_panoptic import SMALL
+from tests.training.two_planes import BOX_M, two_planes
 
 SET = make_label_set("deck", ["floor", "table"])
 FLOOR, TABLE = 0, 1
 FRAMES, GAP_NS = 10, 100
-BOX_M = (-2.0, -2.0, -0.5, 2.0, 2.0, 2.0)
 SHIFTS = np.linspace(-1.6, 0.0, FRAMES)  # of the deck, whose middle is at x = 0.8 m without
 
 
@@ -64,7 +62,7 @@ def start(*boxes: Primitive) -> Panoptic:
 
 @cache
 def fitted() -> Checkpoint:
-    return fit_panoptic(scene(), SET, start(deck()), SMALL)
+    return finetune(scene(), SET, start(deck()), SMALL)
 
 
 def seen(
@@ -110,17 +108,10 @@ def test_it_leaves_nothing_in_the_scene_that_stands_still() -> None:
     wrong = (render.depth_m - torch.from_numpy(ground.ravel())).abs() > 0.2
     assert (wrong & render.known).float().mean() < 0.01
     assert (things == 0).all()
-    still = model(fit_panoptic(scene(), SET, start(replace(deck(), stamps=None)), SMALL))
+    still = model(finetune(scene(), SET, start(replace(deck(), stamps=None)), SMALL))
     smeared, _ = seen(still, frame, None)
     wrong = (smeared.depth_m - torch.from_numpy(ground.ravel())).abs() > 0.2
     assert (wrong & smeared.known).float().mean() > 0.05, "as if it stood still"
-
-
-def test_beyond_its_stamps_a_box_is_nowhere() -> None:
-    last, frame = (FRAMES - 1) * GAP_NS, view(0.4, FRAMES - 1)
-    for stamp, there in ((last + 40, True), (last + 60, False), (-40, True), (-60, False), (None, False)):
-        _, things = seen(model(fitted()), frame, stamp)
-        assert bool((things == 7).any()) == there, stamp
 
 
 def test_between_stamps_a_box_is_on_the_way() -> None:
@@ -131,28 +122,9 @@ def test_between_stamps_a_box_is_on_the_way() -> None:
     np.testing.assert_array_equal(unsorted.pose_at(3 * GAP_NS), deck_pose(3))
 
 
-def test_weights_keep_what_is_in_boxes_that_move(tmp_path: Path) -> None:
-    save_checkpoint(fitted(), tmp_path / "w.safetensors")
-    loaded = model(load_checkpoint(tmp_path / "w.safetensors"))
-    assert primitive_of(loaded.shape.boxes[0]).moves
-    frame = view(0.4, 3)
-    (before, things), (after, same) = (seen(f, frame, frame.stamp_ns) for f in (model(fitted()), loaded))
-    assert (things == same).float().mean() > 0.995 and (things == 7).any()
-    assert (before.depth_m - after.depth_m).abs().quantile(0.99) < 0.01, "they are stored as float16"
-
-
-def test_measured_depth_says_whether_a_pixel_is_of_the_box() -> None:
-    frame = view(0.4, 5)
-    assert frame.label is not None and frame.depth_m is not None
-    truth = torch.from_numpy(frame.label.ravel() == SET.ids[TABLE])
-    render, things = seen(model(fitted()), frame, frame.stamp_ns, torch.from_numpy(frame.depth_m.ravel()))
-    assert ((render.logits.argmax(1) == TABLE) == truth).float().mean() > 0.99
-    assert ((things == 7) == truth).float().mean() > 0.99
-
-
 def test_without_depth_the_core_of_a_box_is_full() -> None:
     config = msgspec.structs.replace(SMALL, steps=10, grid=msgspec.structs.replace(SMALL.grid, box_m=BOX_M))
-    field = model(fit_panoptic([replace(f, depth_m=None) for f in scene()], SET, start(deck()), config))
+    field = model(finetune([replace(f, depth_m=None) for f in scene()], SET, start(deck()), config))
     frame = view(0.4, 3)
     _, things = seen(field, frame, frame.stamp_ns)
     assert frame.label is not None
@@ -163,8 +135,8 @@ def test_without_depth_the_core_of_a_box_is_full() -> None:
 def test_a_box_that_no_frame_shows_at_its_times_is_left_out() -> None:
     config = msgspec.structs.replace(SMALL, steps=2)
     away = replace(deck(), id=8, stamps=((900_000_000, deck_pose(0)),))
-    checkpoint = fit_panoptic(scene(), SET, start(deck(), away), config)
+    checkpoint = finetune(scene(), SET, start(deck(), away), config)
     assert [b.id for b in model(checkpoint).shape.boxes] == [7]
     assert (checkpoint.recipe["panoptic"]["moving"], checkpoint.recipe["panoptic"]["lost"]) == (1, 1)
     with pytest.raises(ConfigError, match="no frame shows them at the times of their stamps"):
-        fit_panoptic(scene(), SET, start(away), config)
+        finetune(scene(), SET, start(away), config)

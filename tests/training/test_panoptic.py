@@ -13,24 +13,19 @@ import torch
 
 from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
+from semantic_mapper.fields.base import encoded_views
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.scene.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
 from semantic_mapper.fields.scene.primitives import Primitive
-from semantic_mapper.fields.source_views import encoded_views
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.training.boxes import boxes_in_view
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig, StepConfig
+from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.panoptic import (
-    fit_panoptic,
-    held_out_unlabelled,
-    semantic_losses,
-)
+from semantic_mapper.training.panoptic import boxes_in_view, held_out_unlabelled, semantic_losses
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, RayBatch
-from tests.training.test_irt import two_planes
+from tests.training.two_planes import two_planes
 
 SET = make_label_set("deck", ["floor", "table", "lamp", "sky"])
 FLOOR, TABLE, LAMP, SKY = 0, 1, 2, 3
@@ -74,7 +69,7 @@ def empty_field(*boxes: BoxConfig, **changes: object) -> Panoptic:
 
 @cache
 def fitted() -> Checkpoint:
-    return fitter_of("panoptic")(scene(), SET, empty_field(DECK), SMALL)
+    return finetune(scene(), SET, empty_field(DECK), SMALL)
 
 
 def answers(field: Panoptic, frame: PosedFrame) -> tuple[torch.Tensor, RayBatch]:
@@ -124,31 +119,7 @@ def test_the_recipe_says_what_boxes_cover_and_no_frame_is_held_to_be_seen() -> N
     figures = fitted().recipe["panoptic"]
     assert (figures["boxes"], figures["seen"], figures["labelled_frames"]) == (1, 1, 8)
     assert 0.05 < figures["covered"] < 0.95 and 0.95 < figures["matched"] <= 1  # lamps may be outside
-    assert figures["ambiguous"] == 0
     assert fitted().train_stamps_ns == frozenset()  # pseudo labels are no truth
-
-
-def test_true_labels_count_as_seen() -> None:
-    frames = [replace(f, label_is_pseudo=False) for f in scene()]
-    config = msgspec.structs.replace(SMALL, steps=2)
-    assert fit_panoptic(frames, SET, empty_field(DECK), config).train_stamps_ns == frozenset(range(8))
-
-
-def test_weights_keep_boxes(tmp_path: Path) -> None:
-    save_checkpoint(fitted(), tmp_path / "w.safetensors")
-    loaded, field = load_checkpoint(tmp_path / "w.safetensors").model, fitted().model
-    assert isinstance(loaded, Panoptic) and loaded.shape.boxes == (DECK,) and isinstance(field, Panoptic)
-    assert (answers(loaded, scene()[1])[0] == answers(field, scene()[1])[0]).float().mean() > 0.99
-
-
-def test_labels_alone_teach_where_there_are_no_boxes() -> None:
-    losses = msgspec.structs.replace(SMALL.panoptic, fixed=0.0, points=0.0)
-    config = msgspec.structs.replace(SMALL, steps=4, panoptic=losses)
-    checkpoint = fit_panoptic(scene(), SET, empty_field(), config)
-    assert isinstance(checkpoint.model, Panoptic)
-    assert {LAMP, FLOOR} & set(answers(checkpoint.model, scene()[0])[0].tolist())
-    figures = checkpoint.recipe["panoptic"]
-    assert (figures["boxes"], figures["covered"], figures["matched"]) == (0, 0.0, 1.0)
 
 
 def gradients(
@@ -180,12 +151,6 @@ def test_a_pseudo_label_off_every_primitive_has_no_gradient(uncovered: str) -> N
     # Of a class without any box: it may be outside, where anything may be.
     for gradient in gradients(empty_field(DECK, uncovered=uncovered), away, LAMP):
         assert gradient is not None and bool((gradient != 0).any()) == (uncovered == "stuff")
-
-
-def test_a_pseudo_label_moves_density_into_its_box() -> None:
-    density, _ = gradients(empty_field(DECK), (0.8, 0.0, 2.0), TABLE, learned=0.0)
-    column = density[28, 20, :, 0]  # x = 0.8, y = 0; vertices from z = -0.5 on, 0.1 apart
-    assert (column[11:15] < 0).all() and (column[18:23] > 0).all()
 
 
 def test_merged_classes_share_a_pseudo_label() -> None:
@@ -227,13 +192,6 @@ def test_near_the_faces_of_a_box_its_class_and_what_needs_no_box_are_possible() 
     assert exact.classes[0].tolist() == [[0.0] * 4, [0.0] * 4, table, table, table]
 
 
-def test_in_the_core_of_a_box_others_have_a_say_where_it_holds_their_centre() -> None:
-    within, above = box(8, "lamp", (0.8, 0.0, 0.75), (0.2, 0.2, 0.2)), box(9, "lamp", (0.8, 0.0, 1.1), (0.3, 0.3, 0.3))
-    # Near the bottom of the upper lamp, near the top of the lower one, and inside of that.
-    found = along_a_ray(empty_field(DECK, within, above), 1.045, 1.13, 1.25)
-    assert found.classes[0].tolist() == [[0, 1, 0, 0], [0, 1, 1, 0], [0, 1, 1, 0]]
-
-
 def test_of_overlapping_boxes_of_a_class_the_nearer_centre_has_the_point() -> None:
     left, right = box(3, "table", (-0.4, 0, 0.5), (1, 1, 1)), box(4, "table", (0.4, 0, 0.5), (1, 1, 1))
     field = empty_field(left, right)
@@ -248,16 +206,6 @@ def test_of_overlapping_boxes_of_a_class_the_nearer_centre_has_the_point() -> No
     rays = RayBatch(origin, down, 0 * x + 0.1, 0 * x + 9, 0 * x)
     assert field.instances(rays, torch.full((5,), TABLE)).tolist() == [3, 3, 4, 4, 0]
     assert field.instances(rays, torch.full((5,), FLOOR)).tolist() == [0] * 5
-
-
-def test_where_nothing_may_be_outside_the_grid_is_empty() -> None:
-    config = msgspec.structs.replace(SMALL, steps=20)
-    floor = box(2, "floor", (0.0, 0.0, -0.1), (8.0, 8.0, 0.5))
-    field = fit_panoptic(scene(), SET, empty_field(DECK, floor, uncovered="empty"), config).model
-    assert isinstance(field, Panoptic)
-    solid, opaque = field.solid(), field.grid.alpha() > 1e-3
-    assert solid.any() and not solid.all()
-    assert not (opaque & ~solid).any() and (opaque & solid).any()
 
 
 def test_boxes_that_no_frame_can_see_are_left_out_wherever_they_move() -> None:
@@ -287,9 +235,7 @@ def test_frames_without_labels_are_those_that_are_held_out() -> None:
 @pytest.mark.parametrize("joint", [0, 2])
 def test_a_stop_before_classes_are_learned_leaves_what_the_boxes_say(joint: int, tmp_path: Path) -> None:
     done: list[FitProgress] = []
-    stopped = fit_panoptic(
-        scene(), SET, empty_field(DECK), SMALL, done.append, lambda: len(done) >= SMALL.steps + joint
-    )
+    stopped = finetune(scene(), SET, empty_field(DECK), SMALL, done.append, lambda: len(done) >= SMALL.steps + joint)
     assert (stopped.recipe["grid_steps"], stopped.recipe["steps"]) == (SMALL.steps, joint)
     save_checkpoint(stopped, tmp_path / "w.safetensors")
     field = load_checkpoint(tmp_path / "w.safetensors").model
@@ -301,26 +247,22 @@ def test_a_stop_before_classes_are_learned_leaves_what_the_boxes_say(joint: int,
     assert (said[deck] == TABLE).float().mean() > 0.9
 
 
-def test_boxes_survive_the_config() -> None:
-    assert box_config(primitive_of(DECK)) == DECK
-
-
 def test_what_cannot_be_fitted_is_refused() -> None:
     far = box(1, "table", (90.0, 0.0, 0.0), (1, 1, 1))
     with pytest.raises(ConfigError, match=r"boxes lie from \(89.46, .*cameras from .*world frame\?"):
-        fit_panoptic(scene(), SET, empty_field(far), SMALL)
+        finetune(scene(), SET, empty_field(far), SMALL)
     with pytest.raises(ConfigError, match="needs boxes"):
-        fit_panoptic(scene(), SET, empty_field(), SMALL)
+        finetune(scene(), SET, empty_field(), SMALL)
     with pytest.raises(FrameError, match="no frame has a pseudo label"):
-        fit_panoptic(scene(False), SET, empty_field(DECK), SMALL)
+        finetune(scene(False), SET, empty_field(DECK), SMALL)
     only_lamps = [replace(f, label=np.full((48, 64), SET.ids[LAMP], np.uint8)) for f in scene()]
     with pytest.raises(ConfigError, match=r"no class in common: labels say lamp, boxes table"):
-        fit_panoptic(only_lamps, SET, empty_field(DECK), SMALL)
+        finetune(only_lamps, SET, empty_field(DECK), SMALL)
     unknown = [replace(f, label=np.full((48, 64), SET.ignore_id, np.uint8)) for f in scene()]
     with pytest.raises(FrameError, match=r"all pixels of all 8 pseudo labels are unknown \(id 0\)"):
-        fit_panoptic(unknown, SET, empty_field(DECK), SMALL)
+        finetune(unknown, SET, empty_field(DECK), SMALL)
     other = make_label_set("other", ["floor", "table"])
     with pytest.raises(WeightsError, match=r"'deck'.*'other'"):
-        fit_panoptic(scene(), other, empty_field(DECK), SMALL)
+        finetune(scene(), other, empty_field(DECK), SMALL)
     with pytest.raises(LabelError, match="a box is of class 'table'"):
         Panoptic(PanopticConfig(boxes=(DECK,)), make_label_set("none", ["floor"]))

@@ -30,12 +30,6 @@ def test_labelled_frames_are_not_suggested_and_what_they_show_counts_nothing():
     assert suggest_frames(frames, 2, [0, 2, 3]) == []
 
 
-def test_weights_of_pixels_decide_where_they_are_given():
-    frames = [candidate(1, 2, 3), candidate(8, 9)]
-    weights = [np.full(3, 0.1), np.ones(2)]
-    assert [s.index for s in suggest_frames(frames, 2, weights=weights)] == [1, 0]
-
-
 def test_suggestions_without_depth_are_spread_over_time():
     frames = [candidate(stamp_ns=stamp) for stamp in (0, 10, 20, 30, 40, 50, 60, 70, 80)]
     found = suggest_frames(frames, 3)
@@ -55,23 +49,8 @@ def test_suggested_frames_of_a_room_show_more_than_others():
     assert again == found, "labels play no part"
 
 
-def test_chosen_keyframes_cover_different_places():
-    def cells(start: int) -> np.ndarray:
-        return np.stack([np.arange(start, start + 50), np.zeros(50, int), np.zeros(50, int)], axis=1)
-
-    candidates = [Candidate(i, cells(start)) for i, start in enumerate([0, 1, 2, 100, 101, 200])]
-    chosen = choose_keyframes(candidates, 3, seed=0)
-    assert len(set(chosen) & {0, 1, 2}) == 1 and len(set(chosen) & {3, 4}) == 1 and 5 in chosen
-
-
 def test_choice_is_decided_by_the_seed_and_gives_as_many_as_asked():
     candidates = [candidate_from_frame(f) for f in tiny_frames(6)]
     assert choose_keyframes(candidates, 4, 3) == choose_keyframes(candidates, 4, 3)
     assert len(choose_keyframes(candidates, 4, 3)) == 4
     assert choose_keyframes(candidates, 99, 0) == list(range(6))
-
-
-def test_frames_without_depth_are_spread_over_time():
-    blind = [Candidate(i, np.zeros((0, 3), np.int64)) for i in range(100)]
-    chosen = choose_keyframes(blind, 4, 0)
-    assert len(chosen) == 4 and min(np.diff(chosen)) >= 15

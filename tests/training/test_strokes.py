@@ -3,9 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from semantic_mapper.errors import FrameError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
@@ -60,9 +58,3 @@ def test_what_no_stroke_reaches_stays_unlabelled_and_what_is_painted_stays() -> 
     assert (grown.label[30:90, 65:95] == ROOMS.ignore_id).all()
     assert (grown.label[label != ROOMS.ignore_id] == label[label != ROOMS.ignore_id]).all()
     assert labelled_fraction([grown], ROOMS) > 5 * labelled_fraction([given], ROOMS)
-
-
-def test_a_frame_without_label_image_is_refused() -> None:
-    bare = replace(frame(np.zeros((H, W, 3), np.uint8), None), label=None)
-    with pytest.raises(FrameError, match="no label image"):
-        grow_strokes(bare, ROOMS)

@@ -5,49 +5,25 @@ import pytest
 import torch
 
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.losses import ray_loss, semantic_loss
-from semantic_mapper.training.step import pick_views
+from semantic_mapper.training.finetune import pick_views
+from semantic_mapper.training.losses import semantic_loss
 from semantic_mapper.training.views import (
     LabelledView,
-    RayTargets,
     draw_pixels,
-    jitter_colours,
     query_rays,
-    stack_sources,
     view_from_frame,
     view_overlap,
-    withhold_depth,
 )
-from semantic_mapper.types import CameraIntrinsics, FieldRender
+from semantic_mapper.types import CameraIntrinsics
 from tests.small import tiny_frames
 
 CAMERA = CameraIntrinsics(40.0, 40.0, 23.5, 15.5, 48, 32)
-
-
-def render(logits: torch.Tensor, known: torch.Tensor | None = None) -> FieldRender:
-    n = len(logits)
-    known = torch.ones(n, dtype=torch.bool) if known is None else known
-    return FieldRender(logits, torch.full((n,), 2.0), torch.ones(n), torch.full((n, 3), 0.5), torch.zeros(n), known)
 
 
 def test_cross_entropy_matches_a_hand_computed_case_with_ignored_rays():
     logits = torch.tensor([[0.0, math.log(3)], [5.0, -5.0], [0.0, 0.0]])
     loss = semantic_loss(logits, torch.tensor([1, -1, 0]))
     torch.testing.assert_close(loss, torch.tensor((math.log(4 / 3) + math.log(2)) / 2))
-
-
-def test_all_rays_ignored_gives_zero_loss_with_zero_gradient():
-    logits = torch.randn(3, 2, requires_grad=True)
-    semantic_loss(logits, torch.full((3,), -1)).backward()
-    assert logits.grad.abs().max() == 0
-
-
-def test_unknown_rays_do_not_count():
-    targets = RayTargets(torch.tensor([0, 1]), torch.full((2, 3), 0.5), torch.tensor([2.0, 2.0]))
-    logits = torch.tensor([[9.0, -9.0], [9.0, -9.0]])
-    both = ray_loss(render(logits), targets)
-    first = ray_loss(render(logits, torch.tensor([True, False])), targets)
-    assert both.semantic > 5 and first.semantic < 1e-3
 
 
 def test_balanced_draws_show_rare_classes_as_often_as_common_ones():
@@ -76,16 +52,6 @@ def test_query_rays_carry_the_targets_of_their_pixels():
     torch.testing.assert_close(k.fx * camera[0] / camera[2] + k.cx, torch.tensor(float(u)), atol=1e-3, rtol=1e-4)
 
 
-def test_depth_is_withheld_by_view_and_colours_stay_in_range():
-    sources = stack_sources([view_from_frame(f, ROOMS, 96) for f in tiny_frames()])
-    generator = torch.Generator().manual_seed(0)
-    assert withhold_depth(sources, 1.0, generator).depth_m.max() == 0
-    assert torch.equal(withhold_depth(sources, 0.0, generator).depth_m, sources.depth_m)
-    jittered = jitter_colours(sources, 0.3, generator).rgb
-    assert jittered.min() >= 0 and jittered.max() <= 1
-    assert not torch.equal(jittered, sources.rgb)
-
-
 def view(x: float, *, turned: bool = False, depth_m: float = 2.0) -> LabelledView:
     """A camera ``x`` metres to the right that sees a wall 2 m ahead (2.4 m wide), or looks away from it."""
     T = torch.eye(4)
@@ -103,19 +69,6 @@ def test_overlap_is_the_share_of_a_view_that_another_sees():
     assert overlap[0, 1] == pytest.approx(0.75, abs=0.05), "moved by a quarter of the width"
     assert overlap[1, 0] == pytest.approx(0.75, abs=0.05)
     assert overlap[0, 2] == overlap[2, 0] == 0
-
-
-def test_what_is_hidden_is_not_seen():
-    blocked = view(0.0)
-    blocked.depth_m[:, :24] = 0.5  # something before the left half
-    overlap = view_overlap([view(0.0), blocked])
-    assert overlap[0, 1] == pytest.approx(0.5, abs=0.05)
-
-
-def test_without_depth_views_overlap_where_their_frusta_do():
-    overlap = view_overlap([view(0.0, depth_m=0.0), view(0.3, depth_m=0.0), view(0.0, turned=True, depth_m=0.0)])
-    assert overlap[0, 1] > 0.5
-    assert overlap[0, 2] == 0
 
 
 def test_source_views_are_drawn_by_what_they_see_of_the_query():

@@ -11,7 +11,7 @@ from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.views.view_renderer import ViewRenderer
+from semantic_mapper.mapping.rendering import ViewRenderer
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.small import INTRINSICS, tiny_config, tiny_field, tiny_frames

@@ -4,14 +4,15 @@ import pytest
 import torch
 
 from research.peers.neuray import NeuRay, visibility_share
-from semantic_mapper.fields.sray_layers import contextual_space
-from semantic_mapper.fields.volume import weighted_moments
+from research.peers.rendering import weighted_moments
+from research.tests.peers.tiny_peers import tiny_peer
+from semantic_mapper.fields.sray import contextual_space
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
-from tests.fields.tiny_fields import AWAY, POSES, assert_gradients_are_right, assert_unknown, tiny
+from tests.fields.tiny_fields import AWAY, POSES, assert_gradients_are_right, assert_unknown
 
 
 def neuray() -> NeuRay:
-    field = tiny("neuray")
+    field = tiny_peer("neuray")
     assert isinstance(field, NeuRay)
     return field
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from research.peers.semantic_nerf import SemanticNeRF, config_for_scene
+from research.tests.peers.tiny_peers import tiny_peer
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.scene.grid import encode_frequencies, encoded_size
 from semantic_mapper.fields.volume import sample_guided
@@ -9,11 +10,11 @@ from semantic_mapper.training.losses import ray_loss
 from semantic_mapper.training.views import RayTargets
 from semantic_mapper.types import RayBatch
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
-from tests.fields.tiny_fields import POSES, assert_gradients_are_right, assert_unknown, tiny
+from tests.fields.tiny_fields import POSES, assert_gradients_are_right, assert_unknown
 
 
 def semantic_nerf() -> SemanticNeRF:
-    field = tiny("semantic_nerf")
+    field = tiny_peer("semantic_nerf")
     assert isinstance(field, SemanticNeRF)
     return field
 

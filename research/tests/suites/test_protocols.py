@@ -18,6 +18,7 @@ from research.suites.protocols import (
     run_room,
 )
 from research.suites.rooms import as_given
+from research.suites.scene_box import scene_config
 from research.suites.scoring import from_rows
 from research.tests.suites.tiny import tiny_contestant, tiny_room, tiny_suite
 from semantic_mapper.errors import ConfigError
@@ -218,7 +219,7 @@ def test_a_kind_for_one_scene_is_fitted_in_a_box_round_what_the_keyframes_see() 
     assert after.total_accuracy > 0
     room = tiny_room()
     views = stack_sources([view_from_frame(room.frames[n], ROOMS, 48) for n in result.record.keyframes])
-    box = entry.field.scene_config(views, suite.tier.guided.far_m)
+    box = scene_config(entry.field, views, suite.tier.guided.far_m)
     assert box.half_extent_m < entry.field.config.half_extent_m
     depth_m = max(float(room.frames[n].depth_m.max()) for n in result.record.keyframes)
     assert 0.5 * depth_m < box.half_extent_m

@@ -73,7 +73,7 @@ def test_a_frozen_colour_network_keeps_weights_and_statistics_while_the_other_le
     views = SourceViews(
         views.rgb, views.depth_m * torch.tensor([1.0, 1, 0, 0])[:, None, None], views.K, views.T_world_camera
     )
-    encoder.freeze_colours(True)
+    encoder.freeze(encoder.colour_net)
     before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
     optimiser = torch.optim.AdamW(encoder.parameters(), lr=0.1)
     with encoder.batch_statistics():
@@ -83,7 +83,7 @@ def test_a_frozen_colour_network_keeps_weights_and_statistics_while_the_other_le
         name.split(".")[0] for name, tensor in encoder.state_dict().items() if not torch.equal(tensor, before[name])
     }
     assert changed == {"depth_net"}
-    encoder.freeze_colours(False)
+    encoder.freeze()
     with encoder.batch_statistics():
         encoder(views).square().mean().backward()
     assert all(p.grad is not None for p in encoder.colour_net.parameters())

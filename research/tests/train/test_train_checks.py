@@ -12,7 +12,7 @@ from research.train.train_checks import check_field
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.types import SourceViews

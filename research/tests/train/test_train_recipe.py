@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from research.experiments import peers
+from research.peers.kinds import build_field
 from research.train.recipe import git_revision
 from research.train.train_config import TrainConfig
 from semantic_mapper.config import load_config
-from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 
 ROOT = Path(__file__).resolve().parents[3]

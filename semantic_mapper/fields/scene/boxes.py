@@ -57,18 +57,13 @@ def ray_intervals(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Intervals:
-    """Where R rays are inside of primitives: at most M intervals each, by ascending ``enter``.
+    """Where R rays are inside of primitives: at most M intervals each, by ascending ``enter``."""
 
-    Args:
-        enter, leave: (R, M) float32 metres of z; infinite after the last interval.
-        index: (R, M) int64 position of the primitive; -1 after the last.
-        count: (R,) int64 how many there are; those beyond M are left out.
-    """
-
+    # (R, M) float32 metres of z; infinite after the last interval
     enter: torch.Tensor
     leave: torch.Tensor
-    index: torch.Tensor
-    count: torch.Tensor
+    index: torch.Tensor  # (R, M) int64 position of the primitive; -1 after the last
+    count: torch.Tensor  # (R,) int64 how many there are; those beyond M are left out
 
     def inside(self, z: torch.Tensor) -> torch.Tensor:
         """Whether samples at z (R, K) are in intervals: (R, K, M) bool."""
@@ -153,19 +148,12 @@ def _array(tensor: torch.Tensor) -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaysInBox:
-    """Those of R rays that meet a box at its place at their time.
+    """Those of R rays that meet a box at its place at their time."""
 
-    Args:
-        number: Of the box.
-        ray: (N,) int64 which rays.
-        rays: (N,) in the box's axes; z is that of the camera, as in the world.
-        found: Where they are inside.
-    """
-
-    number: int
-    ray: torch.Tensor
-    rays: RayBatch
-    found: Intervals
+    number: int  # of the box
+    ray: torch.Tensor  # (N,) int64 which rays
+    rays: RayBatch  # (N,) in the box's axes; z is that of the camera, as in the world
+    found: Intervals  # where they are inside
 
 
 class MovingBoxes(nn.Module):

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from semantic_mapper.config import GridConfig, GridFieldConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.march import (
     BIAS,
@@ -33,7 +33,6 @@ from semantic_mapper.fields.scene.march import (
     gather,
     march,
 )
-from semantic_mapper.fields.source_views import check_views, encoded_views, seen_bounds
 from semantic_mapper.fields.volume import composite_depth, field_render, interval_lengths
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -46,8 +45,6 @@ NOTHING = -10.0  # raw density of what is empty: an opacity of 5e-8
 POSITION_FREQUENCIES, DIRECTION_FREQUENCIES = 4, 2
 COLOUR_WIDTH = 64
 FEATURE_START = 0.1  # standard deviation
-DENSITY_START = 2.0  # log density of an untrained network: 7 / m, a third of the light gone after 5 cm
-DENSITY_LIMIT = 8.0  # 3,000 / m: opaque within 1 mm, and no overflow
 OPAQUE = 0.5  # opacity from which on a ray has met something
 
 
@@ -79,10 +76,7 @@ class SceneGrid(nn.Module):
 
     def rays(self, rays: RayBatch, jitter: torch.Tensor | None = None) -> GridRays:
         """Rays (R,) of the world in voxels.
-
-        Args:
-            jitter: (R,) place of samples in their intervals, 0 to 1; None = the middle.
-        """
+        ``jitter``: (R,) place of samples in their intervals, 0 to 1; None = the middle."""
         origin = (rays.origin - rays.origin.new_tensor(self.config.origin_m)) / self.config.voxel_m
         middle = torch.full_like(rays.near_m, 0.5) if jitter is None else jitter
         direction = rays.direction / self.config.voxel_m
@@ -176,11 +170,7 @@ def grid_box(
 
 
 def check_grid(config: GridConfig) -> None:
-    """Refuse a grid that would take too much memory.
-
-    Raises:
-        ConfigError: more than 16 M voxels.
-    """
+    """Refuse a grid that would take too much memory. Raises ConfigError: more than 16 M voxels."""
     if math.prod(config.shape) > MAX_VOXELS:
         raise ConfigError(f"a grid of {config.shape} has more than {MAX_VOXELS} voxels; raise voxel_m")
 
@@ -207,15 +197,6 @@ def encode_frequencies(x: torch.Tensor, frequencies: int) -> torch.Tensor:
 def encoded_size(dimensions: int, frequencies: int) -> int:
     """Channels that ``encode_frequencies`` gives."""
     return dimensions * (1 + 2 * frequencies)
-
-
-def density_from(raw: torch.Tensor) -> torch.Tensor:
-    """Network output -> density in 1 / m, positive.
-
-    An exponential where NeRF has a ReLU: scenes are in metres here, and samples may stand a centimetre apart, so
-    densities from 0.1 / m to 1,000 / m have to be in reach of one learning rate.
-    """
-    return torch.exp((raw + DENSITY_START).clamp(max=DENSITY_LIMIT))
 
 
 def relu_layers(c_in: int, width: int, count: int) -> nn.Sequential:
@@ -264,22 +245,14 @@ class Trunk(nn.Module):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaySamples:
-    """What a kind says the classes of: K samples on each of R rays.
+    """What a kind says the classes of: K samples on each of R rays."""
 
-    Args:
-        rays: The rays in the world.
-        points: (R, K, 3) voxel coordinates.
-        z: (R, K) metres.
-        weight: (R, K) compositing weights, differentiable by the grid's density.
-        light: (R,) what gets through the grid to the sky.
-        mover: (R, K) int64 number of the box that moves whose sample it is, -1 = of the scene; None = all are.
-    """
-
-    rays: RayBatch
-    points: torch.Tensor
-    z: torch.Tensor
-    weight: torch.Tensor
-    light: torch.Tensor
+    rays: RayBatch  # the rays in the world
+    points: torch.Tensor  # (R, K, 3) voxel coordinates
+    z: torch.Tensor  # (R, K) metres
+    weight: torch.Tensor  # (R, K) compositing weights, differentiable by the grid's density
+    light: torch.Tensor  # (R,) what gets through the grid to the sky
+    # (R, K) int64 number of the box that moves whose sample it is, -1 = of the scene; None = all are
     mover: torch.Tensor | None = None
 
     @property
@@ -358,17 +331,9 @@ class GridField(LearnedField):
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """The views' cameras and colours, without features: nothing of them is looked at.
-
-        Raises:
-            ShapeError: tensors that do not fit together.
-        """
+        Raises ShapeError: tensors that do not fit together."""
         check_views(views)
         return encoded_views(views, views.rgb[:, :0])
-
-    def scene_config(self, views: SourceViews, far_m: float) -> GridFieldConfig:
-        """This kind, in the box that holds what the views can see, as finely as this field's is divided."""
-        low, high = seen_bounds(views, far_m)
-        return msgspec.structs.replace(self.config, grid=grid_box(low, high, max(self.config.grid.shape)))
 
     def march(self, rays: RayBatch, kept: int = KEPT, jitter: torch.Tensor | None = None) -> RaySamples:
         """The samples of greatest weight of each ray."""

@@ -17,9 +17,8 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import GridConfig, IRTConfig, SamplingConfig
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import MIN_DEPTH_M, EncodedViews, check_views, encoded_views, own_view
 from semantic_mapper.fields.scene.grid import GridField, RaySamples, heaviest, ray_fraction, relu_layers
-from semantic_mapper.fields.source_views import MIN_DEPTH_M, check_views, encoded_views, own_view
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import RayBatch, SourceViews
 
@@ -76,7 +75,6 @@ class IRT(GridField):
     """
 
     kind = "irt"
-    reads_own_view = True
     class_rows = ("classifier.weight", "classifier.bias")
     points_of_ray: int = POINTS
     texture_net: type[TextureNet] = TextureNet
@@ -102,10 +100,7 @@ class IRT(GridField):
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """The views' cameras, colours and, as ``feature``, the texture (m, 32, H, W) of their images.
-
-        Raises:
-            ShapeError: tensors that do not fit together.
-        """
+        Raises ShapeError: tensors that do not fit together."""
         check_views(views)
         return encoded_views(views, views.rgb[:, :0] if self.texture is None else self.texture(views.rgb))
 
@@ -320,10 +315,7 @@ class CarriedLabels(nn.Module):
 
     def forward(self, xyz: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
         """Votes (R, L + 1) for points (R, 3): fractions by class, and how many there are, as n / (1 + n).
-
-        Args:
-            counted: (R, F) or (F,) weight of each frame; 0 = its labels are not known.
-        """
+        ``counted``: (R, F) or (F,) weight of each frame; 0 = its labels are not known."""
         T, K = self.T_camera_world.float(), self.K.float()
         p = torch.einsum("fij,rj->rfi", T[:, :3, :3], xyz) + T[:, :3, 3]
         z = p[..., 2]

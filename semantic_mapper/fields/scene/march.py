@@ -9,7 +9,6 @@ from __future__ import annotations
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,20 +28,12 @@ STOP_BELOW = 1e-4  # a ray ends where less of its light gets through
 
 
 class GridArrays(NamedTuple):
-    """A grid as kernels take it.
+    """A grid as kernels take it."""
 
-    Args:
-        values: (X, Y, Z, C) at the vertices, channel 0 the raw density.
-        occupied: Of each cell of ``CELL`` intervals a side, whether there may be anything in it.
-        step: Length of a sample, in voxels.
-        bias: Added to the raw density before its softplus.
-        stop_below: A ray ends where less light gets through.
-    """
-
-    values: Float32
-    occupied: UInt8
-    step: float
-    bias: float
+    values: Float32  # (X, Y, Z, C) at the vertices, channel 0 the raw density
+    occupied: UInt8  # of each cell of ``CELL`` intervals a side, whether there may be anything in it
+    step: float  # length of a sample, in voxels
+    bias: float  # added to the raw density before its softplus
     stop_below: float = STOP_BELOW
 
 
@@ -200,15 +191,8 @@ def fuse_grid_depth(
     """Average one depth image into a truncated signed distance (layers, Y, Z)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GridRays:
-    """R rays in voxels of a grid.
-
-    Args:
-        origin, direction: (R, 3); of the direction, voxels a metre of z.
-        near, far: (R,) metres of z.
-        jitter: (R,) where in its interval a sample lies, 0 to 1.
-    """
+class GridRays(NamedTuple):
+    """``RayArrays`` as tensors."""
 
     origin: torch.Tensor
     direction: torch.Tensor
@@ -218,22 +202,16 @@ class GridRays:
 
     def arrays(self) -> RayArrays:
         """For kernels."""
-        return RayArrays(*(array_of(t) for t in (self.origin, self.direction, self.near, self.far, self.jitter)))
+        return RayArrays(*map(array_of, self))
 
     def points(self, z: torch.Tensor) -> torch.Tensor:
         """Voxel coordinates (R, K, 3) at z (R, K)."""
         return self.origin[:, None] + z[..., None] * self.direction[:, None]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class March:
-    """Samples of R rays.
-
-    Args:
-        z: (R, K) metres, ascending.
-        weight: (R, K) compositing weights, 0 beyond the last sample. Differentiable.
-        light: (R,) what gets through the whole grid: 1 minus all weights, also of samples that are left out.
-    """
+class March(NamedTuple):
+    """Samples of R rays: z (R, K) in metres, ascending; compositing weights (R, K), 0 beyond the last sample; and light
+    (R,) that gets through the whole grid: 1 minus all weights, also of samples that are left out."""
 
     z: torch.Tensor
     weight: torch.Tensor
@@ -256,8 +234,7 @@ def march(values: torch.Tensor, occupied: torch.Tensor, rays: GridRays, kept: in
         raise ShapeError(f"a grid has at least 2 vertices a side and channels, got shape {tuple(values.shape)}")
     if not _is_compiled(values):
         return March(*reference_march(values, occupied, rays, kept))
-    ray_tensors = (rays.origin, rays.direction, rays.near, rays.far, rays.jitter)
-    return March(*_March.apply(values, occupied, kept, *ray_tensors))  # type: ignore[misc]
+    return March(*_March.apply(values, occupied, kept, *rays))  # type: ignore[misc]
 
 
 def gather(values: torch.Tensor, points: torch.Tensor) -> torch.Tensor:

@@ -11,6 +11,7 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,23 +42,17 @@ SKY = "sky"  # class of light that leaves the grid and meets no box, where the l
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxesOnRays:
-    """What boxes hold the K samples of R rays.
+    """What boxes hold the K samples of R rays."""
 
-    Args:
-        box: (R, K, M) bool, whether the sample is in the interval, and the box has a say there: in a core, those have
-            whose centre it holds, such as books in a shelf.
-        index: (R, M) int64 number of the box of each interval, -1 = none.
-        named: (R, K, L) classes of the boxes there: 0 or 1.
-        classes: (R, K, L) what may be there: these, and outside of the cores of boxes what needs no box: 0 or 1.
-        on_ray: (R, L) bool, classes that are anywhere on the ray.
-        behind: (R,) int64 class of light that leaves the grid: of the first box there, else sky; -1 = neither.
-    """
-
+    # (R, K, M) bool, whether the sample is in the interval, and the box has a say there: in a core, those have whose
+    # centre it holds, such as books in a shelf
     box: torch.Tensor
-    index: torch.Tensor
-    named: torch.Tensor
+    index: torch.Tensor  # (R, M) int64 number of the box of each interval, -1 = none
+    named: torch.Tensor  # (R, K, L) classes of the boxes there: 0 or 1
+    # (R, K, L) what may be there: these, and outside of the cores of boxes what needs no box: 0 or 1
     classes: torch.Tensor
-    on_ray: torch.Tensor
+    on_ray: torch.Tensor  # (R, L) bool, classes that are anywhere on the ray
+    # (R,) int64 class of light that leaves the grid: of the first box there, else sky; -1 = neither
     behind: torch.Tensor
 
     @property
@@ -310,43 +305,26 @@ def merged_classes(label_set: LabelSet, merge: Mapping[str, Sequence[str]]) -> t
 
 def box_config(primitive: Primitive) -> BoxConfig:
     """A primitive as a field keeps it."""
+    kept = {name: getattr(primitive, name) for name in BoxConfig.__struct_fields__}
+    return BoxConfig(**{name: _plain(value) for name, value in kept.items()})
 
-    def rows(array: np.ndarray | None) -> tuple[tuple[float, ...], ...] | None:
-        return None if array is None else tuple(map(tuple, array.tolist()))
 
-    return BoxConfig(
-        id=primitive.id,
-        class_name=primitive.class_name,
-        shape=primitive.shape,
-        T_world_box=rows(primitive.T_world_box),  # type: ignore[arg-type]
-        size=tuple(primitive.size.tolist()),
-        thing=primitive.thing,
-        polygon=rows(primitive.polygon),  # type: ignore[arg-type]
-        vertices=rows(primitive.vertices),  # type: ignore[arg-type]
-        faces=rows(primitive.faces),  # type: ignore[arg-type]
-        stamps=None if primitive.stamps is None else tuple((t, rows(pose)) for t, pose in primitive.stamps),  # type: ignore[arg-type]
-    )
+def _plain(value: Any) -> Any:
+    """Arrays as nested tuples."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return tuple(map(_plain, value)) if isinstance(value, (list, tuple)) else value
 
 
 def primitive_of(box: BoxConfig) -> Primitive:
     """The primitive that a field keeps."""
-
-    def floats(value: object) -> np.ndarray | None:
-        return None if value is None else np.array(value, np.float64)
-
-    faces: Int64 | None = None if box.faces is None else np.array(box.faces, np.int64)
-    return Primitive(
-        id=box.id,
-        class_name=box.class_name,
-        shape=box.shape,
-        T_world_box=np.array(box.T_world_box, np.float64),
-        size=np.array(box.size, np.float64),
-        thing=box.thing,
-        polygon=floats(box.polygon),
-        vertices=floats(box.vertices),
-        faces=faces,
-        stamps=None if box.stamps is None else tuple((t, np.array(pose, np.float64)) for t, pose in box.stamps),
-    )
+    kept = {name: getattr(box, name) for name in box.__struct_fields__}
+    for name in ("T_world_box", "size", "polygon", "vertices"):
+        kept[name] = None if kept[name] is None else np.array(kept[name], np.float64)
+    kept["faces"] = None if box.faces is None else np.array(box.faces, np.int64)
+    if box.stamps is not None:
+        kept["stamps"] = tuple((t, np.array(pose, np.float64)) for t, pose in box.stamps)
+    return Primitive(**kept)
 
 
 def _channel(channels: Mapping[str, int], name: str) -> int:

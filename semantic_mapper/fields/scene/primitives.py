@@ -26,31 +26,23 @@ ALONE_NS = 50_000_000  # a pose at one time alone holds for so long before and a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Primitive:
-    """One annotated piece of space.
+    """One annotated piece of space."""
 
-    Args:
-        id: 1 to 65535, of this primitive alone.
-        class_name: Of the label set.
-        shape: What it is, in the axes of ``T_world_box``, whose origin is the middle of its bounds (``centred``).
-        T_world_box: (4, 4) float64 pose; of one that moves, its first.
-        size: (3,) metres, the sides of a box, the diameters of an ellipsoid, the bounds of a prism or a mesh.
-        thing: Whether it is one countable thing, or part of some stuff.
-        polygon: (N, 2) metres, outline of a prism in x and y; it reaches from -size[2] / 2 to size[2] / 2 in z.
-        vertices, faces: (V, 3) float64 metres in the box's axes and (F, 3) int64, of a mesh.
-        stamps: Of one that moves: (ns, (4, 4) pose) at each time that is known.
-        frames: Of one that moves, whose times are not known: (number of a frame of its drive, (4, 4) pose) instead.
-    """
-
-    id: int
-    class_name: str
+    id: int  # 1 to 65535, of this primitive alone
+    class_name: str  # of the label set
+    # What it is, in the axes of ``T_world_box``, whose origin is the middle of its bounds (``centred``)
     shape: ShapeName
-    T_world_box: Float64
-    size: Float64
-    thing: bool
+    T_world_box: Float64  # (4, 4) float64 pose; of one that moves, its first
+    size: Float64  # (3,) metres, the sides of a box, the diameters of an ellipsoid, the bounds of a prism or a mesh
+    thing: bool  # whether it is one countable thing, or part of some stuff
+    # (N, 2) metres, outline of a prism in x and y; it reaches from -size[2] / 2 to size[2] / 2 in z
     polygon: Float64 | None = None
+    # (V, 3) float64 metres in the box's axes and (F, 3) int64, of a mesh
     vertices: Float64 | None = None
     faces: Int64 | None = None
+    # Of one that moves: (ns, (4, 4) pose) at each time that is known
     stamps: tuple[tuple[int, Float64], ...] | None = None
+    # Of one that moves, whose times are not known: (number of a frame of its drive, (4, 4) pose) instead
     frames: tuple[tuple[int, Float64], ...] | None = None
 
     @property
@@ -79,10 +71,7 @@ class Primitive:
 
     def mesh(self) -> tuple[Float64, Int64]:
         """Vertices (V, 3) float64 world metres and faces (F, 3) int64 of its closed surface, facing outwards.
-
-        Raises:
-            ConfigError: the surface is open, or has no volume.
-        """
+        Raises ConfigError: the surface is open, or has no volume."""
         vertices, faces = _local_mesh(self)
         vertices, faces = closed_mesh(vertices, faces)
         return vertices @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3], faces
@@ -244,10 +233,7 @@ def _sphere() -> tuple[Float64, Int64]:
 
 def triangulate(polygon: Float64) -> Int64:
     """Triangles (N - 2, 3) of a simple polygon (N, 2) whose corners go round anticlockwise.
-
-    Raises:
-        ConfigError: it crosses or touches itself, or all its corners lie on a line.
-    """
+    Raises ConfigError: it crosses or touches itself, or all its corners lie on a line."""
     left = list(range(len(polygon)))
     triangles: list[tuple[int, int, int]] = []
     while len(left) > 3:

@@ -1,4 +1,4 @@
-/* Surface points at the zero crossings of the TSDF; see mapping/files/extract.py. */
+/* Surface points at the zero crossings of the TSDF; see mapping/surface.py. */
 #include "grid_buffers.h"
 
 /* Where along the edge from `voxel` to the next along `axis` the TSDF is zero, in [0, 1); -1 = nowhere. `neighbours`

@@ -1,4 +1,4 @@
-/* The map seen from a pose; see mapping/views/ray_casting.py. */
+/* The map seen from a pose; see mapping/surface.py. */
 #include "camera.h"
 #include "ray_casting.h"
 

@@ -1,4 +1,4 @@
-/* Walking along a ray from block to block, by the TSDF, to the first surface; see mapping/views/ray_casting.py. */
+/* Walking along a ray from block to block, by the TSDF, to the first surface; see mapping/surface.py. */
 #pragma once
 
 #include "readout.h"

@@ -1,4 +1,4 @@
-/* Color, class and confidence of points; see mapping/views/ray_casting.py. */
+/* Color, class and confidence of points; see mapping/surface.py. */
 #include "readout.h"
 
 typedef struct {

@@ -1,4 +1,4 @@
-/* The surface of a map in patches of one block; see mapping/views/virtual_views.py. */
+/* The surface of a map in patches of one block; see mapping/virtual_views.py. */
 #include "readout.h"
 
 typedef struct {

@@ -1,4 +1,4 @@
-/* Joint bilateral upsampling of a coarse rendered view: see mapping/views/upsample.py. */
+/* Joint bilateral upsampling of a coarse rendered view: see mapping/rendering.py. */
 #include <math.h>
 #include <string.h>
 

@@ -29,7 +29,6 @@ from semantic_mapper.files import atomic_write
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
-from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, OccupancyGrid
 from semantic_mapper.types import Float32, Float64, UInt8
 
 ColorBy = Literal["rgb", "class", "confidence"]
@@ -113,19 +112,13 @@ def _escaped(name: str) -> str:
 def write_obj(
     path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials: bool, scale_known: bool = True
 ) -> tuple[Path, Path]:
-    """Write ``path`` and, next to it, the material library of the same stem (.mtl).
+    """Write ``path`` and, next to it, the material library of the same stem (.mtl); returns both.
 
     OBJ knows neither units nor an up axis: vertices are in the world frame, metres, to the micrometre. Each has its
     colour behind its position (``v x y z r g b``), as most programs read it. A face is of the class that most of its
     corners are of (the first one's where all differ); material ``ID_NAME`` stands for a class, ``ID_unknown`` for none.
-
-    Args:
-        class_materials: Whether materials have the colours of their classes; else they are white, so that programs
-            which multiply both show the colours of the vertices.
-        scale_known: Whether lengths are metres; a comment says where not.
-
-    Returns:
-        The two files.
+    Materials have the colours of their classes with ``class_materials``; else they are white, so that programs which
+    multiply both show the colours of the vertices.
 
     Raises:
         MapError: a file cannot be written.
@@ -168,14 +161,10 @@ _VERTICES, _INDICES = {"target": 34962}, {"target": 34963}  # what a part of the
 
 
 def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, scale_known: bool = True) -> None:
-    """Write a mesh as GLB: a header, one chunk of JSON, one chunk of numbers.
+    """Write a mesh with at least one face (glTF has no empty ones) as GLB: a header, a chunk of JSON, a chunk of
+    numbers.
 
-    Args:
-        path: Of the file.
-        mesh: With at least one face: glTF has no empty meshes.
-        label_set: For ``extras``.
-        up: (3,) unit vector, up in the world.
-        scale_known: Whether lengths are metres; ``extras`` say where not.
+    ``up`` (3,) is a unit vector, up in the world.
 
     Raises:
         MapError: no faces, more than 4 GiB, or the file cannot be written.
@@ -246,10 +235,9 @@ def _linear_color(rgb: UInt8) -> NDArray[np.uint16]:
 def write_npz(path: Path, points: MapPoints, label_set: LabelSet, *, scale_known: bool = True) -> None:
     """Write xyz (N, 3) float32 metres in the world, rgb (N, 3) uint8, label (N,) uint8, confidence (N,) float32.
 
-    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale, "unknown".
-
-    And of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id, label_set
-    (its name).
+    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale,
+    "unknown". Of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id,
+    label_set (its name).
 
     Raises:
         MapError: the file cannot be written.
@@ -271,56 +259,3 @@ def write_npz(path: Path, points: MapPoints, label_set: LabelSet, *, scale_known
             **measured,
             **({} if scale_known else {"scale": np.str_("unknown")}),
         )
-
-
-_FREE_GREY, _OCCUPIED_GREY, _UNKNOWN_GREY = 254, 0, 205
-_OCCUPIED_ABOVE, _FREE_BELOW = 0.65, 0.196  # of (255 - grey) / 255; nav2's own 0.25 would read unknown as free
-_UNKNOWN_RAW = 255  # mode raw: grey levels 0 to 100 are the costs themselves, and what is above is unknown
-
-
-def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
-    """Write the YAML and, next to it, the PGM of the same stem; of a grid with costs, these as ``STEM_costs``, too.
-
-    The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
-    pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.
-
-    Args:
-        path: One of the two files.
-        grid: The plan.
-
-    Returns:
-        The YAML and the PGM; then those of the costs.
-
-    Raises:
-        MapError: a file cannot be written.
-    """
-    grey = np.full(grid.cells.shape, _UNKNOWN_GREY, np.uint8)
-    grey[grid.cells == FREE] = _FREE_GREY
-    grey[grid.cells == OCCUPIED] = _OCCUPIED_GREY
-    files = _write_grid(path, grid, grey, "trinary")
-    if grid.costs is None:
-        return files
-    grey = np.where(grid.costs < 0, _UNKNOWN_RAW, grid.costs).astype(np.uint8)
-    return files + _write_grid(path.with_stem(f"{path.stem}_costs"), grid, grey, "raw")
-
-
-def _write_grid(path: Path, grid: OccupancyGrid, grey: UInt8, mode: str) -> tuple[Path, Path]:
-    picture, description = path.with_suffix(".pgm"), path.with_suffix(".yaml")
-    rows, columns = grey.shape
-    with atomic_write(picture, raises=MapError) as file:
-        file.write(f"P5\n{columns} {rows}\n255\n".encode())
-        file.write(np.ascontiguousarray(grey[::-1]).tobytes())
-    x, y = grid.origin_m
-    lines = (
-        f"image: {json.dumps(picture.name)}",
-        f"mode: {mode}",
-        f"resolution: {grid.resolution_m!r}",
-        f"origin: [{x:.6f}, {y:.6f}, 0.0]",
-        "negate: 0",
-        f"occupied_thresh: {_OCCUPIED_ABOVE}",
-        f"free_thresh: {_FREE_BELOW}",
-        f"T_grid_world: {np.round(grid.T_grid_world, 9).tolist()}",
-    )
-    with atomic_write(description, raises=MapError) as file:
-        file.write(("\n".join(lines) + "\n").encode())
-    return description, picture

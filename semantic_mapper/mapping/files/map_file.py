@@ -32,9 +32,10 @@ from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
-from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
-from semantic_mapper.mapping.storage.changes import BlockChanges, ChosenBlocks, compact_saved
+from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues, PackedBlocks, pack_blocks
+from semantic_mapper.mapping.storage.changes import BlockChanges, CopiedChanges, Decision
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
+from semantic_mapper.types import Int32, Int64
 
 FORMAT = "semantic-mapper voxel map"
 FORMAT_VERSION = 3
@@ -44,7 +45,7 @@ ADVICE = "Use another copy, or make the map again from its log with `semantic-ma
 Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 Corner = tuple[float, float, float]
 
-BlockPart = tuple[NDArray[np.int32], BlockValues]  # keys (B, 3) and voxels
+BlockPart = tuple[Int32, BlockValues]  # keys (B, 3) and voxels
 
 _MANIFEST = "manifest.json"
 _MAX_MANIFEST_BYTES = 64 << 20  # 100 million blocks
@@ -74,13 +75,8 @@ _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeEr
 
 
 class MapChunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Blocks that are stored together.
-
-    Args:
-        blocks: How many.
-        measured, voted: Their voxels with a depth measurement, and with a class vote.
-        sha256: Of the chunk's arrays, in their order.
-    """
+    """Blocks that are stored together: how many, how many of their voxels are measured and have votes, and the SHA-256
+    of their arrays in the order of the file."""
 
     blocks: Annotated[int, msgspec.Meta(ge=1, le=CHUNK_BLOCKS)]
     measured: Annotated[int, msgspec.Meta(ge=0, le=CHUNK_BLOCKS * BLOCK_VOXELS)]
@@ -89,14 +85,8 @@ class MapChunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlaceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The places that the map is found again by (``localization.places``).
-
-    Args:
-        places: How many.
-        features: Of all of them.
-        cameras: Names of the cameras that have seen them.
-        sha256: Of its arrays, in their order.
-    """
+    """The places that the map is found again by (``localization.places``), the features of all of them, and the names
+    of the cameras that have seen them."""
 
     places: NotNegative
     features: NotNegative
@@ -139,18 +129,24 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         return self.scale != SCALE_UNKNOWN
 
 
-def encode_manifest(manifest: MapManifest) -> bytes:
-    """JSON that is the same for the same map."""
-    return msgspec.json.format(msgspec.json.encode(manifest), indent=1)
-
-
 def parse_manifest(content: bytes, where: str) -> MapManifest:
     """Read a manifest and check it.
 
     Raises:
         MapError: it is not one, of another format version, or says what cannot be.
     """
-    plain = _plain(content, where)
+    try:
+        plain = msgspec.json.decode(content, type=dict[str, Any])
+        kind, version = plain["format"], plain["version"]
+    except (msgspec.DecodeError, KeyError, ValueError, RecursionError) as error:
+        raise MapError(f"{where}: not a map file: cannot be read ({error}). {ADVICE}") from error
+    if kind != FORMAT:
+        raise MapError(f"{where}: not a voxel map but '{kind}'")
+    if version != FORMAT_VERSION:
+        raise MapError(
+            f"{where}: map format {version}, this version reads format {FORMAT_VERSION}; make the map again from its "
+            "log with `semantic-mapper replay`, or read it with the version of semantic-mapper that wrote it"
+        )
     try:
         manifest = convert_config(plain, MapManifest, where)
     except ConfigError as error:
@@ -163,11 +159,6 @@ def parse_manifest(content: bytes, where: str) -> MapManifest:
         if max(chunk.measured, chunk.voted) > chunk.blocks * BLOCK_VOXELS:
             raise MapError(f"{where}: chunk {n} has more voxels than its {chunk.blocks} blocks can hold. {ADVICE}")
     return manifest
-
-
-def digest(content: bytes) -> str:
-    """SHA-256 in hex."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def write_map(
@@ -191,7 +182,7 @@ def write_map(
         MapError: the file cannot be written; one that was there before is untouched.
     """
     chunks: list[MapChunk] = []
-    corners: list[NDArray[np.int32]] = []
+    corners: list[Int32] = []
     try:
         with (
             atomic_write(path, sync="folder") as file,
@@ -206,10 +197,10 @@ def write_map(
             manifest = msgspec.structs.replace(
                 manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks), places=found
             )
-            content = encode_manifest(manifest)
+            content = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
             with archive.open(_MANIFEST, "w") as member:
                 member.write(content)
-            archive.comment = _COMMENT + digest(content).encode()
+            archive.comment = _comment(content)
     except OSError as error:
         raise MapError(
             f"{path}: cannot write the map: {error.strerror or error}. What is there is whole, the old map or the new "
@@ -275,7 +266,7 @@ class MapReader:
         last = -1
         for n, chunk in enumerate(self.manifest.chunks):
             where = f"{self._path}: chunk {n} of {len(self.manifest.chunks)}"
-            keys, values = _unpack(self._read_chunk(n, chunk, where), chunk, where)
+            keys, values = self._read_chunk(n, chunk, where)
             packed = pack_keys(keys)
             if np.abs(keys.astype(np.int64)).max() >= KEY_LIMIT or not (np.diff(packed, prepend=last) > 0).all():
                 raise MapError(f"{where}: block coordinates are out of range or not in order. {ADVICE}")
@@ -290,13 +281,23 @@ class MapReader:
             MapError: a chunk is damaged, or there is no memory.
         """
         saved = self.manifest
-        decision = (saved.label_set, saved.config.vote_discount, saved.config.unknown_below, SURFACE_WEIGHT)
+        decision = Decision(saved.label_set, saved.config.vote_discount, saved.config.unknown_below, SURFACE_WEIGHT)
         try:
-            packed = np.zeros(saved.blocks, np.int64)
-            chosen = ChosenBlocks(packed, 0, saved.frames, saved.frames, 0, *decision, saved.scale_known)
-            return compact_saved(self.parts(), chosen)
+            keys = np.empty((saved.blocks, 3), np.int32)
+            packed, frames = self._packed_into(keys), saved.frames
+            return CopiedChanges(0, frames, frames, 0, keys, decision, packed, saved.scale_known).compact()
         except MemoryError as error:
             raise MapError(f"{self._path}: no memory for its {saved.blocks:,} blocks: {error}") from error
+
+    def _packed_into(self, keys: Int32) -> Iterator[tuple[Int64, PackedBlocks]]:
+        """The blocks of ``parts``, packed, and their rows in ``keys``, which are filled."""
+        row = 0
+        for part, values in self.parts():
+            rows = np.arange(row, row + len(part))
+            keys[rows] = part
+            yield rows, pack_blocks(values, np.arange(len(part), dtype=np.int32))
+            row += len(part)
+            del values  # while the next ones are read
 
     def places(self) -> tuple[Place, ...]:
         """What the map is found again by; nothing where it does not say.
@@ -310,7 +311,7 @@ class MapReader:
         where = f"{self._path}: its places"
         one, all_ = (table.places,), table.features
         sizes = ((*one, 4, 4), one, one, one, (all_, 3), (all_, DESCRIPTOR_BYTES))
-        arrays = self._read_arrays("places", dict(zip(_PLACES, sizes, strict=True)), _PLACES, table.sha256, where)
+        arrays = self._read_arrays("places", _PLACES, sizes, table.sha256, where)
         counts, camera = arrays["features"], arrays["camera"]
         sound = (counts >= 0).all() and counts.sum() == all_ and np.isfinite(arrays["points"]).all()
         if not (sound and (camera >= 0).all() and (camera < len(table.cameras)).all()):
@@ -327,29 +328,40 @@ class MapReader:
             places.append(Place(name, stamp_ns, pose, arrays["points"][rows], arrays["descriptors"][rows]))
         return tuple(places)
 
-    def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> dict[str, NDArray[Any]]:
-        shapes = _shapes(chunk, len(self.manifest.label_set))
-        return self._read_arrays(f"{n:06d}", shapes, _ARRAYS, chunk.sha256, where)
+    def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> BlockPart:
+        mask, measured, voted = (chunk.blocks, BLOCK_VOXELS // 8), (chunk.measured,), (chunk.voted,)
+        classes = len(self.manifest.label_set)
+        shapes = ((chunk.blocks, 3), mask, mask, measured, measured, (*measured, 3), (*voted, classes), voted)
+        arrays = self._read_arrays(f"{n:06d}", _ARRAYS, shapes, chunk.sha256, where)
+        masks = {name: np.unpackbits(arrays[name], axis=1).astype(np.bool_) for name in ("measured", "voted")}
+        if any(int(mask.sum()) != getattr(chunk, name) for name, mask in masks.items()):
+            raise MapError(f"{where}: its masks and its values do not fit each other. {ADVICE}")
+        full: dict[str, NDArray[Any]] = {}
+        for name in BlockValues._fields:
+            mask = masks["voted" if name in ("evidence", "votes") else "measured"]
+            full[name] = np.zeros((*mask.shape, *arrays[name].shape[1:]), arrays[name].dtype)
+            full[name][mask] = arrays[name]
+        return arrays["keys"], BlockValues(**full)
 
     def _read_arrays(
-        self, folder: str, shapes: dict[str, tuple[int, ...]], dtypes: dict[str, str], sha256: str, where: str
+        self, folder: str, dtypes: dict[str, str], shapes: Sequence[tuple[int, ...]], sha256: str, where: str
     ) -> dict[str, NDArray[Any]]:
         arrays: dict[str, NDArray[Any]] = {}
         hashed = hashlib.sha256()
-        for name, shape in shapes.items():
-            head = _npy_head(dtypes[name], shape)
-            size = len(head) + int(np.prod(shape)) * np.dtype(dtypes[name]).itemsize
+        for (name, dtype), shape in zip(dtypes.items(), shapes, strict=True):
+            head = _npy_head(dtype, shape)
+            size = len(head) + int(np.prod(shape)) * np.dtype(dtype).itemsize
             content = _read_member(self._archive, f"{folder}/{name}.npy", size, f"{where}: {name}")
             if not content.startswith(head):
-                raise MapError(f"{where}: {name} is not an array {dtypes[name]} of shape {shape}. {ADVICE}")
+                raise MapError(f"{where}: {name} is not an array {dtype} of shape {shape}. {ADVICE}")
             hashed.update(content)
-            arrays[name] = np.frombuffer(content, dtypes[name], offset=len(head)).reshape(shape)
+            arrays[name] = np.frombuffer(content, dtype, offset=len(head)).reshape(shape)
         if hashed.hexdigest() != sha256:
             raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {ADVICE}")
         return arrays
 
 
-def _write_chunk(archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], values: BlockValues) -> MapChunk:
+def _write_chunk(archive: zipfile.ZipFile, n: int, keys: Int32, values: BlockValues) -> MapChunk:
     measured, voted = values.weight > 0, values.votes > 0
     arrays = {
         "keys": keys,
@@ -393,25 +405,6 @@ def _write_arrays(
     return hashed.hexdigest()
 
 
-def _unpack(arrays: dict[str, NDArray[Any]], chunk: MapChunk, where: str) -> BlockPart:
-    measured = np.unpackbits(arrays["measured"], axis=1).astype(np.bool_)
-    voted = np.unpackbits(arrays["voted"], axis=1).astype(np.bool_)
-    if (int(measured.sum()), int(voted.sum())) != (chunk.measured, chunk.voted):
-        raise MapError(f"{where}: its masks and its values do not fit each other. {ADVICE}")
-    full: dict[str, NDArray[Any]] = {}
-    for name in BlockValues._fields:
-        mask = voted if name in ("evidence", "votes") else measured
-        full[name] = np.zeros((*mask.shape, *arrays[name].shape[1:]), arrays[name].dtype)
-        full[name][mask] = arrays[name]
-    return arrays["keys"], BlockValues(**full)
-
-
-def _shapes(chunk: MapChunk, classes: int) -> dict[str, tuple[int, ...]]:
-    mask, measured, voted = (chunk.blocks, BLOCK_VOXELS // 8), (chunk.measured,), (chunk.voted,)
-    shapes = ((chunk.blocks, 3), mask, mask, measured, measured, (*measured, 3), (*voted, classes), voted)
-    return dict(zip(_ARRAYS, shapes, strict=True))
-
-
 def _npy_head(dtype: str, shape: tuple[int, ...]) -> bytes:
     """What stands before the values in an .npy file of version 1.0; NumPy's own differs between its versions."""
     text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape!r}, }}"
@@ -419,7 +412,7 @@ def _npy_head(dtype: str, shape: tuple[int, ...]) -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded.encode("ascii")
 
 
-def _bounds_m(corners: list[NDArray[np.int32]], voxel_size_m: float) -> Any:
+def _bounds_m(corners: list[Int32], voxel_size_m: float) -> Any:
     if not corners:
         return None
     both = np.stack((np.min(corners, axis=0), np.max(corners, axis=0))) * (BLOCK_SIDE * voxel_size_m)
@@ -441,7 +434,7 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
         end = file.read()
     if not (end.startswith(b"PK\5\6") and end[-_COMMENT_BYTES:].startswith(_COMMENT)):
         raise MapError(f"{path}: damaged: it is cut off, or something stands behind its end. {ADVICE}")
-    if archive.comment != _COMMENT + digest(content).encode():
+    if archive.comment != _comment(content):
         raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {ADVICE}")
     expected = [f"{n:06d}/{name}.npy" for n in range(len(manifest.chunks)) for name in _ARRAYS]
     expected += [] if manifest.places is None else [f"places/{name}.npy" for name in _PLACES]
@@ -471,17 +464,6 @@ def _explained(what: str) -> Iterator[None]:
         raise MapError(f"{what}: {error}. {ADVICE}") from error
 
 
-def _plain(content: bytes, where: str) -> dict[str, Any]:
-    try:
-        plain = msgspec.json.decode(content, type=dict[str, Any])
-        kind, version = plain["format"], plain["version"]
-    except (msgspec.DecodeError, KeyError, ValueError, RecursionError) as error:
-        raise MapError(f"{where}: not a map file: cannot be read ({error}). {ADVICE}") from error
-    if kind != FORMAT:
-        raise MapError(f"{where}: not a voxel map but '{kind}'")
-    if version != FORMAT_VERSION:
-        raise MapError(
-            f"{where}: map format {version}, this version reads format {FORMAT_VERSION}; make the map again from its "
-            "log with `semantic-mapper replay`, or read it with the version of semantic-mapper that wrote it"
-        )
-    return plain
+def _comment(manifest: bytes) -> bytes:
+    """Of the zip."""
+    return _COMMENT + hashlib.sha256(manifest).hexdigest().encode()

@@ -8,7 +8,6 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.localization.places import Place
@@ -16,8 +15,8 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, BlockPart, MapManifest, write_map
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import unpack_keys
-from semantic_mapper.mapping.storage.block_store import BlockValues, find_sorted, unpack_blocks
-from semantic_mapper.mapping.storage.scratch import ScratchFile
+from semantic_mapper.mapping.storage.block_store import BlockValues, ScratchFile, find_sorted, unpack_blocks
+from semantic_mapper.types import Int64
 
 MOST_IN_MEMORY = 2048  # copied blocks, some 20 KB each; of more, the first go to disk
 
@@ -100,7 +99,7 @@ class MapSnapshot:
             if self._scratch is not None:
                 self._scratch.close()
 
-    def _read(self, packed: NDArray[np.int64]) -> BlockValues:
+    def _read(self, packed: Int64) -> BlockValues:
         """Blocks (B,) bit for bit as they were."""
         if self._failure is not None:
             raise self._failure
@@ -114,7 +113,7 @@ class MapSnapshot:
         unpack_blocks([stored[key] if key in stored else self._copies[key] for key in keys], values, copied)
         return values
 
-    def _copy(self, packed: NDArray[np.int64]) -> None:
+    def _copy(self, packed: Int64) -> None:
         """Blocks (B,) are about to change."""
         rows, there = find_sorted(self._keys, packed)
         rows = np.unique(rows[there])

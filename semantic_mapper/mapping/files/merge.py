@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
@@ -24,7 +23,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid, GridBuffers
 from semantic_mapper.mapping.storage.block_index import BlockIndex, pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.block_store import BlockValues, empty_blocks
-from semantic_mapper.types import Float64, Int32
+from semantic_mapper.types import Float64, Int32, Int64
 
 MERGED_AT_ONCE = 128  # blocks
 SNAP_VOXELS = 1e-6  # a shift nearer than this to whole voxels is one: metres have been rounded on their way here
@@ -72,8 +71,7 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
     """Add all that ``source`` holds to ``target``; blocks without a measurement are left out.
 
     Args:
-        target: Is changed; of the same voxel size and classes.
-        source: Another grid.
+        target, source: Grids of the same voxel size and classes.
         T_target_source: Where the source lies.
         cap: Of weights and of votes.
         version: That the blocks are marked as changed at.
@@ -87,8 +85,8 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
 
 
 def moved_blocks(
-    source: BlockGrid, T_target_source: VoxelTransform, pairs: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.int64], BlockValues]]:
+    source: BlockGrid, T_target_source: VoxelTransform, pairs: Int64
+) -> Iterator[tuple[Int64, BlockValues]]:
     """Blocks of a target with what a source says of them; those without a measurement are left out.
 
     Args:
@@ -111,7 +109,7 @@ def moved_blocks(
             yield wanted[holds], BlockValues(*(part[holds] for part in moved))
 
 
-def add_values(target: BlockGrid, packed: NDArray[np.int64], added: BlockValues, cap: float, version: int) -> None:
+def add_values(target: BlockGrid, packed: Int64, added: BlockValues, cap: float, version: int) -> None:
     """Add blocks (B,) of ``moved_blocks`` to a grid; see ``add_blocks``.
 
     Raises:
@@ -151,7 +149,7 @@ def count_empty(source: BlockGrid) -> int:
     return empty
 
 
-def overlaps(sources: NDArray[np.int64], T_target_source: VoxelTransform) -> NDArray[np.int64]:
+def overlaps(sources: Int64, T_target_source: VoxelTransform) -> Int64:
     """Pairs (P, 2) of packed keys, sorted: a block of the target and a source block that may say something of it."""
     corners = np.array([[x, y, z] for x in (-1, BLOCK_SIDE) for y in (-1, BLOCK_SIDE) for z in (-1, BLOCK_SIDE)])
     ends = (unpack_keys(sources)[:, None] * BLOCK_SIDE + corners) @ T_target_source.R.T + T_target_source.t
@@ -159,7 +157,7 @@ def overlaps(sources: NDArray[np.int64], T_target_source: VoxelTransform) -> NDA
     first = np.floor((np.floor(ends.min(axis=1)) + 1) / BLOCK_SIDE).astype(np.int64)
     last = np.floor((np.ceil(ends.max(axis=1)) - 1) / BLOCK_SIDE).astype(np.int64)
     most = int((last - first).max(initial=0)) + 1
-    pairs: list[NDArray[np.int64]] = []
+    pairs: list[Int64] = []
     for step in np.ndindex(most, most, most):
         inside = (first + step <= last).all(axis=1)
         keys = (first[inside] + step).astype(np.int32)
@@ -168,7 +166,7 @@ def overlaps(sources: NDArray[np.int64], T_target_source: VoxelTransform) -> NDA
     return joined[np.lexsort((joined[:, 1], joined[:, 0]))]
 
 
-def _parts(pairs: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _parts(pairs: Int64) -> Iterator[tuple[Int64, Int64]]:
     """The blocks of the target, some at a time, each time with the source blocks that they need."""
     wanted, starts = np.unique(pairs[:, 0], return_index=True)
     ends = np.append(starts[1:], len(pairs))
@@ -181,15 +179,8 @@ def _parts(pairs: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], NDArra
 def _resample_blocks(
     count: int, keys: Int32, R: Float64, t: Float64, index: BlockIndex, buffers: GridBuffers, moved: BlockValues
 ) -> None:
-    """Interpolate a source at the voxels of other blocks.
-
-    Args:
-        count: B.
-        keys: (B, 3) of the blocks.
-        R, t: (3, 3) and (3,): their point p is the source's ``R @ (p - t)``, in voxels.
-        index, buffers: Of the source.
-        moved: B blocks of zeros, to fill.
-    """
+    """Interpolate a source at the voxels of other blocks (B, 3), whose point p is the source's ``R @ (p - t)`` in
+    voxels."""
     ...
 
 

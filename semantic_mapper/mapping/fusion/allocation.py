@@ -10,13 +10,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, Int64
 
 _BANDS = 8  # image bands with a key set of their own: enough to share among cores, few enough to merge at no cost
 _FIRST_CAPACITY = 1 << 13
@@ -61,7 +60,7 @@ def blocks_in_band(
     truncation_m: float,
     depth_max_m: float,
     budget: int = LEAST_FRAME_BUDGET,
-) -> NDArray[np.int64]:
+) -> Int64:
     """Packed keys (B,) of the blocks that rays cross within ``truncation_m`` of their depth, sorted, each once.
 
     Time and memory are bounded: by the pixels times ``MAX_CROSSINGS``, and by ``budget``.
@@ -113,15 +112,12 @@ def _steepest(camera: Camera, shape: tuple[int, ...]) -> float:
     return math.hypot(1.0, x, y)
 
 
-def blocks_in_view(
-    camera: Camera, size: tuple[int, int], keys: NDArray[np.int32], voxel_size_m: float, reach_m: float
-) -> NDArray[np.int64]:
+def blocks_in_view(camera: Camera, size: tuple[int, int], keys: Int32, voxel_size_m: float, reach_m: float) -> Int64:
     """Packed keys of those blocks of ``keys`` (B, 3) that a camera may see up to ``reach_m`` of z, the nearest first.
 
-    ``size`` is (height, width) of the image, which may be a small part of one far from the optical axis.
-
-    A block counts whose bounding sphere touches the frustum; the sphere is that of the block and a voxel more on each
-    side, for a point between two blocks is interpolated from both.
+    ``size`` is (height, width) of the image, which may be a small part of one far from the optical axis. A block counts
+    whose bounding sphere touches the frustum; the sphere is that of the block and a voxel more on each side, for a
+    point between two blocks is interpolated from both.
     """
     side, radius = voxel_size_m * BLOCK_SIDE, _block_radius_m(voxel_size_m)
     p = ((keys + 0.5) * side - camera.t) @ camera.R
@@ -138,22 +134,14 @@ def blocks_in_view(
     return pack_keys(keys[seen][order])
 
 
-def view_bounds(
-    camera: Camera, intrinsics: CameraIntrinsics, voxel_size_m: float, reach_m: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def blocks_within_reach(
+    camera: Camera, size: tuple[int, int], voxel_size_m: float, reach_m: float
+) -> tuple[Int64, Int64]:
     """Least and greatest block coordinates (3,) that ``blocks_in_view`` may take."""
     side, radius = voxel_size_m * BLOCK_SIDE, _block_radius_m(voxel_size_m)
-    z = np.array([-radius, reach_m + radius])
-    ends: list[Float64] = []
-    for focal, center, size in (
-        (camera.fx, camera.cx, intrinsics.width),
-        (camera.fy, camera.cy, intrinsics.height),
-    ):
-        slopes = (np.array([-0.5, size - 0.5]) - center) / focal
-        ends.append(slopes * z[:, None] + np.array([-radius, radius]) * np.hypot(1.0, slopes))  # (2 of z, 2)
-    corners = np.array([(ends[0][k, i], ends[1][k, j], z[k]) for k in (0, 1) for i in (0, 1) for j in (0, 1)])
-    blocks = (corners @ camera.R.T + camera.t) / side
-    return np.floor(blocks.min(axis=0) - 1).astype(np.int64), np.ceil(blocks.max(axis=0)).astype(np.int64)
+    reach = _steepest(camera, size) * (reach_m + radius) + radius
+    low, high = np.floor((camera.t - reach) / side), np.floor((camera.t + reach) / side)
+    return low.astype(np.int64), high.astype(np.int64)
 
 
 def _block_radius_m(voxel_size_m: float) -> float:
@@ -174,13 +162,7 @@ def _collect_block_keys(
 ) -> None:
     """Packed keys of the blocks of each of the ``bands`` that an image is cut into.
 
-    Args:
-        bands: Number of bands.
-        depth: (H, W) float32 metres.
-        camera: Of the image.
-        voxel_size_m, truncation_m, depth_max_m: Of the map.
-        slots: (bands, 2 * capacity) of -1, scratch: a hash set; the capacity is a power of two.
-        keys: (bands, capacity) to fill, in no order, each once.
-        counts: (bands,) to fill: how many; more than the capacity where there is no room for all.
+    ``slots`` (bands, 2 * capacity) of -1 is scratch, a hash set; ``keys`` (bands, capacity) are filled in no order,
+    each once; ``counts`` (bands,) are more than the capacity, a power of two, where there is no room for all.
     """
     ...

@@ -27,7 +27,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.kernels import kernel, parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
@@ -46,21 +45,13 @@ _LEVELS = 6  # squares of up to 64 cells a side
 
 
 class FusionLimits(NamedTuple):
-    """Lengths in metres, and the caps.
-
-    Args:
-        voxel_size: Edge of a voxel.
-        truncation: TSDF truncation.
-        depth_max: Farther depth is ignored.
-        vote_band: Voxels at most this far from the surface take votes.
-        max_weight: Cap of TSDF weight and of votes; beyond it old measurements fade.
-    """
+    """Lengths in metres, and the caps."""
 
     voxel_size: float
-    truncation: float
-    depth_max: float
-    vote_band: float
-    max_weight: float
+    truncation: float  # of the TSDF
+    depth_max: float  # farther depth is ignored
+    vote_band: float  # voxels at most this far from the surface take votes
+    max_weight: float  # cap of TSDF weight and of votes; beyond it old measurements fade
 
 
 class DepthBounds(NamedTuple):
@@ -102,7 +93,7 @@ def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BO
 
 def clear_in_view(
     grid: BlockGrid,
-    band: NDArray[np.int64],
+    band: Int64,
     camera: Camera,
     limits: FusionLimits,
     depth: Float32,
@@ -115,10 +106,8 @@ def clear_in_view(
     Args:
         grid: The map's storage. Blocks on disk come back where the frame may see through them.
         band: (B,) sorted packed keys of the blocks that the frame was fused into.
-        camera: Of the frame.
-        limits: Of the map.
-        depth: (H, W) float32 metres, from a sensor.
-        rgb: (H, W, 3) uint8.
+        camera, limits: Of the frame and the map.
+        depth, rgb: (H, W) float32 metres, from a sensor, and (H, W, 3) uint8.
         bounds: Of ``depth``.
         version: Of the map, for the blocks that change.
 
@@ -140,9 +129,7 @@ def clear_in_view(
             yield changing, cleared
 
 
-def _candidates(
-    grid: BlockGrid, band: NDArray[np.int64], camera: Camera, limits: FusionLimits, bounds: DepthBounds
-) -> NDArray[np.int64]:
+def _candidates(grid: BlockGrid, band: Int64, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> Int64:
     """Packed keys (B,), sorted, of blocks outside of the band that hold a surface, in front of some depth."""
     considered = grid.may_hold_surface()
     inside = find_blocks(grid.index, band)
@@ -158,16 +145,14 @@ def _candidates(
     return np.sort(np.concatenate((pack_keys(keys[slots]), stored[before > 0])))
 
 
-def _before_depth(
-    keys: NDArray[np.int32], considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds
-) -> UInt8:
+def _before_depth(keys: Int32, considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> UInt8:
     found = np.empty(len(keys), np.uint8)
     _blocks_before_depth(len(keys), keys, considered, camera, limits.voxel_size, bounds, found)
     return found
 
 
 def _clear(
-    blocks: NDArray[np.int32],
+    blocks: Int32,
     buffers: GridBuffers,
     camera: Camera,
     limits: FusionLimits,

@@ -35,7 +35,7 @@ SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surfa
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
 LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
-ProbabilityTable = tuple[Float32, NDArray[np.int32]]  # probabilities (K, L), row of each pixel (H, W), -1 = unknown
+ProbabilityTable = tuple[Float32, Int32]  # probabilities (K, L), row of each pixel (H, W), -1 = unknown
 
 _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
     "voxel_size_m": (1e-4, 10.0),
@@ -64,21 +64,15 @@ def make_limits(config: VoxelMapConfig) -> FusionLimits:
 
 
 class Votes(NamedTuple):
-    """What a frame says of classes.
+    """What a frame says of classes."""
 
-    Args:
-        log_p: (K, L) float32 log probabilities, floored.
-        rows: (H, W) int32, which row each pixel takes; looked at only where ``weights`` > 0.
-        weights: (H, W) float32 in 0..1.
-    """
-
-    log_p: Float32
-    rows: NDArray[np.int32]
-    weights: Float32
+    log_p: Float32  # (K, L) log probabilities, floored
+    rows: Int32  # (H, W) which row each pixel takes; looked at only where ``weights`` > 0
+    weights: Float32  # (H, W) in 0..1
 
 
 def make_votes(
-    probabilities: Float32, rows: NDArray[np.int32], depth: Float32, camera: Camera, depth_max: float
+    probabilities: Float32, rows: Int32, depth: Float32, camera: Camera, depth_max: float
 ) -> tuple[Votes, int]:
     """Votes of a frame, each of weight ``max(cos, 0.2) * min(1, (2 m / z)^2)``, 0 where none is due.
 
@@ -97,28 +91,29 @@ def make_votes(
     return Votes(log_p, rows, weights), int(bad.sum())
 
 
-def no_votes(height: int, width: int, classes: int) -> Votes:
-    """Of a frame without semantics: weights all 0."""
-    rows, weights = np.zeros((height, width), np.int32), np.zeros((height, width), np.float32)
-    return Votes(np.zeros((1, classes), np.float32), rows, weights)
-
-
-def check_depth(depth_m: Float32, intrinsics: CameraIntrinsics, where: str) -> Float32:
-    """Depth (H, W) as one piece of memory.
+def checked_depth(
+    depth_m: Float32, trust: Float32 | None, intrinsics: CameraIntrinsics, where: str
+) -> tuple[Float32, Float32]:
+    """Depth (H, W) as one piece of memory, without what is not trusted, and its weights as ``fuse_blocks`` takes them.
 
     Raises:
-        ShapeError: it does not fit the intrinsics, or is not float32.
+        ShapeError: depth or weights do not fit the intrinsics, are not float32, or weights are not in 0..1.
     """
-    expect_shape(depth_m, f"{intrinsics.height} {intrinsics.width}", f"{where}: depth_m")
-    _expect_dtype(depth_m, np.float32, f"{where}: depth_m")
-    return np.ascontiguousarray(depth_m)
+    size = f"{intrinsics.height} {intrinsics.width}"
+    _expect(depth_m, size, np.float32, f"{where}: depth_m")
+    if trust is None:
+        return np.ascontiguousarray(depth_m), np.empty((0, 0), np.float32)
+    _expect(trust, size, np.float32, f"{where}: trust")
+    if not ((trust >= 0) & (trust <= 1)).all():
+        raise ShapeError(f"{where}: trust must be 0 ... 1 everywhere")
+    return np.where(trust > 0, depth_m, np.float32(0)), np.ascontiguousarray(trust)
 
 
 def probability_table(
     depth: Float32,
     probabilities: Float32,
-    known: NDArray[np.bool_] | None,
-    rows: NDArray[np.int32] | None,
+    known: Bool | None,
+    rows: Int32 | None,
     classes: int,
     where: str,
 ) -> ProbabilityTable:
@@ -128,18 +123,15 @@ def probability_table(
         ShapeError: something does not fit the depth (H, W), or is of another dtype.
     """
     size = f"{depth.shape[0]} {depth.shape[1]}"
-    _expect_dtype(probabilities, np.float32, f"{where}: probabilities")
     if rows is None:
-        expect_shape(probabilities, f"{size} {classes}", f"{where}: probabilities")
+        _expect(probabilities, f"{size} {classes}", np.float32, f"{where}: probabilities")
         rows = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
         if known is not None:
-            expect_shape(known, size, f"{where}: known")
-            _expect_dtype(known, np.bool_, f"{where}: known")
+            _expect(known, size, np.bool_, f"{where}: known")
             rows[~known] = -1
     else:
-        expect_shape(probabilities, f"K {classes}", f"{where}: probabilities")
-        expect_shape(rows, size, f"{where}: rows")
-        _expect_dtype(rows, np.int32, f"{where}: rows")
+        _expect(probabilities, f"K {classes}", np.float32, f"{where}: probabilities")
+        _expect(rows, size, np.int32, f"{where}: rows")
         if known is not None or rows.min() < -1 or rows.max() >= len(probabilities):
             raise ShapeError(f"{where}: rows must be -1 ... {len(probabilities) - 1}, and known None")
     return np.ascontiguousarray(probabilities).reshape(-1, classes), np.ascontiguousarray(rows)
@@ -160,7 +152,7 @@ def frame_votes(
         FrameError: invalid probabilities.
     """
     if table is None:
-        return no_votes(depth.shape[0], depth.shape[1], classes)
+        return Votes(np.zeros((1, classes), np.float32), np.zeros(depth.shape, np.int32), np.zeros_like(depth))
     votes, bad = make_votes(*table, depth, camera, depth_max_m)
     if bad:
         raise FrameError(
@@ -170,22 +162,8 @@ def frame_votes(
     return votes if trust is None or not trust.size else votes._replace(weights=votes.weights * trust)
 
 
-def trusted_depth(depth: Float32, trust: Float32 | None, where: str) -> tuple[Float32, Float32]:
-    """Depth (H, W) without what is not trusted, and its weights as ``fuse_blocks`` takes them.
-
-    Raises:
-        ShapeError: the weights do not fit the depth, or are not float32 in 0..1.
-    """
-    if trust is None:
-        return depth, np.empty((0, 0), np.float32)
-    expect_shape(trust, f"{depth.shape[0]} {depth.shape[1]}", f"{where}: trust")
-    _expect_dtype(trust, np.float32, f"{where}: trust")
-    if not ((trust >= 0) & (trust <= 1)).all():
-        raise ShapeError(f"{where}: trust must be 0 ... 1 everywhere")
-    return np.where(trust > 0, depth, np.float32(0)), np.ascontiguousarray(trust)
-
-
-def _expect_dtype(array: NDArray[np.generic], dtype: type[np.generic], name: str) -> None:
+def _expect(array: NDArray[np.generic], shape: str, dtype: type[np.generic], name: str) -> None:
+    expect_shape(array, shape, name)
     if array.dtype != dtype:
         raise ShapeError(f"{name}: expected dtype {np.dtype(dtype).name}, got {array.dtype.name}")
 
@@ -207,11 +185,8 @@ def fuse_blocks(
 
     Args:
         indices: (B,) buffer indices of the blocks, each once.
-        buffers: Of the grid.
-        camera: Of the frame.
-        limits: Of the map.
-        depth: (H, W) float32 metres.
-        rgb: (H, W, 3) uint8.
+        buffers, camera, limits: Of the grid, the frame and the map.
+        depth, rgb: (H, W) float32 metres and (H, W, 3) uint8.
         trust: (H, W) float32 fraction of its full weight that each depth counts, or (0, 0): 1.
         votes: Of the frame.
         measured: Whether a sensor measured the depth.
@@ -244,17 +219,10 @@ def _vote_weights(
     weights: Float32,
     bad: Int64,
 ) -> None:
-    """Weigh votes: |cos| of the angle between ray and surface normal, from four neighbours, times nearness.
+    """Weigh votes (H, W): |cos| of the angle between ray and surface normal, from four neighbours, times nearness.
 
-    Args:
-        height: H.
-        depth: (H, W) metres.
-        rows: (H, W) row of each pixel, -1 = unknown.
-        proper: (K,) of ``_log_probability_rows``.
-        camera: Of the frame.
-        depth_max: Farther depth is ignored.
-        weights: (H, W) to fill.
-        bad: (H,) to fill: known pixels of each row of the image whose probabilities are not proper.
+    ``proper`` (K,) is of ``_log_probability_rows``; ``bad`` (H,) is filled with the known pixels of each row of the
+    image whose probabilities are not proper.
     """
     ...
 
@@ -288,12 +256,5 @@ def vote_into_blocks(
     votes: Votes,
     max_votes: float,
 ) -> None:
-    """Vote as ``fuse_blocks`` does, at measured voxels with fewer than ``max_votes``, and change nothing else.
-
-    Args:
-        count: B.
-        indices: (B,) buffer indices, each once.
-        buffers, camera, limits, depth, votes: As of ``fuse_blocks``.
-        max_votes: Voxels with this many take none.
-    """
+    """Vote as ``fuse_blocks`` does, at measured voxels with fewer than ``max_votes``, and change nothing else."""
     ...

@@ -38,7 +38,7 @@ from semantic_mapper.mapping.storage.block_store import (
     empty_blocks,
     pack_blocks,
 )
-from semantic_mapper.types import Bool, Float32, Int32, UInt8
+from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8
 
 BLOCK_SIDE = 8
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
@@ -55,23 +55,14 @@ _log = get_logger(__name__)
 
 
 class GridBuffers(NamedTuple):
-    """The grid's memory; growing replaces it.
+    """The grid's memory; growing replaces it. Voxels are (capacity, 512, ...) float32."""
 
-    Args:
-        keys: (capacity, 3) int32 block coordinates.
-        tsdf: (capacity, 512) float32, signed distance over truncation in [-1, 1].
-        weight: (capacity, 512) float32, number of depth measurements (capped); below 1 the depth was computed.
-        color: (capacity, 512, 3) float32 in 0..255.
-        evidence: (capacity, 512, L) float32, sum of log probabilities by weight.
-        votes: (capacity, 512) float32, sum of vote weights.
-    """
-
-    keys: NDArray[np.int32]
-    tsdf: Float32
-    weight: Float32
-    color: Float32
-    evidence: Float32
-    votes: Float32
+    keys: Int32  # (capacity, 3) block coordinates
+    tsdf: Float32  # signed distance over truncation in [-1, 1]
+    weight: Float32  # number of depth measurements (capped); below 1 the depth was computed
+    color: Float32  # (..., 3) in 0..255
+    evidence: Float32  # (..., L) sum of log probabilities by weight
+    votes: Float32  # sum of vote weights
 
     @property
     def values(self) -> BlockValues:
@@ -80,13 +71,13 @@ class GridBuffers(NamedTuple):
 
 
 class BlockGrid:
-    """Blocks of 8^3 voxels by their key; grows by half when full and never past ``max_blocks``.
+    """Blocks of 8^3 voxels by their key; grows by half when full and never past ``max_blocks``, in memory and on disk.
 
     Args:
         voxel_size_m: Edge of a voxel.
         classes: L, channels of the class evidence.
         initial_blocks: Capacity at start.
-        max_blocks: Blocks at most, in memory and on disk.
+        max_blocks: At most.
         memory_bytes: For blocks in memory; 0 = no limit.
 
     Attributes:
@@ -117,7 +108,7 @@ class BlockGrid:
         self._surface = np.zeros(capacity, np.uint8)
         self._resident_count = 0
         self._ever_used = 0  # from here on, buffers are as they were made: zero
-        self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
+        self.watchers: list[Callable[[Int64], None]] = []
 
     @property
     def index(self) -> BlockIndex:
@@ -140,7 +131,7 @@ class BlockGrid:
         return 0 if self._store is None else self._store.file_bytes
 
     @property
-    def stored_surface(self) -> NDArray[np.int64]:
+    def stored_surface(self) -> Int64:
         """Packed keys, sorted, of blocks on disk that hold a surface."""
         return np.empty(0, np.int64) if self._store is None else self._store.keys[self._store.surface]
 
@@ -163,22 +154,22 @@ class BlockGrid:
         """The present buffers. Take them again after every ``activate``: growth moves the memory."""
         return self._buffers
 
-    def sorted_blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    def sorted_blocks(self) -> tuple[Int32, Int32]:
         """Keys (B, 3) in lexicographic order and their buffer indices (B,), of blocks in memory."""
         indices = np.flatnonzero(self._packed != _FREE).astype(np.int32)
         indices = indices[np.argsort(self._packed[indices])]
         return self._buffers.keys[indices], indices
 
-    def all_packed(self) -> NDArray[np.int64]:
+    def all_packed(self) -> Int64:
         """Packed keys (B,) of all blocks, sorted."""
         resident = self._packed[self._packed != _FREE]
         return np.sort(resident if self._store is None else np.concatenate((resident, self._store.keys)))
 
-    def all_keys(self) -> NDArray[np.int32]:
+    def all_keys(self) -> Int32:
         """Keys (B, 3) of all blocks in lexicographic order."""
         return unpack_keys(self.all_packed())
 
-    def keys_between(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int32]:
+    def keys_between(self, low: Int64, high: Int64) -> Int32:
         """Those of ``all_keys`` from ``low`` (3,) to ``high`` (3,), both included, without sorting the others."""
         keys = self._buffers.keys[self._packed != _FREE]
         if self._store is not None:
@@ -186,7 +177,7 @@ class BlockGrid:
         keys = keys[((keys >= low) & (keys <= high)).all(axis=1)]
         return keys[np.argsort(pack_keys(keys))]
 
-    def activate(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+    def activate(self, packed: Int64) -> Int32:
         """Make sure that the blocks of unique packed keys (B,), about to change, are in memory; return indices (B,).
 
         New ones are zero; those on disk come back as they were.
@@ -201,7 +192,7 @@ class BlockGrid:
         self._surface[found] = _UNKNOWN
         return found
 
-    def batches(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
+    def batches(self, packed: Int64) -> Iterator[Int32]:
         """``activate`` unique packed keys (B,) this many at a time as memory has room for.
 
         Yields:
@@ -213,12 +204,21 @@ class BlockGrid:
         if len(packed) > self._max_resident:
             found = find_blocks(self._index, packed)
             self._check_room(packed[found < 0])
-            self._warn_of_batches(len(packed))
+            if not self._warned_of_batches:
+                self._warned_of_batches = True
+                _log.warning(
+                    "memory_is_short",
+                    blocks=len(packed),
+                    room=self._max_resident,
+                    reason="a frame touches more blocks than memory has room for: it goes through the disk part by "
+                    "part, which is slow; raise voxel_map.memory_mb to "
+                    f"{advised_mb(len(packed), self.block_bytes)} or more, or use larger voxels",
+                )
             packed = packed[np.argsort(found < 0, kind="stable")]  # first those in memory: they need not come back
         for start in range(0, max(len(packed), 1), self._max_resident):
             yield self.activate(packed[start : start + self._max_resident])
 
-    def page_in(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+    def page_in(self, packed: Int64) -> Int32:
         """Bring the first of these existing blocks (B,) into memory to be read, as many as have room: their indices."""
         return self._bring_together(packed[: self._max_resident])
 
@@ -231,7 +231,7 @@ class BlockGrid:
         """A copy of (capacity,), by buffer index: 0 where there is no block, or one without a surface."""
         return self._surface.copy()
 
-    def hold_surface(self, blocks: NDArray[np.int32]) -> Bool:
+    def hold_surface(self, blocks: Int32) -> Bool:
         """Whether the blocks (B,) in memory hold a surface: a voxel that ``fusion/clearing`` may have to clear."""
         unknown = blocks[self._surface[blocks] == _UNKNOWN]
         holds = np.empty(len(unknown), np.uint8)
@@ -239,7 +239,7 @@ class BlockGrid:
         self._surface[unknown] = np.where(holds, _SURFACE, _NO_SURFACE)
         return self._surface[blocks] == _SURFACE
 
-    def mark_changed(self, blocks: NDArray[np.int32], version: int) -> None:
+    def mark_changed(self, blocks: Int32, version: int) -> None:
         """Note that blocks with these buffer indices were changed at ``version`` of the map."""
         self._version[blocks] = version
 
@@ -253,7 +253,7 @@ class BlockGrid:
             self._store.versions = versions[len(indices) :].copy()
         return version + max(count - 1, 0) // each
 
-    def versions_since(self, version: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def versions_since(self, version: int) -> tuple[Int64, Int64]:
         """Packed keys (B,) of all blocks that were changed after ``version``, sorted, and when each was: (B,)."""
         there = self._packed != _FREE
         packed, versions = self._packed[there], self._version[there]
@@ -264,7 +264,7 @@ class BlockGrid:
         newer = newer[np.argsort(packed[newer])]
         return packed[newer], versions[newer]
 
-    def tiles(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], BlockGrid]]:
+    def tiles(self) -> Iterator[tuple[Int32, Int32, BlockGrid]]:
         """All blocks, in lexicographic order, in parts that fit in memory.
 
         Yields:
@@ -281,7 +281,7 @@ class BlockGrid:
             tile = self.holding(around[np.isin(around, everything)])
             yield unpack_keys(part), find_blocks(tile.index, part), tile
 
-    def holding(self, packed: NDArray[np.int64]) -> BlockGrid:
+    def holding(self, packed: Int64) -> BlockGrid:
         """A grid with these existing blocks (B,) in memory: this one where nothing is on disk, else a temporary one."""
         if not self.stored_count:
             return self
@@ -289,7 +289,7 @@ class BlockGrid:
         copy.fill(packed, self.read(packed))
         return copy
 
-    def read(self, packed: NDArray[np.int64]) -> BlockValues:
+    def read(self, packed: Int64) -> BlockValues:
         """A copy of blocks (B,) that exist, from memory or disk."""
         found = find_blocks(self._index, packed)
         away = np.flatnonzero(found < 0)
@@ -301,7 +301,7 @@ class BlockGrid:
             self._store.read_into(values, away, packed[away])
         return values
 
-    def pack(self, packed: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], PackedBlocks]]:
+    def pack(self, packed: Int64) -> Iterator[tuple[Int64, PackedBlocks]]:
         """A packed copy of blocks (B,) that exist, part by part: first those in memory, then those on disk.
 
         Yields:
@@ -314,14 +314,14 @@ class BlockGrid:
             part = away[start : start + _READ_AT_ONCE]
             yield part, pack_blocks(self.read(packed[part]), np.arange(len(part), dtype=np.int32))
 
-    def fill(self, packed: NDArray[np.int64], values: BlockValues) -> NDArray[np.int32]:
+    def fill(self, packed: Int64, values: BlockValues) -> Int32:
         """Make blocks (B,) be ``values``, new or not; returns their buffer indices."""
         blocks = self.activate(packed)
         for own, given in zip(self._buffers.values, values, strict=True):
             own[blocks] = given
         return blocks
 
-    def _bring_together(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+    def _bring_together(self, packed: Int64) -> Int32:
         self._clock += 1
         found = find_blocks(self._index, packed)
         missing = packed[found < 0]
@@ -334,7 +334,7 @@ class BlockGrid:
         self._used[found] = self._clock
         return found
 
-    def _check_room(self, missing: NDArray[np.int64]) -> None:
+    def _check_room(self, missing: Int64) -> None:
         new = len(missing) - (0 if self._store is None else int(self._store.find(missing)[1].sum()))
         if self.block_count + new > self._max_blocks:
             raise MapError(
@@ -343,17 +343,7 @@ class BlockGrid:
                 "voxels, or start a new map; what is in this one stays usable"
             )
 
-    def _warn_of_batches(self, blocks: int) -> None:
-        if self._warned_of_batches:
-            return
-        self._warned_of_batches = True
-        reason = (
-            "a frame touches more blocks than memory has room for: it goes through the disk part by part, which is "
-            f"slow; raise voxel_map.memory_mb to {advised_mb(blocks, self.block_bytes)} or more, or use larger voxels"
-        )
-        _log.warning("memory_is_short", blocks=blocks, room=self._max_resident, reason=reason)
-
-    def _bring_in(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
+    def _bring_in(self, packed: Int64, missing: Int64) -> None:
         """Make room for the missing blocks, add them, and read those that were on disk."""
         needed = self._resident_count + len(missing)
         if needed > self._max_resident:
@@ -380,7 +370,7 @@ class BlockGrid:
             self._surface[indices] = np.where(surface, _SURFACE, _NO_SURFACE)
         self._add(missing[~there])
 
-    def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
+    def _evict(self, count: int, keep: Int64) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
         if self._store is None:
             self._store = BlockStore()
@@ -445,7 +435,7 @@ class BlockGrid:
         self._used, self._version = np.pad(self._used, (0, more)), np.pad(self._version, (0, more))
         self._surface = np.pad(self._surface, (0, more))
 
-    def _add(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+    def _add(self, packed: Int64) -> Int32:
         """Give new blocks (B,) a place in the buffers, which have room; all their voxels are zero."""
         added = np.flatnonzero(self._packed == _FREE)[: len(packed)].astype(np.int32)
         self._packed[added] = packed
@@ -478,11 +468,5 @@ def _zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
 
 @kernel
 def blocks_hold_surface(indices: Int32, tsdf: Float32, weight: Float32, holds: UInt8) -> None:
-    """Which blocks have a voxel that may have to be cleared one day (``fusion/clearing``).
-
-    Args:
-        indices: (B,) buffer indices.
-        tsdf, weight: Of the grid.
-        holds: (B,) to fill, 0 or 1.
-    """
+    """Which blocks (B,) have a voxel that may have to be cleared one day (``fusion/clearing``): 0 or 1 to fill."""
     ...

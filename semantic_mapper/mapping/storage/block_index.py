@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.kernels import kernel
 from semantic_mapper.types import Int32, Int64
@@ -23,11 +22,11 @@ _EMPTY = -1
 class BlockIndex(NamedTuple):
     """(S,) int64 packed keys (-1 = empty slot) and (S,) int32 buffer indices; S is a power of two."""
 
-    slot_keys: NDArray[np.int64]
-    slot_values: NDArray[np.int32]
+    slot_keys: Int64
+    slot_values: Int32
 
 
-def make_block_index(keys: NDArray[np.int32], values: NDArray[np.int32]) -> BlockIndex:
+def make_block_index(keys: Int32, values: Int32) -> BlockIndex:
     """Build the table of keys (B, 3) with values (B,); at most half of the slots are used."""
     slots = 1 << max(6, int(2 * len(keys)).bit_length() + 1)
     index = BlockIndex(np.full(slots, _EMPTY, np.int64), np.zeros(slots, np.int32))
@@ -40,19 +39,19 @@ def has_room(index: BlockIndex, count: int) -> bool:
     return 2 * count <= len(index.slot_keys)
 
 
-def pack_keys(keys: NDArray[np.int32]) -> NDArray[np.int64]:
+def pack_keys(keys: Int32) -> Int64:
     """(B, 3) -> (B,); the order of packed keys is the lexicographic order of the triples."""
     wide = keys.astype(np.int64) + KEY_LIMIT
     return (wide[:, 0] << (2 * KEY_BITS)) | (wide[:, 1] << KEY_BITS) | wide[:, 2]
 
 
-def unpack_keys(packed: NDArray[np.int64]) -> NDArray[np.int32]:
+def unpack_keys(packed: Int64) -> Int32:
     """(B,) -> (B, 3)."""
     parts = (packed >> (2 * KEY_BITS), (packed >> KEY_BITS) & _KEY_MASK, packed & _KEY_MASK)
     return (np.stack(parts, axis=1) - KEY_LIMIT).astype(np.int32)
 
 
-def find_blocks(index: BlockIndex, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+def find_blocks(index: BlockIndex, packed: Int64) -> Int32:
     """Buffer indices (B,) of packed keys (B,), -1 where there is no such block."""
     found = np.empty(len(packed), np.int32)
     _find_block_indices(index, np.ascontiguousarray(packed), found)

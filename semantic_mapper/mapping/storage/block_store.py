@@ -1,8 +1,15 @@
-"""Voxel blocks as bytes, and those that do not fit in memory: on disk in a ``ScratchFile``."""
+"""Voxel blocks as bytes, and those that do not fit in memory: on disk, in scratch space of one running process.
+
+SQLite takes its file out of the folder as soon as it is open, so nothing stays behind, however the process ends. Each
+blob has a checksum. A write that fails is taken back: what was there before is there still.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sqlite3
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -11,21 +18,15 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.storage.scratch import ScratchFile
 from semantic_mapper.types import Bool, Float32, Int32, Int64
 
 BLOCK_VOXELS = 512
-MASK_BYTES = BLOCK_VOXELS // 8
+_CACHE_KIB = 4096  # of SQLite's own pages
+_KEYS_A_QUERY = 500
 
 
 class BlockValues(NamedTuple):
-    """The voxels of B blocks.
-
-    Args:
-        tsdf, weight, votes: (B, 512) float32.
-        color: (B, 512, 3) float32.
-        evidence: (B, 512, L) float32.
-    """
+    """The voxels of B blocks: (B, 512) float32, colour (B, 512, 3), evidence (B, 512, L)."""
 
     tsdf: Float32
     weight: Float32
@@ -51,7 +52,7 @@ class PackedBlocks(NamedTuple):
     """
 
     data: Float32
-    ends: NDArray[np.int64]
+    ends: Int64
 
     def blobs(self) -> list[memoryview]:
         """The bytes of each block; they share memory."""
@@ -59,13 +60,101 @@ class PackedBlocks(NamedTuple):
         return [memoryview(data)[start:end] for start, end in pairwise((4 * self.ends).tolist())]
 
 
-class BlockStore:
-    """Blocks on disk by packed key.
+class ScratchFile:
+    """Blobs by an integer key. Calls may come from several threads, one at a time.
 
-    Attributes:
-        keys: (B,) int64, ascending, of the blocks in the store.
-        versions: (B,) int64 when each had last changed.
-        surface: (B,) bool whether each holds a surface.
+    Args:
+        what: Of what the blobs are, for messages, such as "blocks".
+        advice: Which setting helps where the disk is full.
+
+    Raises:
+        MapError: no file can be made in the system's folder for temporary files.
+    """
+
+    def __init__(self, what: str, advice: str) -> None:
+        self._what, self._advice = what, advice
+        try:
+            self._database = sqlite3.connect("", check_same_thread=False, isolation_level=None)
+            self._database.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
+            self._database.execute("PRAGMA journal_mode = MEMORY")
+            self._database.execute("CREATE TABLE blobs (key INTEGER PRIMARY KEY, crc INTEGER, blob BLOB)")
+        except sqlite3.Error as error:
+            raise MapError(f"no room for {what} on disk can be made: {error}; is TMPDIR full or read-only?") from error
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the file; room of blobs that are gone is used again, never given back."""
+        (pages,), (page_bytes,) = (self._database.execute(f"PRAGMA page_{n}").fetchone() for n in ("count", "size"))
+        return pages * page_bytes
+
+    def put(self, keys: Sequence[int], blobs: Sequence[bytes | memoryview]) -> None:
+        """Put blobs on disk.
+
+        Raises:
+            MapError: the disk is full or fails; the file is as it was, and can be used again once there is room.
+        """
+        rows = [(key, zlib.crc32(blob), blob) for key, blob in zip(keys, blobs, strict=True)]
+        with self._transaction(f"{len(rows)} {self._what} cannot be put on disk"):
+            self._database.executemany("INSERT OR REPLACE INTO blobs VALUES (?, ?, ?)", rows)
+
+    def get(self, keys: Sequence[int]) -> list[bytes]:
+        """Read blobs, in the order of the keys; they stay on disk.
+
+        Raises:
+            MapError: one is not there, or is not what was put there.
+        """
+        found: dict[int, tuple[int, bytes]] = {}
+        try:
+            for part in _parts(keys):
+                marks = ",".join("?" * len(part))
+                rows = self._database.execute(f"SELECT key, crc, blob FROM blobs WHERE key IN ({marks})", part)
+                found.update((key, (crc, blob)) for key, crc, blob in rows)
+        except sqlite3.Error as error:
+            raise MapError(f"{self._what} on disk cannot be read: {error}") from error
+        for key in keys:
+            if key not in found or zlib.crc32(found[key][1]) != found[key][0]:
+                reason = "damaged" if key in found else "missing"
+                raise MapError(f"{self._what} on disk: number {key} is {reason}; its disk fails")
+        return [found[key][1] for key in keys]
+
+    def drop(self, keys: Sequence[int]) -> None:
+        """Forget blobs.
+
+        Raises:
+            MapError: see ``put``.
+        """
+        with self._transaction(f"{len(keys)} {self._what} cannot be taken off the disk"):
+            for part in _parts(keys):
+                self._database.execute(f"DELETE FROM blobs WHERE key IN ({','.join('?' * len(part))})", part)
+
+    def close(self) -> None:
+        """Give the disk space back. Harmless when repeated."""
+        self._database.close()
+
+    @contextmanager
+    def _transaction(self, failure: str) -> Iterator[None]:
+        try:
+            self._database.execute("BEGIN")
+            try:
+                yield
+                self._database.execute("COMMIT")
+            finally:
+                if self._database.in_transaction:  # some failures end it by themselves
+                    self._database.execute("ROLLBACK")
+        except sqlite3.Error as error:
+            raise MapError(
+                f"{failure}: {error}; make room in the folder for temporary files (TMPDIR), or {self._advice}"
+            ) from error
+
+
+def _parts(keys: Sequence[int]) -> Iterator[Sequence[int]]:
+    for start in range(0, len(keys), _KEYS_A_QUERY):
+        yield keys[start : start + _KEYS_A_QUERY]
+
+
+class BlockStore:
+    """Blocks on disk by packed key: ``keys`` (B,), ascending; when each had last changed, and whether it holds a
+    surface.
 
     Raises:
         MapError: no file can be made in the system's folder for temporary files.
@@ -85,17 +174,11 @@ class BlockStore:
         """Size of the file."""
         return self._scratch.file_bytes
 
-    def find(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], Bool]:
+    def find(self, keys: Int64) -> tuple[NDArray[np.intp], Bool]:
         """Rows of blocks (B,) among ``keys``, or where they would be, and whether they are there."""
         return find_sorted(self.keys, keys)
 
-    def put(
-        self,
-        keys: NDArray[np.int64],
-        blocks: PackedBlocks,
-        versions: NDArray[np.int64] | None = None,
-        surface: Bool | None = None,
-    ) -> None:
+    def put(self, keys: Int64, blocks: PackedBlocks, versions: Int64, surface: Bool) -> None:
         """Put blocks (B,) away that are not in the store.
 
         Raises:
@@ -104,13 +187,11 @@ class BlockStore:
         self._scratch.put(keys.tolist(), blocks.blobs())
         order = np.argsort(keys)
         rows = np.searchsorted(self.keys, keys[order])
-        versions = np.zeros(len(keys), np.int64) if versions is None else versions
-        surface = np.zeros(len(keys), np.bool_) if surface is None else surface
         self.keys = np.insert(self.keys, rows, keys[order])
         self.versions = np.insert(self.versions, rows, versions[order])
         self.surface = np.insert(self.surface, rows, surface[order])
 
-    def read_into(self, values: BlockValues, rows: NDArray[np.int64], keys: NDArray[np.int64]) -> None:
+    def read_into(self, values: BlockValues, rows: Int64, keys: Int64) -> None:
         """Fill ``rows`` (B,) of ``values``, which are zero, with blocks (B,) of the store, where they stay.
 
         Raises:
@@ -118,7 +199,7 @@ class BlockStore:
         """
         unpack_blocks(self._scratch.get(keys.tolist()), values, rows)
 
-    def drop(self, keys: NDArray[np.int64]) -> None:
+    def drop(self, keys: Int64) -> None:
         """Forget blocks (B,).
 
         Raises:
@@ -130,12 +211,8 @@ class BlockStore:
         self.keys, self.versions = np.delete(self.keys, rows), np.delete(self.versions, rows)
         self.surface = np.delete(self.surface, rows)
 
-    def close(self) -> None:
-        """Give the disk space back."""
-        self._scratch.close()
 
-
-def find_sorted(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], Bool]:
+def find_sorted(sorted_keys: Int64, keys: Int64) -> tuple[NDArray[np.intp], Bool]:
     """Rows of keys (B,) among sorted ones, or where they would be, and whether they are there."""
     rows = np.searchsorted(sorted_keys, keys)
     there = rows < len(sorted_keys)
@@ -152,7 +229,7 @@ def pack_blocks(values: BlockValues, rows: NDArray[np.int32]) -> PackedBlocks:
     return PackedBlocks(data, ends)
 
 
-def unpack_blocks(blobs: Sequence[bytes | memoryview], values: BlockValues, rows: NDArray[np.int64]) -> None:
+def unpack_blocks(blobs: Sequence[bytes | memoryview], values: BlockValues, rows: Int64) -> None:
     """Fill blocks ``rows`` (B,), whose voxels are all zero, with those that ``pack_blocks`` has packed.
 
     Raises:
@@ -169,14 +246,7 @@ def unpack_blocks(blobs: Sequence[bytes | memoryview], values: BlockValues, rows
 
 @kernel
 def packed_block_ends(weight: Float32, votes: Float32, rows: Int32, ends: Int64, classes: int) -> None:
-    """Where packed blocks begin and end, in units of float32.
-
-    Args:
-        weight, votes: (capacity, 512).
-        rows: (B,) blocks to pack.
-        ends: (B + 1,) to fill.
-        classes: L.
-    """
+    """Where packed blocks begin and end (B + 1,), in units of float32; ``rows`` (B,) of them."""
     ...
 
 
@@ -188,15 +258,5 @@ def pack_block_values(values: BlockValues, rows: Int32, ends: Int64, data: Float
 
 @kernel
 def unpack_block_values(data: Float32, ends: Int64, values: BlockValues, rows: Int64) -> int:
-    """The reverse, onto voxels that are zero.
-
-    Args:
-        data: (N,) packed blocks.
-        ends: (B + 1,) where they begin and end.
-        values: To fill.
-        rows: (B,) blocks of ``values``.
-
-    Returns:
-        How many were unpacked, fewer than B where one is damaged.
-    """
+    """The reverse, onto voxels that are zero; how many were unpacked, fewer than B where one is damaged."""
     ...

@@ -8,12 +8,8 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
-import os
-import random
 import resource
-import signal
 import threading
-import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -38,32 +34,6 @@ def start_child(function: Callable[..., None], *arguments: Any) -> tuple[BasePro
     process.start()
     theirs.close()
     return process, ours
-
-
-def kill_savers(sources: list[Path], out: Path, seed: int, link: Connection) -> None:
-    """Each time it hears from ``link``, fork a process that saves maps over one another in turn, and kill it.
-
-    Sends how many saves that process had begun.
-    """
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-
-    maps = [VoxelMap.load(path) for path in sources]  # loading and saving start no threads, so a fork is sound
-    rng = random.Random(seed)
-    while True:
-        link.recv()
-        reader, writer = os.pipe()
-        pid = os.fork()
-        if pid == 0:
-            for turn in itertools.count():
-                os.write(writer, b".")
-                maps[turn % len(maps)].save(out)
-        os.close(writer)
-        begun = sum(len(os.read(reader, 1)) for _ in range(rng.randint(1, 4)))
-        time.sleep(rng.uniform(0, 0.03))  # a save takes about 0.02 s
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-        link.send(begun + len(os.read(reader, 1 << 16)))
-        os.close(reader)
 
 
 def map_and_save(out: Path, link: Connection) -> None:

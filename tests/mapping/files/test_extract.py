@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.files import extract
+from semantic_mapper.mapping import surface
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.grids import random_grid
 from tests.mapping.rendered_views import around, frame, plane_depth, small_map, sphere_depth, sure
@@ -65,7 +65,7 @@ def test_crossings_are_those_of_a_dense_grid(min_weight: float, rng: np.random.G
     index, buffers = random_grid(rng)
     blocks = rng.permutation(len(buffers.keys)).astype(np.int32)[:7]
     grid = cast("Any", SimpleNamespace(index=index, buffers=lambda: buffers))
-    found = extract.surface_voxels(buffers.keys[blocks], blocks, grid, min_weight)
+    found = surface.surface_voxels(buffers.keys[blocks], blocks, grid, min_weight)
     low = buffers.keys.min(axis=0)
     size = 8 * (buffers.keys.max(axis=0) - low + 2)
     tsdf, seen, asked = np.zeros(size, np.float32), np.zeros(size, bool), np.zeros(size, bool)  # [x, y, z]

@@ -13,6 +13,7 @@ import pytest
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.files.floor_plan import find_up
 from semantic_mapper.mapping.files.formats import (
     colored,
     sure_faces,
@@ -22,7 +23,6 @@ from semantic_mapper.mapping.files.formats import (
     write_obj,
     write_ply,
 )
-from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float64
@@ -102,13 +102,6 @@ def test_open3d_reads_the_glb_with_y_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(corners, np.stack((x, z, -y), axis=1), atol=1e-6)  # no mirror
 
 
-def test_an_empty_mesh_is_no_glb(tmp_path: Path) -> None:
-    empty = sure_faces(MESH, 0.99)
-    assert (len(empty.vertices), empty.faces.shape) == (0, (0, 3))
-    with pytest.raises(MapError, match="without faces"):
-        write_glb(tmp_path / "map.glb", empty, LABELS, UP_Z)
-
-
 @pytest.mark.parametrize("class_materials", [True, False])
 def test_obj_groups_faces_by_class_with_a_material_each(tmp_path: Path, class_materials: bool) -> None:
     files = write_obj(tmp_path / "map.obj", MESH, LABELS, class_materials=class_materials)
@@ -156,20 +149,6 @@ def test_ply_says_what_its_labels_mean(tmp_path: Path) -> None:
     assert (cloud.point.positions.numpy() == POINTS.xyz).all()
 
 
-def test_npz_needs_no_pickle_and_is_the_same_each_time(tmp_path: Path) -> None:
-    for name in ("a.npz", "b.npz"):
-        write_npz(tmp_path / name, POINTS, LABELS)
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    with np.load(tmp_path / "a.npz", allow_pickle=False) as read:
-        columns = [name for name in POINTS.__slots__ if name != "measured"]
-        for name in columns:
-            np.testing.assert_array_equal(read[name], getattr(POINTS, name))
-            assert read[name].dtype == getattr(POINTS, name).dtype
-        assert read["label_names"].tolist() == ["table", "cup", "wall"] and read["label_ids"].tolist() == [5, 9, 2]
-        assert [tuple(c) for c in read["label_colors"]] == list(LABELS.colors)
-        assert (int(read["ignore_id"]), str(read["label_set"])) == (0, "three")
-
-
 def test_points_and_meshes_say_what_was_measured_where_something_was_computed(tmp_path: Path) -> None:
     some, all_ = np.array([True, False, False, True]), np.ones(4, np.bool_)
     for measured, said in ((some, True), (all_, False)):
@@ -194,11 +173,6 @@ def test_any_class_name_is_one_readable_comment_of_a_ply(tmp_path: Path, name: s
     assert name.startswith(shown) and (shown == name or 190 < len(text) <= 200)
     cloud = load_open3d().t.io.read_point_cloud(str(tmp_path / "map.ply"))
     assert (cloud.point["label"].numpy().ravel() == POINTS.label).all()
-
-
-def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="nowhere"):
-        write_ply(tmp_path / "nowhere" / "map.ply", POINTS, LABELS)
 
 
 def test_colours_and_confidence_choose_what_is_seen() -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.files import atomic_write
-from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, describe_map, open_map
+from semantic_mapper.mapping.files.map_file import describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.rendered_views import LABELS, around, frame, small_map, sphere_depth, sure
 from tests.mapping.test_voxel_map import CENTER, fuse_sphere, same
@@ -52,19 +51,6 @@ def test_the_same_map_gives_the_same_bytes(saved: tuple[VoxelMap, Path], tmp_pat
     one_more(voxel_map)
     voxel_map.save(again)
     assert again.read_bytes() != path.read_bytes()
-
-
-def test_a_map_of_several_chunks_has_its_blocks_in_order(tmp_path: Path) -> None:
-    voxel_map = small_map(voxel_size_m=0.015)
-    fuse_sphere(voxel_map, 3)
-    path = tmp_path / "map.npz"
-    voxel_map.save(path)
-    with open_map(path) as reader:
-        parts = list(reader.parts())
-        assert [len(keys) for keys, _ in parts] == [chunk.blocks for chunk in reader.manifest.chunks]
-    assert len(parts) == -(-voxel_map.block_count // CHUNK_BLOCKS) > 1
-    assert (np.concatenate([keys for keys, _ in parts]) == voxel_map.block_state()["keys"]).all()
-    assert same(VoxelMap.load(path).block_state(), voxel_map.block_state())
 
 
 def test_a_map_is_described_without_its_blocks(saved: tuple[VoxelMap, Path]) -> None:
@@ -186,29 +172,3 @@ def test_files_that_are_no_maps_are_refused(tmp_path: Path) -> None:
         VoxelMap.load(tmp_path / "other.npz")
     with pytest.raises(MapError, match=r"damaged or not a map"):
         VoxelMap.load(tmp_path)
-
-
-def test_failed_save_leaves_the_old_file(saved: tuple[VoxelMap, Path], tmp_path: Path) -> None:
-    voxel_map, path = saved
-    with pytest.raises(MapError, match="cannot write"):
-        voxel_map.save(tmp_path / "no such folder" / "map.npz")
-    blocked = tmp_path / "folder.npz"
-    blocked.mkdir()
-    (blocked / "file").touch()
-    with pytest.raises(MapError, match="cannot write"):
-        voxel_map.save(blocked)  # a rename onto a folder fails at the very last step
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder.npz", "map.npz"]
-    assert same(VoxelMap.load(path).block_state(), voxel_map.block_state())
-
-
-def test_what_a_killed_save_left_is_removed_and_two_saves_do_not_mix(saved: tuple[VoxelMap, Path]) -> None:
-    voxel_map, path = saved
-    part = path.with_name(".map.npz.0123456789ab.part")
-    part.write_bytes(b"x" * 1_000_000)
-    with atomic_write(path) as file:
-        assert not part.exists()
-        file.write(b"another writer")
-        voxel_map.save(path)
-        assert same(VoxelMap.load(path).block_state(), voxel_map.block_state())
-    assert path.read_bytes() == b"another writer"  # the last one to end
-    assert list(path.parent.glob(".*")) == []

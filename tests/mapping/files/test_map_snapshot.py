@@ -15,7 +15,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.files import map_snapshot
 from semantic_mapper.mapping.files.map_file import MapManifest, describe_map
 from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
-from semantic_mapper.mapping.storage import scratch
+from semantic_mapper.mapping.storage import block_store
 from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT, BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.storage.block_store import BlockValues
@@ -80,7 +80,7 @@ def test_a_full_disk_fails_the_snapshot_and_not_the_frame(monkeypatch: pytest.Mo
 
     connect = sqlite3.connect
     monkeypatch.setattr(map_snapshot, "MOST_IN_MEMORY", 20)
-    monkeypatch.setattr(scratch.sqlite3, "connect", tiny)
+    monkeypatch.setattr(block_store.sqlite3, "connect", tiny)
     snapshot = snapshot_of(grid)
     changed = some_blocks(100, 5)
     grid.fill(KEYS[300:400], changed)

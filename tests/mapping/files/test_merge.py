@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -73,25 +71,6 @@ def test_two_halves_make_the_map_of_the_whole(halves: tuple[VoxelMap, VoxelMap])
     assert len(joined.changed_since(0)) == joined.block_count
 
 
-def voxels(state: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Integer coordinates (N, 3) of observed voxels and all their values (N, 6 + L)."""
-    b, k, j, i = np.nonzero(state["weight"] > 0)
-    xyz = state["keys"][b] * 8 + np.stack((i, j, k), axis=1)
-    flat = [state[n][b, k, j, i].reshape(len(b), -1) for n in ("tsdf", "weight", "color", "evidence", "votes")]
-    return xyz, np.concatenate(flat, axis=1)
-
-
-def test_quarter_turns_are_exact_and_go_the_right_way(halves: tuple[VoxelMap, VoxelMap]) -> None:
-    _, b = halves
-    T = turned((0, 0, 90), (0.1, 0.0, -0.06))
-    xyz, rows = voxels(small_map().merged(b, T).block_state())
-    source, source_rows = voxels(b.block_state())
-    target = np.stack((-source[:, 1] + 5, source[:, 0], source[:, 2] - 3), axis=1)  # x -> y, y -> -x
-    order, target_order = np.lexsort(xyz.T), np.lexsort(target.T)
-    np.testing.assert_array_equal(xyz[order], target[target_order])
-    np.testing.assert_array_equal(rows[order], source_rows[target_order])
-
-
 def test_a_map_of_another_frame_comes_to_lie_where_it_belongs() -> None:
     T_a_b = turned((20, -35, 50), (0.31, -1.27, 0.553))
     a = fuse_views(small_map(), range(6))
@@ -111,21 +90,6 @@ def test_a_map_of_another_frame_comes_to_lie_where_it_belongs() -> None:
     assert np.abs(mine.depth_m - theirs.depth_m)[both].mean() < 0.003
     assert (mine.label == theirs.label)[both].mean() > 0.85
     assert np.abs(mine.confidence - theirs.confidence)[both].mean() < 0.05
-
-
-def test_a_paged_map_merges_as_one_in_memory(tmp_path: Path) -> None:
-    T = turned((4, 5, -70), (0.2, 0.1, 0.05))
-    a, b = (fuse_views(small_map(voxel_size_m=0.01), views) for views in (range(2), range(2, 4)))
-    a.save(tmp_path / "a.npz")
-    paged = small_map(voxel_size_m=0.01, memory_mb=1)
-    fuse_views(paged, range(2, 4))
-    assert paged.stored_blocks > 0
-    small = small_map(voxel_size_m=0.01, memory_mb=1)
-    fuse_views(small, range(2))
-    expected = a.merged(b, T).block_state()
-    joined = small.merged(paged, T)
-    assert joined.stored_blocks > 0 and same(joined.block_state(), expected)
-    assert same(VoxelMap.load(tmp_path / "a.npz").merged(b, T).block_state(), expected)
 
 
 def test_maps_that_do_not_fit_are_refused(halves: tuple[VoxelMap, VoxelMap]) -> None:

@@ -8,11 +8,11 @@ from semantic_mapper.geometry import look_at, unproject
 from semantic_mapper.mapping.fusion.allocation import (
     blocks_in_band,
     blocks_in_view,
+    blocks_within_reach,
     make_camera,
-    view_bounds,
 )
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
-from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, small_map
+from tests.mapping.rendered_views import INTRINSICS, plane_depth
 
 POSE = look_at(np.array([0.4, -0.3, -1.1]), np.array([0.1, 0.1, 0.4]), np.array([0.1, -1.0, 0.0]))
 
@@ -43,17 +43,6 @@ def test_every_block_that_a_ray_crosses_in_the_band_is_found(scene: str, rng: np
     surface = sampled_blocks(depth, 0.07, 0.16)
     assert np.isin(surface, found).all(), "never within 3.5 voxels of the surface"
     assert len(found) < 1.1 * len(expected)
-
-
-@pytest.mark.parametrize("column", [80, 81, 82, 83])
-def test_a_pole_one_pixel_wide_is_not_missed(column: int) -> None:
-    depth = np.zeros((120, 160), np.float32)
-    depth[:, column] = 1.0
-    voxel_map = small_map(voxel_size_m=0.005)
-    assert voxel_map.integrate(frame(), depth, None, None) >= 24
-    xyz = voxel_map.points().xyz
-    assert xyz[:, 1].max() - xyz[:, 1].min() > 0.85
-    assert np.abs(xyz[:, 2] - 1.0).max() < 0.001
 
 
 def test_a_frame_that_needs_more_blocks_than_its_budget_is_refused(rng: np.random.Generator) -> None:
@@ -93,8 +82,8 @@ def test_the_bounds_of_a_view_hold_all_its_blocks_and_little_more(rng: np.random
     for _ in range(30):
         eye, target, up = rng.uniform(-1, 1, (3, 3))
         camera = make_camera(INTRINSICS, look_at(eye, target, up))
-        low, high = view_bounds(camera, INTRINSICS, 0.02, 1.0)
+        low, high = blocks_within_reach(camera, (120, 160), 0.02, 1.0)
         near = keys[((keys >= low) & (keys <= high)).all(axis=1)]
         seen = blocks_in_view(camera, (120, 160), keys, 0.02, 1.0)
         np.testing.assert_array_equal(blocks_in_view(camera, (120, 160), near, 0.02, 1.0), seen)
-        assert (high - low <= 2 * 1.6 / 0.16 + 6).all(), "no wider than the sphere round the camera"
+        assert (high - low <= 2 * 1.5 / 0.16 + 6).all(), "the sphere round the camera"

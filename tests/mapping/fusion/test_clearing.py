@@ -9,9 +9,7 @@ import pytest
 
 from semantic_mapper.mapping.fusion import clearing
 from semantic_mapper.mapping.fusion.clearing import depth_bounds
-from semantic_mapper.mapping.storage.changes import UNOBSERVED
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from tests.mapping.rendered_views import LABELS, frame, small_map
 
@@ -54,20 +52,6 @@ def thing_points(voxel_map: VoxelMap) -> int:
 
 def state(voxel_map: VoxelMap) -> dict[str, bytes]:
     return {name: values.tobytes() for name, values in voxel_map.block_state().items()}
-
-
-def test_the_constants_are_those_of_the_kernels() -> None:
-    defined = dict(line.split()[1:3] for line in HEADER.read_text().splitlines() if line.startswith("#define"))
-    for name, value in (
-        ("LARGEST_CLEARED_TSDF", clearing.LARGEST_TSDF),
-        ("MARGIN_VOXELS", clearing.MARGIN_VOXELS),
-        ("MARGIN_PER_M", clearing.MARGIN_PER_M),
-        ("ASIDE_VOXELS", clearing.ASIDE_VOXELS),
-        ("ASIDE_PER_M", clearing.ASIDE_PER_M),
-        ("MOST_HOLES", clearing.MOST_HOLES),
-        ("MOST_KEPT", clearing.MOST_KEPT),
-    ):
-        assert float(defined[name].rstrip("f")) == value
 
 
 def test_bounds_are_the_least_and_greatest_depths(rng: np.random.Generator) -> None:
@@ -155,19 +139,3 @@ def test_clearing_is_deterministic_and_blocks_on_disk_are_cleared_as_well() -> N
     assert maps[2].stored_blocks > 0
     assert state(maps[0]) == state(maps[1]) == state(maps[2])
     assert maps[0].cleared == maps[2].cleared
-
-
-def test_a_mirror_is_told_of_what_vanished_and_of_nothing_else() -> None:
-    voxel_map = small_map()
-    see(voxel_map, wall(thing=True), times=10)
-    mirror = MapMirror.of(voxel_map)
-    see(voxel_map, wall(), times=3)
-    changed = voxel_map.changes(mirror.version)
-    mirror.apply(changed)
-    here, there = mirror.snapshot().changes(0), voxel_map.changes(0)
-    np.testing.assert_array_equal(here.tsdf, there.tsdf)
-    near = here.tsdf[np.abs(here.keys[:, 2] * 0.16 - THING_M) < 0.2]
-    assert len(near) > 20 and near[near != UNOBSERVED].min() > 60
-    version = voxel_map.version
-    see(voxel_map, wall())
-    assert not (np.abs(voxel_map.changed_since(version)[:, 2] * 0.16 - THING_M) < 0.2).any()

@@ -12,11 +12,11 @@ from semantic_mapper.mapping.storage.block_store import (
     BLOCK_VOXELS,
     BlockStore,
     BlockValues,
+    ScratchFile,
     empty_blocks,
     pack_blocks,
     unpack_blocks,
 )
-from semantic_mapper.mapping.storage.scratch import ScratchFile
 
 CLASSES = 3
 

@@ -11,46 +11,10 @@ from semantic_mapper.mapping.storage.block_store import BlockValues, pack_blocks
 from semantic_mapper.mapping.storage.changes import BlockChanges, oldest_first
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.grids import decided, random_grid
-from tests.mapping.rendered_views import LABELS, small_map
+from tests.mapping.rendered_views import small_map
 from tests.mapping.storage.test_paging import MEMORY_MB, walk
 
 FIELDS = ("keys", "tsdf", "label", "confidence", "rgb")
-
-
-@pytest.fixture(scope="module")
-def walked() -> VoxelMap:
-    voxel_map = small_map()
-    walk(voxel_map, 6)
-    walk(voxel_map, 2)
-    return voxel_map
-
-
-def flat(voxel_map: VoxelMap) -> dict[str, np.ndarray]:
-    state = voxel_map.block_state()
-    return {name: a if name == "keys" else a.reshape(len(a), 512, *a.shape[4:]) for name, a in state.items()}
-
-
-@pytest.mark.parametrize("min_weight", [1.0, 2.0])
-def test_voxels_are_those_of_the_map_rounded(walked: VoxelMap, min_weight: float) -> None:
-    state, changes = flat(walked), walked.changes(0, min_weight=min_weight)
-    assert (changes.since, changes.version) == (0, 8)
-    np.testing.assert_array_equal(changes.keys, state["keys"])
-    seen = state["weight"] >= min_weight
-    assert 0.05 < seen.mean() < 0.95
-    np.testing.assert_array_equal(changes.observed, seen)
-    assert np.abs(changes.tsdf[seen] / 127 - state["tsdf"][seen]).max() <= 1 / 127
-    np.testing.assert_array_equal(changes.tsdf[seen] > 0, state["tsdf"][seen] > 0)
-    np.testing.assert_allclose(changes.rgb[seen], state["color"][seen], atol=0.51)
-    votes = state["votes"]
-    worth = np.where(votes > 1, 1 / (1 + 0.75 * (votes - 1)), 1 / np.maximum(votes, 1e-9))
-    p = np.exp(
-        (state["evidence"] - state["evidence"].max(axis=-1, keepdims=True)) * worth[..., None].astype(np.float64)
-    )
-    p /= p.sum(axis=-1, keepdims=True)
-    voted = seen & (state["votes"] > 0)
-    np.testing.assert_array_equal(changes.label[voted], LABELS.to_ids(state["evidence"].argmax(axis=-1))[voted])
-    np.testing.assert_allclose(changes.confidence[voted] / 255, p.max(axis=-1)[voted], atol=0.6 / 255)
-    assert not changes.label[~voted].any() and not changes.confidence[~voted].any() and not changes.rgb[~seen].any()
 
 
 def collect(voxel_map: VoxelMap, limit: int, grow: int) -> dict[tuple[int, ...], tuple[bytes, ...]]:

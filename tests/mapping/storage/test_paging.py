@@ -63,15 +63,6 @@ def test_a_view_brings_back_what_it_sees(both: tuple[VoxelMap, VoxelMap]) -> Non
     assert same(free.block_state(), paged.block_state()), "looking changes nothing"
 
 
-def test_what_changed_is_known_of_blocks_on_disk_too(both: tuple[VoxelMap, VoxelMap]) -> None:
-    free, paged = both
-    for version in (0, 3, 11, 13, 14):
-        np.testing.assert_array_equal(free.changed_since(version), paged.changed_since(version))
-    assert len(free.changed_since(0)) == free.block_count
-    assert 0 < len(free.changed_since(13)) < len(free.changed_since(12)) < free.block_count
-    assert len(free.changed_since(14)) == 0
-
-
 def test_a_paged_map_is_saved_whole_and_goes_on(both: tuple[VoxelMap, VoxelMap], tmp_path: Path) -> None:
     free, paged = both
     paged.save(tmp_path / "paged.npz")

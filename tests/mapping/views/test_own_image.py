@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.views.view_renderer import RenderedView, add_own_image
+from semantic_mapper.mapping.rendering import RenderedView, add_own_image
 from tests.small import tiny_config, tiny_field, tiny_frames
 
 
@@ -37,20 +36,6 @@ def test_both_opinions_are_joined_as_their_geometric_mean_where_the_view_is_know
     np.testing.assert_allclose(found.probabilities[known], expected[known], atol=1e-5)
     np.testing.assert_array_equal(found.probabilities[~known], view_p.astype(np.float32)[~known])
     assert found.probabilities.dtype == np.float32
-
-
-@pytest.mark.parametrize("field", [Says(None), object()])
-def test_a_field_without_an_opinion_of_images_leaves_the_view(field: object) -> None:
-    view = rendered(np.full((2, 2, 4), 0.25), np.ones((2, 2), bool))
-    assert add_own_image(view, field, None, 0.5) is view  # type: ignore[arg-type]
-
-
-def test_an_opinion_of_another_size_is_resized() -> None:
-    own = torch.zeros(1, 2, 4, 8)
-    own[:, 0, :, :4] = own[:, 1, :, 4:] = 5.0
-    view = rendered(np.full((2, 4, 2), 0.5), np.ones((2, 4), bool))
-    found = add_own_image(view, Says(own), None, 1.0).probabilities.argmax(axis=2)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(found, [[0, 0, 1, 1]] * 2)
 
 
 def test_the_map_takes_it_in_unless_the_frame_is_no_source_or_its_weight_is_nothing() -> None:

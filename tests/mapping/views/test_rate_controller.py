@@ -1,7 +1,7 @@
 import pytest
 
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.mapping.views.view_renderer import LEAST_SHARE, RateController
+from semantic_mapper.mapping.rendering import LEAST_SHARE, RateController
 
 PIXELS = 19_200
 SAMPLING = SamplingConfig(guided=8, free_space=1)

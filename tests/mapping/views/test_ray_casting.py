@@ -7,7 +7,7 @@ from semantic_mapper.geometry import look_at, scale_intrinsics
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.fusion.fuse import MEASURED
 from semantic_mapper.mapping.storage.block_grid import GridBuffers
-from semantic_mapper.mapping.views.ray_casting import read_points
+from semantic_mapper.mapping.surface import read_points
 from tests.mapping.grids import corners, random_grid
 from tests.mapping.rendered_views import (
     INTRINSICS,
@@ -40,21 +40,6 @@ def test_wall_depth_is_unbiased_whichever_way_the_camera_looks(turn_deg: int) ->
     assert abs(error.mean()) < 0.0005 and np.abs(error).max() < 0.002
     assert (view.label[inner] == 2).all() and (view.rgb[inner] == 200).all()
     assert view.confidence[inner].min() > 0.3
-
-
-def test_misses_are_explicit() -> None:
-    voxel_map = small_map()
-    voxel_map.integrate(frame(), plane_depth(np.eye(4), *WALL), sure(1), None)
-    away = look_at(np.zeros(3), np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0]))
-    view = voxel_map.ray_cast(away, INTRINSICS)
-    assert not view.depth_m.any() and not view.rgb.any() and not view.confidence.any() and (view.label == 0).all()
-
-
-def test_a_surface_is_not_seen_from_behind() -> None:
-    voxel_map = small_map()
-    voxel_map.integrate(frame(), plane_depth(np.eye(4), *WALL), None, None)
-    behind = look_at(np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
-    assert (voxel_map.ray_cast(behind, INTRINSICS).depth_m[10:-10, 10:-10] > 0).mean() < 0.01
 
 
 def test_hits_lie_on_the_first_zero_of_the_interpolated_field() -> None:

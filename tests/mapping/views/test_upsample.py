@@ -3,36 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ShapeError
-from semantic_mapper.mapping.views.upsample import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, upsample
-
-
-def channels(probabilities: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Likeliest class (H, W) of what each pixel takes."""
-    return probabilities.reshape(-1, probabilities.shape[2])[rows].argmax(2)
-
-
-def test_lifted_classes_follow_the_image_edge_not_the_coarse_grid():
-    rgb = np.zeros((32, 32, 3), np.uint8)
-    rgb[:, 13:] = 200  # the edge lies within a coarse pixel of 4
-    depth = np.full((32, 32), 2.0, np.float32)
-    low_rgb = rgb[2::4, 2::4].copy()
-    probabilities = np.zeros((8, 8, 2), np.float32)
-    probabilities[..., 0] = low_rgb[..., 0] == 0
-    probabilities[..., 1] = low_rgb[..., 0] > 0
-    rows = upsample(probabilities, np.ones((8, 8), bool), low_rgb, depth[2::4, 2::4].copy(), rgb, depth)
-    assert (rows >= 0).all()
-    assert (channels(probabilities, rows) == (rgb[..., 0] > 0)).all()
-
-
-def test_lifted_classes_follow_a_depth_edge_between_equal_colours():
-    rgb = np.full((32, 32, 3), 90, np.uint8)
-    depth = np.full((32, 32), 2.0, np.float32)
-    depth[:, 18:] = 3.0
-    low_depth = depth[2::4, 2::4].copy()
-    probabilities = np.stack((low_depth < 2.5, low_depth > 2.5), -1).astype(np.float32)
-    rows = upsample(probabilities, np.ones((8, 8), bool), rgb[2::4, 2::4].copy(), low_depth, rgb, depth)
-    assert (channels(probabilities, rows) == (depth > 2.5)).all()
+from semantic_mapper.mapping.rendering import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, upsample
 
 
 def spoken_by(v, u, p, known, rgb_low, depth_low, rgb, depth):
@@ -101,17 +72,3 @@ def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours
     v, u = np.mgrid[0:24, 0:32] // 4
     near = (np.abs(row - v) <= 1) & (np.abs(column - u) <= 1)
     assert ((rows == -1) | near).all() and near.mean() > 0.5
-
-
-def test_images_that_do_not_fit_together_are_refused():
-    p, known = np.zeros((6, 8, 2), np.float32), np.ones((6, 8), bool)
-    low, depth_low = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32)
-    rgb, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
-    for name, images in {
-        "coarse known": (p, known[:5], low, depth_low, rgb, depth),
-        "coarse rgb": (p, known, low[:, :7], depth_low, rgb, depth),
-        "coarse depth": (p, known, low, depth_low[:, :7], rgb, depth),
-        "rgb": (p, known, low, depth_low, rgb[:23], depth),
-    }.items():
-        with pytest.raises(ShapeError, match=name):
-            upsample(*images)

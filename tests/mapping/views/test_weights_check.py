@@ -11,8 +11,7 @@ from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping import pipeline as pipeline_module
-from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.views.weights_check import FieldTrial
+from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
 from tests.small import tiny_config, tiny_field, tiny_frames
 
 FRAMES = tiny_frames(6)

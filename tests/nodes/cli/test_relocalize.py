@@ -12,7 +12,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.mapping.rendered_views import small_map
-from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even_map, off, other_world, walk
+from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even, off, other_world, walk
 from tests.nodes.support import error_line, run
 
 
@@ -24,7 +24,7 @@ def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_
 
 
 def test_the_frames_of_a_log_are_found_in_a_map_each_world_by_itself(tmp_path: Path) -> None:
-    even_map().save(tmp_path / "map.npz")
+    even().voxel_map.save(tmp_path / "map.npz")
     log_path = tmp_path / "today.mcap"
     with LogWriter(log_path, StreamInfo("today", {"rooms": INTRINSICS}, ROOMS, 4, 15.0)) as log:
         for frame in walk()[1:14:4]:

@@ -92,8 +92,8 @@ def test_what_a_node_would_refuse_as_it_starts_is_told_before(tmp_path: Path) ->
 
 
 def test_packages_of_bridges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "semantic_mapper.nodes.foxglove.sdk", None)
-    monkeypatch.delitem(sys.modules, "semantic_mapper.nodes.foxglove.sdk")
+    monkeypatch.setitem(sys.modules, "semantic_mapper.nodes.foxglove.server", None)
+    monkeypatch.delitem(sys.modules, "semantic_mapper.nodes.foxglove.server")
     monkeypatch.setitem(sys.modules, "foxglove", None)
     (missing,) = of(CAMERA, "camera.kind=oak", "foxglove.enabled=true")["foxglove"]
     assert missing.state == "bad" and "semantic-mapper[foxglove]" in missing.found + missing.fix

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.evaluation.metrics import miou_of_sums
-from semantic_mapper.nodes.fleet.store import Event, Failure, Findings, MethodScores, Store, TaskResult
+from semantic_mapper.nodes.fleet.store import Failure, Findings, MethodScores, Store, TaskResult
 
 NAMES = ("wall", "floor", "chair", "lamp")
 FINISHED_NS = 1_790_000_000_000_000_000
@@ -42,7 +42,6 @@ def made_up(log: int, *, loss: float = 0.0, noise: float = 0.0, noise_seed: int 
         "operation": "replay",
         "log": f"/logs/{log:04d}.mcap",
         "log_digest": hashlib.sha256(f"log {log}".encode()).hexdigest(),
-        "log_bytes": 1000 + log,
         "tags": {"robot": f"r{log % 3}"},
         "weights": "",
         "settings": {},
@@ -51,7 +50,7 @@ def made_up(log: int, *, loss: float = 0.0, noise: float = 0.0, noise_seed: int 
             metrics={"miou": miou, "frames_fused": 100.0, "blocks": 500.0 + log, "depth_disagreement": None},
             costs={"step_ms_p50": 30.0 + log % 5},
             scores=(scores,),
-            events=(Event("refused", "pose jumps", 7, 5),),
+            events=(("refused", "frame 7: pose jumps"),),
         ),
         "files": {},
         "seconds": 40.0 + log % 7,

@@ -9,12 +9,13 @@ from pathlib import Path
 
 from semantic_mapper.errors import LogError, StoreError
 from semantic_mapper.nodes.fleet.run import Task
+from semantic_mapper.nodes.fleet.urls import LogInput
 
 
-def do_as_named(task: Task) -> bool:
+def do_as_named(task: Task, log: LogInput) -> bool:
     """The name of the log says what becomes of the task, "once" at its first attempt only; leaves traces of all."""
-    name = task.log.url
-    folder = Path(task.log.tags["traces"])
+    name = log.url
+    folder = Path(log.tags["traces"])
     attempt = len(list(folder.glob(f"{name}.*")))
     (folder / f"{name}.{attempt}").touch()
     if "once" in name and attempt:

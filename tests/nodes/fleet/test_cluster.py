@@ -13,7 +13,6 @@ import psutil
 import pytest
 
 from semantic_mapper.errors import DependencyError, FleetError
-from semantic_mapper.nodes.fleet import cluster
 from semantic_mapper.nodes.fleet.cluster import connected
 
 ray = pytest.importorskip("ray")
@@ -24,7 +23,7 @@ import os, signal, time
 from pathlib import Path
 from semantic_mapper.nodes.fleet.cluster import connected
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-with connected("local", cpus=1):
+with connected(None, cpus=1):
     print(Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent, flush=True)
     time.sleep(300)
 """
@@ -89,8 +88,6 @@ def test_a_signal_ends_the_cluster_of_this_machine(signum: signal.Signals) -> No
     ("address", "said"),
     [
         ("localhost", "give HOST:PORT"),
-        ("user:secret@127.0.0.1:6379", "give HOST:PORT"),
-        ("http://127.0.0.1:6379", "give HOST:PORT"),
         ("ray://10.0.0.1:10001", "give HOST:PORT"),
         ("127.0.0.1:99999", "give HOST:PORT"),
         ("no-such-host.invalid:6379", "there is no host"),
@@ -103,15 +100,10 @@ def test_what_is_no_safe_address_is_refused(address: str, said: str, monkeypatch
         pass
 
 
-def test_a_cluster_that_is_not_there_is_an_error_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_is_not_there_is_an_error_at_once() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(FleetError, match="no Ray cluster answers"), connected(f"127.0.0.1:{port}"):
-        pass
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")
-    monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 64)
-    monkeypatch.setattr(cluster, "_CONNECT_TIMEOUT_S", 0.2)
-    with pytest.raises(FleetError, match="no Ray cluster answers"), connected("192.0.2.1:6379"):  # nobody has it
         pass
 
 

@@ -21,8 +21,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
-from research.experiments.foxglove_client import FoxgloveClient, Received
-from semantic_mapper.errors import NodeError, TransportError
+from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.foxglove.node import run_foxglove
 from semantic_mapper.nodes.foxglove.server import BACKLOG, FoxgloveServer
 from semantic_mapper.nodes.options import FoxgloveOptions
@@ -30,7 +29,8 @@ from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.transport.keys import allow, make_keys
-from tests.nodes.bridge.robot import REFRESH_S, WARM_S, Robot, big_frame, bridged_robot
+from tests.nodes.foxglove.client import FoxgloveClient, Received
+from tests.nodes.foxglove.robot import REFRESH_S, WARM_S, Robot, big_frame, bridged_robot
 from tests.nodes.support import eventually, free_port
 from tests.queries.scene import LABELS, whole
 from tests.small import tiny_frames
@@ -184,25 +184,6 @@ def test_a_mapper_with_keys_answers_who_has_the_same(port: int, tmp_path: Path) 
     assert info["points"] == len(surface_points(whole(), surface_voxels(whole())).xyz), (
         "the map came through the sockets with keys"
     )
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_it_fails_as_a_whole_where_its_map_fails(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*args: object) -> None:
-        raise ZeroDivisionError("a bug")
-
-    monkeypatch.setattr(FoxgloveServer, "send_labels", fail)
-    with pytest.raises(NodeError, match="the map is no longer sent"):
-        run_until_it_fails(port)
-
-
-def run_until_it_fails(port: int) -> None:
-    with bridged_robot(run_foxglove, FoxgloveOptions(port=port, refresh_s=REFRESH_S), "foxglove") as robot:
-        with robot.mapped():
-            robot.bridge.join(WARM_S)
-        [failure] = robot.failures
-        robot.failures.clear()
-        raise failure
 
 
 def test_it_ends_with_the_stream_and_lets_the_camera_go(port: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +13,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.nodes.labeller.server import LabelServer
-from semantic_mapper.nodes.labeller.session import LabelSession
+from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
 from semantic_mapper.replay.label_folder import make_label_folder
 from semantic_mapper.replay.log.sequence import open_log
 from tests.browser import PROGRAM, Browser
@@ -146,12 +144,6 @@ def test_all_of_it_can_be_done_with_keys_alone(page: Page) -> None:
     assert page.browser.evaluate(unnamed) == 0, "each control has a name"
 
 
-def test_a_finger_paints(page: Page) -> None:
-    page.browser.press("1")
-    page.browser.swipe(page.on((20, 20), (40, 25), (60, 30)))
-    assert page.saved(4, lambda label: bool(label[20, 20] == WALL and label[25, 40] == WALL and label[30, 60] == WALL))
-
-
 def test_a_stroke_that_cannot_be_saved_is_said_kept_and_saved_later(page: Page) -> None:
     labels = (page.out / "labels.json").read_bytes()
     moved = page.out.rename(page.out.with_name("away"))
@@ -165,21 +157,6 @@ def test_a_stroke_that_cannot_be_saved_is_said_kept_and_saved_later(page: Page) 
     moved.rename(page.out)
     assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
     assert (page.out / "labels.json").read_bytes() == labels
-
-
-def test_what_was_painted_elsewhere_is_shown_and_not_overwritten(page: Page) -> None:
-    page.browser.press("2")
-    page.browser.drag(page.on((10, 50), (80, 50)))
-    assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
-    elsewhere = np.full((HEIGHT, WIDTH), ROOMS.ignore_id, np.uint8)
-    elsewhere[5:15] = CEILING
-    cv2.imwrite(str(page.out / "000004.png"), elsewhere)
-    page.browser.drag(page.on((10, 30), (80, 30)))
-    status = "document.getElementById('status').textContent"
-    assert page.eventually(lambda: "frame 4 was changed elsewhere" in str(page.browser.evaluate(status)))
-    assert page.shown(40, 10) == [*ROOMS.colors[CEILING - 1], 255] and page.shown(40, 30)[3] == 0
-    page.browser.drag(page.on((10, 60), (80, 60)))
-    assert page.saved(4, lambda label: bool((label[60, 10:81] == FLOOR).all() and (label[5:15] == CEILING).all()))
 
 
 def test_the_page_shows_what_strokes_grow_to(page: Page) -> None:
@@ -203,23 +180,3 @@ def test_the_page_shows_what_strokes_grow_to(page: Page) -> None:
     assert page.browser.evaluate("document.getElementById('grown').hidden") is True
     page.browser.press("s", "n")
     assert page.status("nothing painted yet") and page.eventually(lambda: covered() == 0)
-
-
-def test_a_stroke_that_is_on_its_way_is_shown_and_not_lost(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    on_its_way, save = threading.Event(), LabelSession.save
-
-    def slow(*arguments: Any) -> None:
-        assert on_its_way.wait(WAIT_S)
-        save(*arguments)
-
-    monkeypatch.setattr(LabelSession, "save", slow)
-    page.browser.press("2")
-    page.browser.drag(page.on((10, 50), (80, 50)))
-    page.browser.press("n")
-    assert page.eventually(lambda: page.browser.evaluate("document.getElementById('number').value") == "1")
-    page.browser.press("p")
-    assert page.eventually(lambda: page.shown(40, 50)[3] == 255), "the first stroke is there"
-    on_its_way.set()
-    page.browser.press("1")
-    page.browser.drag(page.on((10, 10), (80, 10)))
-    assert page.saved(4, lambda label: bool(label[50, 40] == FLOOR and label[10, 40] == WALL))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -12,7 +12,6 @@ import pytest
 
 from semantic_mapper.nodes.launcher import fork_server
 from semantic_mapper.nodes.launcher.fork_server import ForkServer
-from semantic_mapper.nodes.launcher.liveness import ProgressLimit
 from semantic_mapper.nodes.launcher.processes import NodeProcess, node_environment
 from semantic_mapper.nodes.options import NodeJob
 from tests.nodes.support import eventually
@@ -62,25 +61,6 @@ def test_forked_nodes_are_children_of_the_launcher_and_the_server_may_die(tmp_pa
 
 
 @pytest.mark.slow
-def test_a_server_that_imports_with_a_fiftieth_of_a_core_is_waited_for(
-    tmp_path: Path, server: ForkServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ends: list[float] = []
-
-    def starved(limit_s: float, cpu_s: Callable[[], float]) -> ProgressLimit:
-        def now_s() -> float:
-            ends.append(50 * cpu_s())
-            return ends[-1]
-
-        return ProgressLimit(limit_s, cpu_s, now_s)
-
-    monkeypatch.setattr(fork_server, "ProgressLimit", starved)
-    monkeypatch.setattr(fork_server, "START_S", 20.0)
-    start(tmp_path, server).close()
-    assert max(ends) - ends[0] > 20.0  # seconds of that clock, of which no more would have been granted at once
-
-
-@pytest.mark.slow
 def test_a_frozen_server_is_replaced(tmp_path: Path, server: ForkServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fork_server, "ANSWER_S", 0.5)
     start(tmp_path, server).close()
@@ -90,11 +70,3 @@ def test_a_frozen_server_is_replaced(tmp_path: Path, server: ForkServer, monkeyp
         start(tmp_path, server)
     assert not psutil.pid_exists(before)
     start(tmp_path, server).close()
-
-
-@pytest.mark.slow
-def test_a_forked_node_says_why_it_fails(tmp_path: Path, server: ForkServer) -> None:
-    node = NodeProcess("mapper", job(tmp_path, weights=str(tmp_path / "none.safetensors")), server)
-    assert node.wait(60) and node.exit_code() == 1
-    assert "none.safetensors" in node.describe_end()
-    node.close()

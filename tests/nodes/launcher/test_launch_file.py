@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from semantic_mapper.drivers.poses.sources import read_pose_config
 from semantic_mapper.drivers.registry import load_driver
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.camera.live import make_source
-from semantic_mapper.nodes.launcher import launch_file
 from semantic_mapper.nodes.launcher.launch_file import find_launch, launch_files, load_launch
 from semantic_mapper.nodes.options import CAMERA_KINDS, POSE_KINDS
 from semantic_mapper.types import CameraIntrinsics
@@ -133,9 +131,7 @@ def test_several_cameras_fit_drivers_poses_and_calibrations(tmp_path: Path) -> N
     ("change", "says"),
     [
         (('id = "right"', 'id = "left"'), "two cameras of node 'mapper', 'left' and 'right', have the id 'left'; give"),
-        (('input = ["left", "right"]', 'input = ["left", "rihgt"]'), "did you mean 'right'?"),
         (('input = ["left", "right"]', 'input = ["left", "recorder"]'), "'recorder', which is no camera"),
-        (("streams = 2", "streams = 4"), "there are 3 sources"),
         (("streams = 2", "streams = 3"), "'mapper', which is no camera"),
     ],
 )
@@ -158,69 +154,36 @@ def test_two_logs_of_one_camera_are_refused_with_the_ways_out(tmp_path: Path) ->
     assert load_launch(path, live).options["second"].camera.kind == "v4l2"  # type: ignore[union-attr]
 
 
-def test_a_bridge_is_one_more_listener_and_queries_the_mapper() -> None:
+def test_foxglove_is_one_more_listener_and_queries_the_mapper() -> None:
     given = ["camera.kind=v4l2", "camera.config=webcam.toml", "camera.poses=poses.toml", "foxglove.enabled=true"]
     launch = load_launch(find_launch(Path("camera")), given)
     assert launch.options["foxglove"].inputs() == ("camera", "mapper") and launch.listeners("camera") == 2
-    for change, says in (
-        ("foxglove.mapper=camera", "node 'foxglove' shows the map of 'camera', which is no mapper"),
-        ("foxglove.query=ask", "has query = 'ask', but mapper 'mapper' 'query'; give both the same"),
-        ("foxglove.keys=k", "has keys = 'k', but mapper 'mapper' ''; give both the same"),
-        ("foxglove.mapper=maper", "did you mean 'mapper'?"),
-        ("foxglove.refresh_s=0", "refresh_s"),
-    ):
+    launch = load_launch(find_launch(Path("camera")), [*given, "mapper.query=ask", "mapper.keys=k"])
+    assert (launch.options["foxglove"].query, launch.options["foxglove"].keys) == ("ask", "k")  # type: ignore[union-attr]
+    for change, says in (("foxglove.mapper=camera", "node 'foxglove' shows the map of 'camera', which is no mapper"),):
         with pytest.raises(ConfigError, match=says):
             load_launch(find_launch(Path("camera")), [*given, change])
-
-
-def test_each_start_has_a_folder_of_its_own_even_where_the_clock_is_set_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Clock(datetime):
-        @classmethod
-        def now(cls, tz: tzinfo | None = None) -> datetime:
-            return datetime(2026, 11, 23, 2, 47, tzinfo=tz)
-
-    monkeypatch.setattr(launch_file, "datetime", Clock)
-    for name in ("20261123T024700Z", "20261123T024700Z-1", "20261123T024700Z-2"):
-        launch = load_launch(file_of(tmp_path, SMALL), ["eye.log=x", f"out={tmp_path}/{{now}}"])
-        assert launch.options["brain"].out == f"{tmp_path}/{name}/map"  # type: ignore[union-attr]
-        (tmp_path / name).mkdir()
 
 
 @pytest.mark.parametrize(
     ("settings", "change", "says"),
     [
         (["eye.log="], ("", ""), "give it with --set eye.log="),
-        (["eye.lok=x"], ("", ""), "node 'eye' has no option 'lok'; did you mean 'log'?"),
         (["eyes.log=x"], ("", ""), "no node is called 'eyes'; did you mean 'eye'?"),
         (["eye"], ("", ""), "write NODE.OPTION=VALUE"),
-        (["eye=x"], ("", ""), "no node is called 'eye'"),
-        (["eye.rate=-1"], ("", ""), "rate"),
         (["eye.rate=fast"], ("", ""), "`rate`: must be a number, not a text"),
         (["eye.kind=v4l2", "eye.config=a.toml", "eye.config.fps=3"], ("", ""), "the file 'a.toml'; set 'fps' there"),
         (["restart=on-failure", "eye.mode=fast"], ("", ""), "'eye' is to be restarted, but camera 'eye' waits"),
         (["restart=always"], ("", ""), "'always' is not valid"),
-        (["eye.enabled=false"], ("", ""), "which is no node"),
         ([], ('input = "eye"', 'input = "eyes"'), "did you mean 'eye'?"),
         ([], ('input = "eye"', 'imput = "eye"'), "did you mean `input`?"),
-        ([], ('kind = "mapper"', 'kind = "maper"'), "`node[1].kind`: 'maper' is not valid; did you mean `mapper`?"),
-        ([], ('mode = "realtime"', 'mode = "real"'), "node 'eye': `mode`: 'real' is not valid; did you mean"),
         ([], ('mode = "realtime"', 'max_frames = "3"'), "`max_frames`: must be a whole number, not a text"),
-        ([], ("[node.options]", "[node.option]"), "`node[0]`: unknown key `option`; did you mean `options`?"),
         ([], ('out = "{out}/map"', ""), "node 'brain': the key `out` is missing"),
-        ([], ('name = "brain"', 'name = "eye"'), "unique"),
-        ([], ('name = "brain"', 'name = "../brain"'), "letters"),
         ([], ('name = "brain"', 'name = "launch"'), "the launcher's own"),
         ([], ("[[node]]", "heartbeat_s = 0.2\n[[node]]"), "heartbeat_s"),
-        ([], ("[[node]]", "heartbeat_s = inf\n[[node]]"), "heartbeat_s = inf"),
-        ([], ("[[node]]", "heartbeat_s = " + "9" * 5000 + "\n[[node]]"), "not valid TOML"),
         ([], ("[[node]]", "x = " + "[" * 20000 + "\n[[node]]"), "not valid TOML"),
         ([], ('mode = "realtime"', "subscriber_timeout_s = nan"), "options.subscriber_timeout_s = nan"),
-        (["eye.rate=1e-300"], ("", ""), "rate"),
         (["eye.rate=" + "9" * 4094], ("", ""), "rate = a number of"),
-        (["eye.rate=" + "[" * 4000], ("", ""), "rate"),
-        (["eye.log=" + "x" * 5000], ("", ""), "longer than 4096 letters"),
         (["eye.log=a\udcff"], ("", ""), "log is not UTF-8"),
         ([], ('out = "{out}/map"', 'out = "a\\u0000"'), "out holds a NUL character"),
         ([], ("[[node]]", '[[node]]\nname = "n"\nkind = "camera"\n' * 64 + "[[node]]"), "length <= 64"),
@@ -243,9 +206,6 @@ def test_mistakes_and_hostile_values_are_named_with_the_fix(
         ('kind = "opencw", poses = { kind = "fixed" }', "`camera.kind`: no kind of camera is called 'opencw'; did you"),
         ('kind = "opencv", poses = { kind = "fixt" }', "'fixt' is no source of poses; did you mean 'fixed'?"),
         ('kind = "opencv", poses = { kind = "device" }', "do not track themselves, and no frame would have a pose"),
-        ('kind = "opencv", poses = "fixed"', 'poses = { kind = "fixed" }'),
-        ('kind = "opencv", poses = {}', "`camera.poses` is empty"),
-        ('kind = "v4l2", poses = { T_world_camera = [] }', "there are device, fixed, topic, board, rgbd"),
     ],
 )
 def test_mistakes_in_a_camera_and_its_poses_are_found_before_anything_starts(

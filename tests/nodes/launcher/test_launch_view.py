@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from semantic_mapper.nodes.launcher.launch_view import LaunchView
+from semantic_mapper.nodes.launcher.running import LaunchView
 from semantic_mapper.transport.messages import Status
 
 S = 1_000_000_000

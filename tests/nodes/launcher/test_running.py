@@ -10,7 +10,7 @@ import pytest
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.launcher import running
-from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder, refuse_missing_socket
+from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder
 from tests.nodes.support import error_line, run, run_here
 
 
@@ -39,12 +39,6 @@ def test_a_mapper_without_a_socket_is_not_asked(
     places = {"MAP": f"ipc://{tmp_path}/query", "poses.tum": str(tmp_path / "poses.tum")}
     code, said = run_here(*(places.get(word, word) for word in words))
     assert code == 1 and f"{places['MAP']}: there is no such socket" in said
-
-
-def test_a_socket_that_may_be_there_is_asked(tmp_path: Path) -> None:
-    (tmp_path / "query").touch()
-    for endpoint in (f"ipc://{tmp_path}/query", "tcp://127.0.0.1:1", "ipc://@name", "inproc://query"):
-        refuse_missing_socket(endpoint)
 
 
 def test_labels_for_a_launch_without_a_finetuner_are_refused_at_once(log: Path, tmp_path: Path) -> None:

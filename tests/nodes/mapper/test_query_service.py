@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError
 from semantic_mapper.geometry import transform
+from semantic_mapper.mapping.map_types import CameraPose, PoseInMap
 from semantic_mapper.mapping.moving import MovingSpace
-from semantic_mapper.mapping.odometry_sessions import CameraPose, PoseInMap
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService

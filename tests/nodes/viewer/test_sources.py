@@ -14,7 +14,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -22,25 +22,27 @@ import msgspec
 import numpy as np
 import pytest
 import rerun.chunk
+from rerun import RecordingStream
 
-from semantic_mapper.errors import MapError, TransportError
+from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.cli.options import Remote
-from semantic_mapper.nodes.cli.view import _find_live, _Page
-from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.cli.view import _find_live
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.viewer import server
 from semantic_mapper.nodes.viewer.mapped_log import show_log
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import BlockAges
 from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file, recording_server
+from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.sockets import Publisher
-from semantic_mapper.types import MapUpdate
+from tests.nodes.foxglove.robot import update_for
 from tests.nodes.mapper.test_query_service import answering
 from tests.nodes.support import error_line, eventually, is_alive, run
 from tests.queries.scene import LABELS, painted, whole_map
@@ -55,24 +57,6 @@ def logged(path: Path) -> Counter[str]:
     for chunk in rerun.chunk.RrdReader(path).stream():
         rows[chunk.entity_path] += chunk.num_rows
     return rows
-
-
-def update_for(frame, label) -> MapUpdate:
-    size = frame.rgb.shape[:2]
-    return MapUpdate(
-        stamp_ns=frame.stamp_ns,
-        seq=frame.seq,
-        camera_id=frame.camera_id,
-        fused=True,
-        is_keyframe=False,
-        source_seqs=(),
-        label=np.full(size, label, np.uint8),
-        confidence=np.ones(size, np.float32),
-        depth_m=np.ones(size, np.float32),
-        blocks=1,
-        blocks_touched=1,
-        stage_ms={"render": 3.0, "fuse": 1.0},
-    )
 
 
 def listening(port: int) -> set[str]:
@@ -127,19 +111,14 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
         assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
 
 
-def test_an_error_while_something_is_shown_is_the_only_one(capfd: pytest.CaptureFixture[str]) -> None:
-    def show_and_fail() -> None:
-        with _Page(0, 0, 64, Output.guarded()) as page:
-            log = RerunLog(page.begin(), LABELS)
-            assert page.alive
-            for _ in range(20):
-                log.log_map(whole_map().points())
-            raise MapError("ours")
-
-    with pytest.raises(MapError, match="ours"):
-        show_and_fail()
-    said = capfd.readouterr()
-    assert said.out.startswith("watch at http://127.0.0.1:") and not said.err
+def test_a_viewer_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "rerun"
+    locked = 'if sys.argv[1] != "analytics": sys.exit("the door is locked")'
+    program.write_text(f"#!{sys.executable} -I\nimport sys\n{locked}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(server, "_find_program", lambda: str(program))
+    with pytest.raises(TransportError, match=r"has not started.* the door is locked"), WebViewer(0, 0):
+        pass
 
 
 def test_a_viewer_that_is_killed_leaves_no_server() -> None:
@@ -157,18 +136,19 @@ def test_a_viewer_that_is_killed_leaves_no_server() -> None:
 
 
 def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path, tmp_path: Path) -> None:
-    done: list[int] = []
-    show_log(
-        log,
-        weights,
-        tiny_config(),
-        5,
-        lambda: recording_file(tmp_path / "log.rrd"),
-        0.0,
-        going=lambda: len(done) < 4,
-        on_start=done.append,
-        on_frame=done.append,
-    )
+    done: list[int | None] = []
+
+    class Monitor(JobMonitor):
+        def start(self, total: int | None) -> None:
+            done.append(total)
+
+        def set(self, frames: int, note: str = "") -> None:
+            done.append(frames)
+
+    def begin() -> RecordingStream:
+        return recording_file(tmp_path / "log.rrd")
+
+    show_log(log, weights, tiny_config(), 5, begin, 0.0, lambda: len(done) < 4, Monitor())
     assert done == [5, 1, 2, 3], "asked to end after the third frame"
     rows = logged(tmp_path / "log.rrd")
     camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"
@@ -212,27 +192,6 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
     camera = f"/world/cameras/{frames[0].camera_id}/image"
     assert 1 <= rows[f"{camera}/rgb"] <= 3 and 1 <= rows[f"{camera}/semantics"] <= 3, "the newest of what came"
     assert rows["/world/map/class"] == rows["/world/map/age"] == 1, "a map that has not changed is not sent again"
-
-
-def test_several_cameras_are_shown_until_the_last_one_ends(tmp_path: Path) -> None:
-    frame, cameras = tiny_frames()[0], ("left", "right")
-    told: list[str] = []
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder, ExitStack() as stack:
-        live = Live(f"ipc://{folder}/query", tuple(f"ipc://{folder}/{name}" for name in cameras), streams=2)
-        left, right = (stack.enter_context(Publisher(endpoint)) for endpoint in live.nodes)
-        stack.enter_context(answering(live.query, whole_map()))
-        stack.enter_context(watching_live(live, tmp_path / "live.rrd", told))
-        assert eventually(lambda: bool(left.subscribers("frame") and right.subscribers("frame")), WARM_S)
-        left.publish(encode_frame(dataclasses.replace(frame, camera_id="left")))
-        left.publish(encode(EndOfStream("left", "end", 1)))
-        left.remind("end")  # said again, it is still one camera's
-        assert not eventually(lambda: not right.subscribers("frame"), 0.7) and not told, "it goes on"
-        right.publish(encode_frame(dataclasses.replace(frame, camera_id="right")))
-        right.publish(encode(EndOfStream("right", "end", 1)))
-        assert eventually(lambda: "the stream has ended" in told, 60)
-    rows = logged(tmp_path / "live.rrd")
-    assert rows["/world/cameras/left/image/rgb"] == rows["/world/cameras/right/image/rgb"] == 1
-    assert not rows["/world/cameras/left"] + rows["/world/cameras/left/image"], "where in the map it was is not known"
 
 
 def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:

@@ -4,10 +4,10 @@ import torch
 from semantic_mapper.config import SRayConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.registry import PRESETS, build_field, field_config, field_kinds, field_names
+from semantic_mapper.fields.learned import KINDS, build_field
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.training.config import StepConfig
-from semantic_mapper.training.step import step_on_rays
+from semantic_mapper.training.finetune import step_on_rays
 from semantic_mapper.training.views import view_from_frame
 from tests.fields.scene import wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, TINY, tiny
@@ -16,40 +16,25 @@ from tests.small import tiny_frames
 STEP = StepConfig(rays=32, samples_without_depth=4)
 
 
-# A plain grid learns no classes; other fields of one scene learn them in their own fits, not in steps of all kinds.
-TRAINED = [
-    name
-    for name in field_names()
-    if name not in ("grid", "panoptic", "panoptic_uniform") and not name.startswith("irt")
-]
-
-
-def test_every_name_is_tested_here():
-    assert set(TINY) == set(field_names()) == set(field_kinds()) | set(PRESETS)
-
-
-@pytest.mark.parametrize("name", field_names())
-def test_every_kind_is_built_from_its_defaults_and_from_plain_data(name: str):
-    field = build_field(name, {}, LABELS)
-    assert field.config == field_config(name, {}) and field.label_set == LABELS
-    assert field.kind == (PRESETS[name][0] if name in PRESETS else name)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_built_from_its_defaults_and_from_plain_data(kind: str):
+    assert kind in TINY
+    field = build_field(kind, {}, LABELS)
+    assert field.kind == kind and field.config == KINDS[kind].config() and field.label_set == LABELS
     rows = dict(field.named_parameters())
-    assert bool(field.class_rows) == (name != "grid") and all(rows[r].shape[0] == len(LABELS) for r in field.class_rows)
+    assert bool(field.class_rows) == (kind != "grid") and all(rows[r].shape[0] == len(LABELS) for r in field.class_rows)
 
 
-def test_an_unknown_name_is_refused_with_those_there_are():
-    with pytest.raises(ConfigError, match=r"no field of kind 'nerf'; there are .*grid.*sray-none"):
+def test_unknown_kinds_and_configs_of_others_are_refused():
+    with pytest.raises(ConfigError, match=r"no field of kind 'nerf'; there are .*grid.*sray"):
         build_field("nerf", {}, LABELS)
-
-
-def test_a_config_of_another_kind_is_refused():
     with pytest.raises(ConfigError, match="'unet' takes a UNetFieldConfig, got a SRayConfig"):
         build_field("unet", SRayConfig(), LABELS)
     with pytest.raises(ConfigError, match="feature_dim"):
         build_field("unet", {"feature_dims": 3}, LABELS)
 
 
-@pytest.mark.parametrize("name", field_names())
+@pytest.mark.parametrize("name", TINY)
 def test_every_kind_goes_through_a_checkpoint(name: str, tmp_path):
     field = tiny(name)
     save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors")
@@ -60,7 +45,7 @@ def test_every_kind_goes_through_a_checkpoint(name: str, tmp_path):
         assert torch.equal(loaded.state_dict()[key], tensor.half().float() if half else tensor)
 
 
-@pytest.mark.parametrize("name", field_names())
+@pytest.mark.parametrize("name", TINY)
 def test_every_kind_is_adapted_to_another_label_set_by_class_name(name: str):
     field = tiny(name)
     adapted = adapt_model(field, make_label_set("other", ["c", "new", "a"]))
@@ -71,7 +56,7 @@ def test_every_kind_is_adapted_to_another_label_set_by_class_name(name: str):
     assert adapted.render(rays, adapted.encode(wall_sources(POSES))).logits.shape == (len(rays.origin), 3)
 
 
-@pytest.mark.parametrize("name", TRAINED)
+@pytest.mark.parametrize("name", ["sray", "sray-paper", "unet"])
 @pytest.mark.parametrize("own_view", [True, False])
 def test_every_kind_takes_a_training_step(name: str, own_view: bool):
     """Also the U-Net where the query's own image is not among its sources: its dense loss goes on."""
@@ -88,7 +73,7 @@ def test_every_kind_takes_a_training_step(name: str, own_view: bool):
     assert all(torch.isfinite(p).all() for p in field.parameters())
 
 
-@pytest.mark.parametrize("name", field_names())
+@pytest.mark.parametrize("name", TINY)
 def test_no_kind_depends_on_how_rays_are_split_into_chunks(name: str):
     field = tiny(name)
     rays = wall_rays(POSES[1], step=3)

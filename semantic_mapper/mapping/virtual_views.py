@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.geometry import check_pose, invert_pose, look_at, nearest_pixels, scale_intrinsics, transform
 from semantic_mapper.kernels import parallel_kernel
@@ -21,7 +20,7 @@ from semantic_mapper.mapping.fusion.allocation import blocks_in_band, make_camer
 from semantic_mapper.mapping.fusion.fuse import (
     FULL_TRUST_RANGE_M,
     ProbabilityTable,
-    check_depth,
+    checked_depth,
     frame_votes,
     make_limits,
     probability_table,
@@ -31,7 +30,7 @@ from semantic_mapper.mapping.keyframes import Keyframe
 from semantic_mapper.mapping.storage.block_grid import GridBuffers
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, Int64
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64
 from semantic_mapper.view_selection import visible_points
 
 VOTE_WEIGHT = 0.3  # of a vote, against one of a frame
@@ -63,17 +62,13 @@ class SurfacePatches(NamedTuple):
             the class is clear, and 0 where there are votes enough.
     """
 
-    packed: NDArray[np.int64]
+    packed: Int64
     xyz: Float64
     need: Float64
 
 
 def surface_patches(voxel_map: VoxelMap) -> SurfacePatches:
-    """Patches of the blocks in memory; those on disk are left out.
-
-    Args:
-        voxel_map: Whose surface it is.
-    """
+    """Patches of the blocks in memory; those on disk are left out."""
     config = voxel_map.config
     with voxel_map.locked() as grid:
         keys, blocks = grid.sorted_blocks()
@@ -89,40 +84,17 @@ def surface_patches(voxel_map: VoxelMap) -> SurfacePatches:
 
 
 class VirtualView(NamedTuple):
-    """A viewpoint, and what speaks for it.
-
-    Args:
-        T_world_camera: (4, 4) float64.
-        gain: Its score, in voxels without votes.
-        packed: (N,) int64 keys of the blocks in need that it sees.
-    """
+    """A viewpoint (4, 4), its score in voxels without votes, and the keys (N,) of the blocks in need that it sees."""
 
     T_world_camera: Float64
     gain: float
-    packed: NDArray[np.int64]
-
-
-class RenderedVirtualView(NamedTuple):
-    """A virtual view that was rendered and fused.
-
-    Args:
-        view: Its viewpoint.
-        source_seqs: Of the keyframes that it was rendered from.
-        blocks: That its votes went to.
-    """
-
-    view: VirtualView
-    source_seqs: tuple[int, ...]
-    blocks: int
+    packed: Int64
 
 
 class ViewpointChooser:
     """Chooses virtual views of one map, each of something else.
 
     Deterministic: the same map, keyframes, seed and number of choices before give the same view.
-
-    Args:
-        seed: Of the places next to the keyframes.
     """
 
     def __init__(self, seed: int) -> None:
@@ -134,12 +106,9 @@ class ViewpointChooser:
     def choose(
         self, voxel_map: VoxelMap, keyframes: Sequence[Keyframe], intrinsics: CameraIntrinsics
     ) -> VirtualView | None:
-        """The viewpoint of most gain; None where none has enough of it.
+        """The viewpoint of most gain for a camera, to be rendered from keyframes; None where none has enough of it.
 
-        Args:
-            voxel_map: Whose surface is looked at. After a new ``epoch`` all of it may be looked at again.
-            keyframes: To render from.
-            intrinsics: Of the virtual camera.
+        After a new ``epoch`` of the map all of it may be looked at again.
         """
         if voxel_map.epoch != self._epoch:
             self._looked_at, self._epoch = np.empty(0, np.int64), voxel_map.epoch
@@ -162,7 +131,7 @@ class ViewpointChooser:
         return best
 
 
-def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> NDArray[np.bool_]:
+def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> Bool:
     """Which points (P, 3) lie in air that a keyframe has looked through, ``MARGIN_M`` before what it saw: (P,)."""
     free = np.zeros(len(points), np.bool_)
     for k in keyframes:
@@ -172,9 +141,7 @@ def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> NDArray[np.
     return free
 
 
-def _worth_a_look(
-    patches: SurfacePatches, keyframes: Sequence[Keyframe], looked_at: NDArray[np.int64]
-) -> SurfacePatches:
+def _worth_a_look(patches: SurfacePatches, keyframes: Sequence[Keyframe], looked_at: Int64) -> SurfacePatches:
     """The neediest patches that enough keyframes see and that were not looked at; need times fraction of views."""
     fresh = np.flatnonzero((patches.need > 0) & ~np.isin(patches.packed, looked_at))
     points = patches.xyz[fresh]
@@ -268,8 +235,7 @@ def add_votes(
 
     Args:
         voxel_map: Whose surface it is.
-        T_world_camera: (4, 4) of the view.
-        intrinsics: Of ``depth_m``.
+        T_world_camera, intrinsics: (4, 4) of the view, and of ``depth_m``.
         depth_m: (H, W) float32, z of the map's surface in the view; 0 = none.
         table: Probabilities (K, L) float32, and the row (H, W) int32 that each pixel takes, -1 = unknown.
 
@@ -282,7 +248,7 @@ def add_votes(
     """
     where = "votes without a frame"
     check_pose(T_world_camera, where)
-    depth = check_depth(depth_m, intrinsics, where)
+    depth, _ = checked_depth(depth_m, None, intrinsics, where)
     limits, classes = make_limits(voxel_map.config), len(voxel_map.label_set)
     checked = probability_table(depth, table[0], None, table[1], classes, where)
     camera = make_camera(intrinsics, T_world_camera)
@@ -310,16 +276,9 @@ def _sum_surface_patches(
     need: Float64,
     count: Int64,
 ) -> None:
-    """Sums over the surface voxels of blocks: keys (B, 3), buffer indices (B,).
+    """Sums over the surface voxels of ``blocks_count`` blocks: keys (B, 3), buffer indices (B,).
 
-    Args:
-        blocks_count: B.
-        keys, blocks, buffers: Of the grid.
-        near: TSDF of voxels of the surface, at most.
-        vote_discount: rho.
-        max_votes: See ``surface_patches``.
-        total: (B, 3) zeros: sum of positions, in voxels.
-        need: (B,) zeros: see ``SurfacePatches``.
-        count: (B,) zeros: number of surface voxels.
+    ``near`` is the largest TSDF of voxels of the surface. To fill, of zeros: ``total`` (B, 3) of positions in voxels,
+    ``need`` (B,) as of ``SurfacePatches``, ``count`` (B,) of voxels.
     """
     ...

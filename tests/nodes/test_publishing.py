@@ -7,7 +7,7 @@ from pathlib import Path
 
 from structlog.testing import capture_logs
 
-from semantic_mapper.nodes.status import publish_status
+from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.transport.codec import decode_as, encode
 from semantic_mapper.transport.messages import MAX_COUNT, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher

@@ -1,4 +1,4 @@
-"""A floor plan for a robot that drives: which cells are free, which are occupied, and which nobody knows.
+"""Which way is up in a finished map, where its floor is, and a floor plan for a robot that drives.
 
 The map keeps voxels in a thin band round surfaces, so the air between a camera and what it saw is mostly not in it:
 that nothing is stored at a place does not mean that nothing is there. A plan made of a map can therefore say "free"
@@ -11,20 +11,86 @@ only where the *floor* was seen and no surface stands above it:
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.evaluation.upright import find_upright
+from semantic_mapper.files import atomic_write
 from semantic_mapper.geometry import turn_onto
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.types import Float64
+from semantic_mapper.types import Float64, UInt8
+
+FLOOR = "floor"  # the class whose points say where down is
+LEAST_SHARE = 0.01  # of a map's points that have to be floor
+FLAT_M = 0.1  # the middle half of the floor's points lies within so much of height
+LEVEL_SHARE = 0.8  # of the floor's points on several storeys, each within so much of height
+STOREY_M = 1.8  # storeys are at least so far apart
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # as in ROS's OccupancyGrid
 LAYER_M = 0.04  # thickness of the layers among which the floor is looked for
 FLOOR_SHARE = 0.25  # of the fullest layer: the lowest one with this many points is the floor
 MAX_CELLS = 100_000_000
+_FREE_GREY, _OCCUPIED_GREY, _UNKNOWN_GREY = 254, 0, 205
+_OCCUPIED_ABOVE, _FREE_BELOW = 0.65, 0.196  # of (255 - grey) / 255; nav2's own 0.25 would read unknown as free
+_UNKNOWN_RAW = 255  # mode raw: grey levels 0 to 100 are the costs themselves, and what is above is unknown
+
+
+def find_up(points: MapPoints, label_set: LabelSet) -> Float64:
+    """Up (3,) in the world: square to what is labelled floor, away from it, made exact as the overview picture does.
+
+    The picture starts from the camera's poses, which a saved map does not hold; here the floor takes their place.
+
+    Raises:
+        MapError: too little of the map is labelled floor, or what is lies in no plane.
+    """
+    named = [i for i, name in zip(label_set.ids, label_set.names, strict=True) if name == FLOOR]
+    floor = points.xyz[np.isin(points.label, named)].astype(np.float64)
+    if len(floor) < max(LEAST_SHARE * len(points.xyz), 10):
+        raise MapError("which way is up cannot be found: too little of the map is labelled floor; say it with --up")
+    rise = points.xyz.mean(axis=0, dtype=np.float64) - floor.mean(axis=0)
+    guess = _normal(floor)
+    up = find_upright(points.xyz, guess if rise @ guess > 0 else -guess)
+    low, high = np.percentile(floor @ up, (25, 75))
+    if high - low <= FLAT_M:
+        return up
+    axis = max(np.eye(3), key=lambda axis: _level_share(floor @ axis))  # floors of storeys lie in no one plane
+    up = find_upright(points.xyz, axis if rise @ axis > 0 else -axis)
+    if _level_share(floor @ up) < LEVEL_SHARE:
+        raise MapError(
+            f"which way is up cannot be found: what is labelled floor lies in no plane ({high - low:.2f} m of height); "
+            "say it with --up"
+        )
+    return up
+
+
+def _level_share(height: Float64) -> float:
+    """Fraction of heights (N,), metres, that lie in layers of ``FLAT_M`` which are as far apart as storeys."""
+    layer = np.floor((height - height.min()) / (FLAT_M / 2)).astype(np.int64)
+    counts = np.convolve(np.bincount(layer), (1, 1))
+    apart, found = round(2 * STOREY_M / FLAT_M), 0
+    while counts.any():
+        best = int(counts.argmax())
+        found += int(counts[best])
+        counts[max(0, best - apart) : best + apart] = 0
+    return found / len(height)
+
+
+def _normal(xyz: Float64) -> Float64:
+    """Normal (3,) of the plane that most points (N, 3) lie near: fitted, and fitted again without the farthest."""
+    near = xyz
+    normal = np.zeros(3)
+    for _ in range(4):
+        center = near.mean(axis=0)
+        normal = np.linalg.eigh((near - center).T @ (near - center))[1][:, 0]
+        distance = np.abs((xyz - np.median(near, axis=0)) @ normal)
+        near = xyz[distance <= np.percentile(distance, 70)]
+    return normal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,9 +175,6 @@ def occupancy_grid(
 def floor_height(height: Float64) -> float:
     """Height of the floor: the middle of the lowest layer that holds a quarter of what the fullest one holds.
 
-    Args:
-        height: (N,) of surface points, metres; N > 0.
-
     Raises:
         MapError: no points.
     """
@@ -123,3 +186,47 @@ def floor_height(height: Float64) -> float:
     while lowest + 1 < len(counts) and counts[lowest + 1] > counts[lowest]:
         lowest += 1
     return float(np.median(height[np.abs(layer - lowest) <= 1]))
+
+
+def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
+    """Write the YAML and, next to it, the PGM of the same stem; of a grid with costs, these as ``STEM_costs``, too.
+
+    The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
+    pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.
+
+    Returns:
+        The YAML and the PGM; then those of the costs.
+
+    Raises:
+        MapError: a file cannot be written.
+    """
+    grey = np.full(grid.cells.shape, _UNKNOWN_GREY, np.uint8)
+    grey[grid.cells == FREE] = _FREE_GREY
+    grey[grid.cells == OCCUPIED] = _OCCUPIED_GREY
+    files = _write_grid(path, grid, grey, "trinary")
+    if grid.costs is None:
+        return files
+    grey = np.where(grid.costs < 0, _UNKNOWN_RAW, grid.costs).astype(np.uint8)
+    return files + _write_grid(path.with_stem(f"{path.stem}_costs"), grid, grey, "raw")
+
+
+def _write_grid(path: Path, grid: OccupancyGrid, grey: UInt8, mode: str) -> tuple[Path, Path]:
+    picture, description = path.with_suffix(".pgm"), path.with_suffix(".yaml")
+    rows, columns = grey.shape
+    with atomic_write(picture, raises=MapError) as file:
+        file.write(f"P5\n{columns} {rows}\n255\n".encode())
+        file.write(np.ascontiguousarray(grey[::-1]).tobytes())
+    x, y = grid.origin_m
+    lines = (
+        f"image: {json.dumps(picture.name)}",
+        f"mode: {mode}",
+        f"resolution: {grid.resolution_m!r}",
+        f"origin: [{x:.6f}, {y:.6f}, 0.0]",
+        "negate: 0",
+        f"occupied_thresh: {_OCCUPIED_ABOVE}",
+        f"free_thresh: {_FREE_BELOW}",
+        f"T_grid_world: {np.round(grid.T_grid_world, 9).tolist()}",
+    )
+    with atomic_write(description, raises=MapError) as file:
+        file.write(("\n".join(lines) + "\n").encode())
+    return description, picture

@@ -1,24 +1,78 @@
-"""Frames, maps and graphs in plain forms that other tools read."""
+"""Maps for other tools: fetched again and again, and in plain forms."""
 
 from __future__ import annotations
 
-from typing import Any
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
 
-import cv2
 import numpy as np
+import structlog
 
-from semantic_mapper.errors import FrameError
+from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.types import Float64, MapUpdate, PosedFrame, UInt8
+from semantic_mapper.types import UInt8
 
 MAX_POINTS = 400_000  # of a map that is shown again and again: of a larger one every second point, or third, ...
-JPEG_QUALITY = 80
 # One point: world metres, colour, class id, confidence in 255ths, 1 where a sensor measured it, else 0, one spare.
 POINT = np.dtype(
     [(axis, "<f4") for axis in ("x", "y", "z")]
     + [(name, "u1") for name in ("red", "green", "blue", "alpha", "label", "confidence", "measured", "spare")]
 )
+
+_log = structlog.get_logger(__name__)
+
+
+class MapFollower:
+    """Looks at a map again and again, in a thread of its own, and once more at the end; a context manager.
+
+    Args:
+        look: May raise errors of ours: a mapper that starts has no map for a while.
+        refresh_s: Between two looks, at least.
+        pause: After a look, so many times as long as it took, at least.
+
+    Attributes:
+        trouble: Why the last look failed; empty = it did not.
+    """
+
+    def __init__(self, look: Callable[[], None], refresh_s: float, pause: float = 0.0) -> None:
+        self.trouble = ""
+        self._look = look
+        self._refresh_s = refresh_s
+        self._pause = pause
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="map", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still looks; False before its end only by a bug."""
+        return self._thread.is_alive()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        ended, pause_s = False, 0.0
+        while not ended:
+            ended = self._ended.wait(max(self._refresh_s, pause_s))
+            began = time.monotonic()
+            try:
+                self._look()
+                self.trouble, pause_s = "", self._pause * (time.monotonic() - began)
+            except SemanticMapperError as error:
+                if not (self.trouble or ended):
+                    _log.warning("map_not_shown", reason=str(error))
+                self.trouble, pause_s = str(error), 0.0
 
 
 def thinning(count: int) -> int:
@@ -69,40 +123,3 @@ def describe_map(snapshot: MapSnapshot, count: int, stamp_ns: int) -> dict[str, 
         "unknown_id": labels.ignore_id,
         "classes": [{"id": i, "name": name, "color": list(color)} for i, name, color in classes],
     }
-
-
-def describe_pose(frame: PosedFrame, T_map_camera: Float64 | None) -> dict[str, Any]:
-    """Where a frame was taken in the map (None = that is not known), and with which lens, for JSON."""
-    k = frame.intrinsics
-    return {
-        "stamp_ns": frame.stamp_ns,
-        "seq": frame.seq,
-        "camera": frame.camera_id,
-        "T_map_camera": None if T_map_camera is None else T_map_camera.tolist(),
-        "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "width": k.width, "height": k.height},
-        "pose_source": frame.pose_source,
-    }
-
-
-def moving_mask(update: MapUpdate) -> UInt8:
-    """255 (H, W) where something moves, which the map leaves out; else 0."""
-    none = np.zeros(update.label.shape, np.uint8)
-    return none if update.moving is None else np.where(update.moving, np.uint8(255), none)
-
-
-def to_jpeg(rgb: UInt8) -> bytes:
-    """JPEG file of an image (H, W, 3)."""
-    return _encoded(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-
-
-def to_png(image: UInt8) -> bytes:
-    """PNG file of an image (H, W, 3) or of one channel (H, W); little compressed, for speed."""
-    turned = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    return _encoded(".png", turned, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-
-
-def _encoded(kind: str, image: Any, flags: list[int]) -> bytes:
-    done, data = cv2.imencode(kind, image, flags)
-    if not done:
-        raise FrameError(f"an image of shape {image.shape} cannot be written as {kind}")
-    return data.tobytes()

@@ -1,4 +1,4 @@
-"""A client of Foxglove's websocket protocol (subprotocol foxglove.sdk.v1), for tests and measurements."""
+"""A client of Foxglove's websocket protocol (subprotocol foxglove.sdk.v1)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ MESSAGE_DATA = 1  # opcode; then the subscription's id and the log time, little-
 
 
 class Received(NamedTuple):
-    """One message: its topic, the name of its schema, log time in nanoseconds, and the encoded message itself."""
+    """One message: its topic, log time in nanoseconds, and the encoded message itself."""
 
     topic: str
-    schema: str
     log_time_ns: int
     data: bytes
 
@@ -35,7 +34,7 @@ class FoxgloveClient:
 
     def __init__(self, url: str, topics: Collection[str] | None = None) -> None:
         self._topics = topics
-        self._channels: dict[int, tuple[str, str]] = {}  # topic and schema, by subscription
+        self._topic_of: dict[int, str] = {}  # by subscription
         self._end = ExitStack()
         opened = connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None, compression=None)
         self._socket = self._end.enter_context(opened)
@@ -54,7 +53,7 @@ class FoxgloveClient:
                     self._subscribe(said["channels"])
             elif message[0] == MESSAGE_DATA:
                 subscription, log_time_ns = struct.unpack_from("<IQ", message, 1)
-                return Received(*self._channels[subscription], log_time_ns, message[13:])
+                return Received(self._topic_of[subscription], log_time_ns, message[13:])
 
     def close(self) -> None:
         """Disconnect."""
@@ -72,7 +71,7 @@ class FoxgloveClient:
         wanted = [c for c in channels if self._topics is None or c["topic"] in self._topics]
         subscriptions: list[dict[str, object]] = []
         for channel in wanted:
-            number = len(self._channels)
-            self._channels[number] = channel["topic"], channel["schemaName"]
+            number = len(self._topic_of)
+            self._topic_of[number] = channel["topic"]
             subscriptions.append({"id": number, "channelId": channel["id"]})
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))

@@ -2,6 +2,9 @@
 
 ``add_own_image`` joins it with what the frame's image says by itself. A rendered view has the image among its sources,
 but few rays: what lies between them is filled in. The image's own features are classified at every coarse pixel.
+``upsample`` brings the coarse view to the size of the frame, along the edges of its image and depth: the coarse pixels
+round a full pixel decide together which class it is of; then it takes the probabilities of one of them. So an upsampled
+view is an index a pixel, not a vector of probabilities a pixel.
 """
 
 from __future__ import annotations
@@ -13,7 +16,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.nn import functional
 
 from semantic_mapper.config import RenderConfig, SamplingConfig
@@ -21,8 +23,10 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews, ImageClassifier, Sampled, SemanticField
 from semantic_mapper.fields.render import render_sparse_view, render_view
 from semantic_mapper.fields.volume import around_computed
+from semantic_mapper.geometry import expect_shape
+from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.fusion.fuse import PROBABILITY_FLOOR
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, UInt8
 
 SAMPLES_WITHOUT_DEPTH = 32  # a ray, of views of which neither sensor nor map knows any depth
 LEAST_SAMPLES = 2
@@ -30,39 +34,35 @@ LEAST_SHARE = 0.1  # of the pixels; below, samples go first
 RESERVE = 0.9  # of a frame's time is planned for: frames differ
 MEMORY = 0.7  # of what was known stays when a new frame is measured
 
+COLOUR_RATE = 1 / (2 * 20.0**2)  # sigma of 20 8-bit steps
+DEPTH_SIGMA = 0.02  # fraction of z
+LARGEST_STEP = 8.0  # a depth that differs by more counts no more: then colour decides among the rest
+LEAST_WEIGHT = 1e-9  # where nothing looks alike, the coarse pixels still count alike
+
 
 class RenderedView(NamedTuple):
-    """What a field says of a view.
+    """What a field says of a view: probabilities (h, w, L) float32, where they mean something (h, w), depth (h, w) or
+    0.
 
-    Args:
-        probabilities: (h, w, L) float32.
-        known: (h, w) bool, where they mean something.
-        depth_m: (h, w) float32, 0 where not known.
-        rays: How many were rendered.
-        samples: Of a ray; 0 where the field draws its own.
+    ``rays`` were rendered, with so many ``samples`` each; 0 where the field draws its own.
     """
 
     probabilities: Float32
-    known: NDArray[np.bool_]
+    known: Bool
     depth_m: Float32
-    rays: int
-    samples: int
+    rays: int = 0
+    samples: int = 0
 
 
 class ViewRenderer:
     """Renders views from one field.
-
-    Args:
-        field: Whose samples a ray can be set, where a rate is to be held.
-        config: Fraction of the rays, rate.
-        sampling: Of a ray with a depth prior.
 
     Raises:
         ConfigError: ``config.target_hz`` with a field that has no samples to set.
     """
 
     def __init__(self, field: SemanticField, config: RenderConfig, sampling: SamplingConfig) -> None:
-        self._field = field
+        self.field = field  # may be exchanged for one of the same kind
         self._config = config
         self._sampling = sampling
         self._rate_controller: RateController | None = None
@@ -71,10 +71,6 @@ class ViewRenderer:
                 raise ConfigError(f"render.target_hz needs a field whose samples can be set; {type(field)} has none")
             self._rate_controller = RateController(config.target_hz, config.ray_fraction, sampling)
         self._last = (0, 0)  # rays and samples of the last view, where its time tells of the next one's
-
-    def exchange_field(self, field: SemanticField) -> None:
-        """Render from another field, of the same kind, from now on."""
-        self._field = field
 
     def note(self, render_ms: float, other_ms: float) -> None:
         """What the frame of the last view took: its rendering, and all else."""
@@ -89,7 +85,7 @@ class ViewRenderer:
         prior_m: Float32,
         rgb: UInt8,
         *,
-        measured: NDArray[np.bool_] | None = None,
+        measured: Bool | None = None,
         computed: bool = False,
         stamp_ns: int | None = None,
     ) -> RenderedView:
@@ -114,10 +110,10 @@ class ViewRenderer:
         elif computed:
             sampling = around_computed(sampling)
         samples = 0
-        if isinstance(self._field, Sampled) and sampling.mode == "streaming":
-            self._field.sampling = sampling
+        if isinstance(self.field, Sampled) and sampling.mode == "streaming":
+            self.field.sampling = sampling
             samples = sampling.guided
-        scene = (self._field, sources, intrinsics, T_world_camera, prior_m, sampling, 0)
+        scene = (self.field, sources, intrinsics, T_world_camera, prior_m, sampling, 0)
         if fraction == 1:
             probabilities, known, depth_m = render_view(*scene, measured, stamp_ns)
             rays = prior_m.size
@@ -128,13 +124,10 @@ class ViewRenderer:
 
 
 def add_own_image(view: RenderedView, field: SemanticField, current: EncodedViews, weight: float) -> RenderedView:
-    """The weighted geometric mean of the class probabilities of both, where the view is known.
+    """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it
+    is known.
 
-    Args:
-        view: Rendered, (h, w).
-        field: The view is returned as it is where this has no opinion of single images.
-        current: The frame's own image, encoded.
-        weight: Of what the image says by itself, 0..1; 0 = the view as it is.
+    The view is returned as it is where the field has no opinion of single images, or ``weight``, 0..1, is 0.
     """
     if weight == 0 or not isinstance(field, ImageClassifier):
         return view
@@ -152,20 +145,15 @@ def add_own_image(view: RenderedView, field: SemanticField, current: EncodedView
 
 
 class RateController:
-    """Trades rays, then samples, for a target rate.
+    """Trades rays, then samples, for a target rate: at most this ``fraction`` of the pixels, and these samples.
 
     What a frame takes is modelled as a part that does not depend on rays, and a cost a ray and sample; both are
     followed from frame to frame. What it chooses depends on the machine, so a map made with it is not reproducible.
-
-    Args:
-        target_hz: Frames a second to hold.
-        fraction: Largest fraction of the pixels that may have rays.
-        sampling: The most samples a ray.
     """
 
     def __init__(self, target_hz: float, fraction: float, sampling: SamplingConfig) -> None:
         self._budget_ms = RESERVE * 1e3 / target_hz
-        self._share = fraction
+        self._fraction = fraction
         self._sampling = sampling
         self._other_ms: float | None = None
         self._sample_ms: float | None = None  # of one sample of one ray
@@ -173,14 +161,14 @@ class RateController:
     def choose(self, pixels: int) -> tuple[float, SamplingConfig]:
         """Fraction of the ``pixels`` of the rendered view that may have rays, and the samples a ray."""
         if self._other_ms is None or self._sample_ms is None:
-            return self._share, self._sampling
+            return self._fraction, self._sampling
         samples = max(self._budget_ms - self._other_ms, 0.0) / self._sample_ms
         count = self._sampling.guided
-        while count > LEAST_SAMPLES and samples / (count * pixels) < min(LEAST_SHARE, self._share):
+        while count > LEAST_SAMPLES and samples / (count * pixels) < min(LEAST_SHARE, self._fraction):
             count -= 1
         free = min(self._sampling.free_space, count - LEAST_SAMPLES)
         sampling = msgspec.structs.replace(self._sampling, guided=count, free_space=free)
-        return min(samples / (count * pixels), self._share), sampling
+        return min(samples / (count * pixels), self._fraction), sampling
 
     def note(self, render_ms: float, other_ms: float, rays: int, samples: int) -> None:
         """What a frame took: its rendering, and all else."""
@@ -191,3 +179,78 @@ class RateController:
 
 def _follow(old: float | None, new: float) -> float:
     return new if old is None else MEMORY * old + (1 - MEMORY) * new
+
+
+def upsample(
+    probabilities: Float32, known: Bool, rgb_low: UInt8, depth_low: Float32, rgb: UInt8, depth: Float32
+) -> Int32:
+    """Joint bilateral upsampling: every full pixel takes one of the 3x3 coarse pixels round it.
+
+    It is of the class that these nine give together, weighted by how much they look like the pixel, and of that class
+    the one that is most like it. Where all nine are of one class it takes the middle one.
+
+    Args:
+        probabilities, known: (h, w, L) float32 and (h, w) bool.
+        rgb_low, depth_low: (h, w, 3) uint8 and (h, w) float32 at the coarse pixels.
+        rgb, depth: (H, W, 3) uint8 and (H, W) float32; depth 0 = none, then colour alone decides.
+
+    Returns:
+        (H, W) int32 number of the coarse pixel (row * w + column), -1 where none of the nine is known.
+
+    Raises:
+        ShapeError: arrays that do not fit together.
+    """
+    sizes = expect_shape(probabilities, "h w L", "coarse probabilities")
+    coarse = f"{sizes['h']} {sizes['w']}"
+    expect_shape(known, coarse, "coarse known")
+    expect_shape(rgb_low, f"{coarse} 3", "coarse rgb")
+    expect_shape(depth_low, coarse, "coarse depth")
+    sizes = expect_shape(depth, "H W", "depth")
+    expect_shape(rgb, f"{sizes['H']} {sizes['W']} 3", "rgb")
+    out = np.full(depth.shape, -1, np.int32)
+    if not known.size:
+        return out
+    channel = np.ascontiguousarray(np.where(known, probabilities.argmax(axis=2), -1))
+    look = np.dstack((rgb_low.astype(np.float32), depth_low))
+    one_class = np.empty(channel.shape, np.bool_)
+    find_one_class(len(channel), channel, one_class)
+    upsample_view(
+        len(depth),
+        np.ascontiguousarray(probabilities.reshape(-1, probabilities.shape[2])),
+        channel,
+        one_class,
+        look,
+        np.ascontiguousarray(rgb),
+        np.ascontiguousarray(depth),
+        out,
+        COLOUR_RATE,
+        DEPTH_SIGMA,
+        LARGEST_STEP,
+        LEAST_WEIGHT,
+    )
+    return out
+
+
+@parallel_kernel()
+def find_one_class(count: int, channel: Int64, one_class: Bool) -> None:
+    """Whether the 3x3 coarse pixels round each (h, w) are known and of one class; ``count`` is h."""
+    ...
+
+
+@parallel_kernel()
+def upsample_view(
+    count: int,
+    probabilities: Float32,
+    channel: Int64,
+    one_class: Bool,
+    look: Float32,
+    rgb: UInt8,
+    depth: Float32,
+    out: Int32,
+    colour_rate: float,
+    depth_sigma: float,
+    largest_step: float,
+    sample_weight_threshold: float,
+) -> None:
+    """``upsample`` of ``count`` rows; ``look`` (h, w, 4) is colour and depth of the coarse pixels."""
+    ...

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.nodes.bridge import packing
-from semantic_mapper.nodes.bridge.packing import POINT, pack_points, thinned, thinning
+from semantic_mapper.nodes import map_feed
+from semantic_mapper.nodes.map_feed import POINT, pack_points, thinned, thinning
 
 
 def points(count: int) -> MapPoints:
@@ -18,7 +18,7 @@ def points(count: int) -> MapPoints:
 
 
 def test_a_large_map_is_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packing, "MAX_POINTS", 4)
+    monkeypatch.setattr(map_feed, "MAX_POINTS", 4)
     few = thinned(points(9))
     assert few.label.tolist() == [0, 3, 6] and few.xyz[1].tolist() == [9, 10, 11]
     assert [thinning(count) for count in (0, 4, 5, 8, 9)] == [1, 1, 2, 2, 3]

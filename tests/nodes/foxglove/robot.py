@@ -1,4 +1,4 @@
-"""A robot as bridges see it: a camera's and a mapper's topics, and the questions about a known map."""
+"""A robot as Foxglove sees it: a camera's and a mapper's topics, and the questions about a known map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.node import NodeContext
-from semantic_mapper.nodes.options import BridgeOptions
+from semantic_mapper.nodes.options import FoxgloveOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import Keys
@@ -83,7 +83,7 @@ class Robot:
 
 
 @contextmanager
-def bridged_robot(run: Callable[[NodeContext, Any], None], options: BridgeOptions, name: str) -> Iterator[Robot]:
+def bridged_robot(run: Callable[[NodeContext, Any], None], options: FoxgloveOptions, name: str) -> Iterator[Robot]:
     """A robot whose bridge is at work, in a thread of its own."""
     with a_folder() as folder, ExitStack() as stack:
         endpoints = {one: f"ipc://{folder / one}" for one in ("camera", "mapper", "query", name)}

@@ -1,0 +1,117 @@
+"""Publishing: of what a node says of itself, and at a second endpoint for other programs and machines."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import structlog
+
+from semantic_mapper.errors import CodecError
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.keys import load_keys
+from semantic_mapper.transport.messages import Buffer, NodeState, Status
+from semantic_mapper.transport.sockets import Publisher
+
+STATUS_PERIOD_S = 1.0
+
+_log = structlog.get_logger(__name__)
+
+
+class PartStatus(NamedTuple):
+    """What one part of a node says of itself: counts, and what does not work as it should."""
+
+    counters: dict[str, int]
+    warnings: tuple[str, ...] = ()
+
+
+def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0) -> None:
+    """Publish a status; one that cannot be sent is no reason for a node to end.
+
+    Args:
+        publisher: Of the node.
+        status: What it says.
+        timeout_s: As of ``Publisher.publish``.
+
+    Raises:
+        TransportError: as of ``Publisher.publish``.
+    """
+    try:
+        parts = encode(status)
+    except CodecError as error:
+        _log.error("status_not_reported", reason=str(error))
+        return
+    publisher.publish(parts, timeout_s)
+
+
+class StatusReport:
+    """Publishes how a node is, about once a second.
+
+    Args:
+        node: Its name.
+        publisher: Where.
+    """
+
+    def __init__(self, node: str, publisher: Publisher) -> None:
+        self._node = node
+        self._publisher = publisher
+        self._last = 0.0
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to."""
+        return time.monotonic() - self._last >= STATUS_PERIOD_S
+
+    def publish(
+        self, state: NodeState, counters: Mapping[str, int], ages_s: Mapping[str, float], degraded: tuple[str, ...]
+    ) -> Status:
+        """Publish it now; what was published."""
+        self._last = time.monotonic()
+        status = Status(self._node, state, time.monotonic_ns(), dict(counters), dict(ages_s), degraded)
+        publish_status(self._publisher, status)
+        return status
+
+
+class PublicPublisher(Publisher):
+    """Sends every message to two endpoints; who does not keep up at the second one loses messages.
+
+    Args:
+        endpoint: Of the node, among those of its launch.
+        public: The fixed one, ``ipc://PATH`` or ``tcp://ADDRESS:PORT``; empty = none.
+        keys: Folder of keys: what goes out there is encrypted, and sent to its peers alone; empty = none.
+        linger_ms: See ``Publisher``.
+
+    Raises:
+        TransportError: see ``Publisher``; other machines could reach the second one, and there are no keys.
+    """
+
+    def __init__(self, endpoint: str, public: str, keys: str, *, linger_ms: int = 2000) -> None:
+        self._public: Publisher | None = None
+        if public:
+            known = load_keys(Path(keys).expanduser()) if keys else None
+            self._public = Publisher(public, keys=known, linger_ms=linger_ms)
+        try:
+            super().__init__(endpoint, linger_ms=linger_ms)
+        except BaseException:
+            if self._public is not None:
+                self._public.close()
+            raise
+
+    @property
+    def public_endpoint(self) -> str:
+        """The second endpoint as ZeroMQ names it; empty = none."""
+        return "" if self._public is None else self._public.endpoint
+
+    def publish(self, parts: Sequence[Buffer], timeout_s: float = 30.0) -> None:
+        """As of ``Publisher``."""
+        super().publish(parts, timeout_s)
+        if self._public is not None:
+            self._public.publish(parts, timeout_s)
+
+    def close(self) -> None:
+        """As of ``Publisher``."""
+        super().close()
+        if self._public is not None:
+            self._public.close()

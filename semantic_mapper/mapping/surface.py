@@ -1,0 +1,283 @@
+"""Reading the surface of a map: as seen from a pose, at points, as points and as a triangle mesh.
+
+Open3D's own ``ray_cast`` is off by half a voxel and can crash when its range buffer overflows; this ray caster walks
+from block to block, steps by the TSDF and finds the zero crossing on the interpolated field. There, and at any other
+point, the map is read by interpolation over the eight voxels around it, then label and confidence.
+
+With n votes of evidence e, what the votes say together is ``p = softmax(e * n_eff / n)``, where
+``n_eff = n / (1 + rho (n - 1))`` for n > 1: views of one place repeat each other's errors, so a hundred of them are
+worth at most 1 / rho independent ones. A vote that is trusted less, n < 1, weighs less against others, but where it is
+the only one it means what the field said: n_eff = 1. The label is the argmax, its confidence p[label]. Below
+``unknown_below`` the label is unknown; the confidence stays that of the likeliest class.
+
+The C code of it is in ``ray_casting.h``, ``readout.h`` and ``extract.c``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.fusion.allocation import Camera, blocks_in_view, blocks_within_reach
+from semantic_mapper.mapping.map_types import MapMesh
+from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, NEIGHBOURS, BlockGrid, GridBuffers
+from semantic_mapper.mapping.storage.block_index import BlockIndex, find_blocks, pack_keys, unpack_keys
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, UInt8
+
+MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
+
+
+class Window(NamedTuple):
+    """Part of an image: first row and column, rows and columns."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def halves(self) -> tuple[Window, Window]:
+        """Both halves of its longer side."""
+        if self.height > self.width:
+            half = self.height // 2
+            return self._replace(height=half), self._replace(top=self.top + half, height=self.height - half)
+        half = self.width // 2
+        return self._replace(width=half), self._replace(left=self.left + half, width=self.width - half)
+
+
+def cast_view(
+    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
+) -> tuple[Float32, UInt8, Int64, Float32, Bool]:
+    """See the map through a camera, up to ``depth_max_m`` away.
+
+    What it may see and is on disk comes back into memory; where there is no room for all of it, for a part of the image
+    after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)
+
+    Returns:
+        depth (H, W) float32 metres (0 = miss), rgb (H, W, 3) uint8, channel (H, W) int64 (-1 = unknown),
+        confidence (H, W) float32, measured (H, W) bool.
+    """
+    size = (intrinsics.height, intrinsics.width)
+    depth, confidence = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    rgb, channel = np.zeros((*size, 3), np.uint8), np.full(size, -1, np.int64)
+    measured = np.zeros(size, np.bool_)
+    for window, seen in _windows(grid, camera, intrinsics, config):
+        if len(seen):
+            grid.page_in(seen)
+        _cast_view_rows(
+            window.height,
+            camera,
+            window,
+            config.voxel_size_m,
+            config.truncation_voxels,
+            config.depth_max_m,
+            config.vote_discount,
+            config.unknown_below,
+            grid.index,
+            grid.buffers(),
+            depth,
+            rgb,
+            channel,
+            confidence,
+            measured,
+        )
+    return depth, rgb, channel, confidence, measured
+
+
+def _windows(
+    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
+) -> Iterator[tuple[Window, Int64]]:
+    """Parts of an image that together are all of it, each with packed keys (B,) of what it may see, nearest first.
+
+    One part, and no keys, where nothing is on disk.
+    """
+    whole = Window(0, 0, intrinsics.height, intrinsics.width)
+    if not grid.stored_count:
+        yield whole, np.empty(0, np.int64)
+        return
+    voxel, reach = config.voxel_size_m, config.depth_max_m + config.truncation_voxels * config.voxel_size_m
+    waiting = [(whole, grid.keys_between(*blocks_within_reach(camera, (whole.height, whole.width), voxel, reach)))]
+    while waiting:
+        window, keys = waiting.pop()
+        moved = camera._replace(cx=camera.cx - window.left, cy=camera.cy - window.top)
+        seen = blocks_in_view(moved, (window.height, window.width), keys, voxel, reach)
+        if len(seen) <= grid.room or window.height * window.width == 1:
+            yield window, seen
+        else:
+            waiting += [(half, unpack_keys(seen)) for half in reversed(window.halves())]
+
+
+def read_points(
+    voxels: Float64,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    label_set: LabelSet,
+    vote_discount: float,
+    unknown_below: float,
+) -> tuple[UInt8, UInt8, Float32, Bool]:
+    """What a map says at points (N, 3), float64, in units of voxels.
+
+    Returns:
+        rgb (N, 3) uint8, label (N,) uint8 ids (ignore id = unknown), confidence (N,) float32 (0 = no votes), measured
+        (N,) bool, False where depth of a voxel around was computed, or none lies around.
+    """
+    rgb, channel = np.zeros((len(voxels), 3), np.uint8), np.full(len(voxels), -1, np.int64)
+    confidence, measured = np.zeros(len(voxels), np.float32), np.zeros(len(voxels), np.bool_)
+    points = np.ascontiguousarray(voxels)
+    decision = (vote_discount, unknown_below)
+    _read_map_points(len(points), points, index, buffers, *decision, rgb, channel, confidence, measured)
+    return rgb, label_set.to_ids(channel), confidence, measured
+
+
+def surface_voxels(keys: Int32, blocks: Int32, grid: BlockGrid, min_weight: float) -> Float64:
+    """Zero crossings along voxel edges, (N, 3) float64 in units of voxels, in the order of the blocks to look at.
+
+    ``keys`` (B, 3) are their coordinates, ``blocks`` (B,) their buffer indices; both ends of an edge need
+    ``min_weight``.
+    """
+    keys, blocks, buffers = np.ascontiguousarray(keys), np.ascontiguousarray(blocks), grid.buffers()
+    starts = np.zeros(len(blocks) + 1, np.int64)
+    _count_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, starts[1:])
+    np.cumsum(starts, out=starts)
+    points = np.empty((int(starts[-1]), 3), np.float64)
+    _write_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, starts, points)
+    return points
+
+
+def triangle_mesh(
+    keys: Int32, blocks: Int32, grid: BlockGrid, voxel_size_m: float, min_weight: float
+) -> tuple[Float32, Int32]:
+    """Marching cubes over sorted blocks, tile by tile: vertices (V, 3) in metres, faces (F, 3), in a fixed order."""
+    parts: list[Float32] = []
+    for start in range(0, len(blocks), MESH_TILE_BLOCKS):
+        tile = keys[start : start + MESH_TILE_BLOCKS]
+        parts.append(_tile_triangles(tile, grid.index, grid.buffers(), voxel_size_m, min_weight))
+    triangles = np.concatenate(parts) if parts else np.empty((0, 3, 3), np.float32)
+    vertices, inverse = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    return vertices.astype(np.float32), _in_order(inverse.reshape(-1, 3))
+
+
+def _tile_triangles(
+    tile: Int32, index: BlockIndex, buffers: GridBuffers, voxel_size_m: float, min_weight: float
+) -> Float32:
+    """Triangles (T, 3, 3) of the cells of the tile's blocks; cells reach into the next blocks, so those are copied."""
+    wanted = np.unique(pack_keys((tile[:, None] + NEIGHBOURS).reshape(-1, 3)))
+    found = find_blocks(index, wanted)
+    keys, source = unpack_keys(wanted[found >= 0]), found[found >= 0]
+    grid = open3d_grid(
+        keys, voxel_size_m, tsdf=buffers.tsdf[source], weight=buffers.weight[source], color=buffers.color[source]
+    )
+    # Open3D keeps what is strictly above its threshold.
+    mesh = grid.extract_triangle_mesh(float(np.nextafter(np.float32(min_weight), np.float32(0))))
+    if mesh.is_empty() or "indices" not in mesh.triangle:
+        return np.empty((0, 3, 3), np.float32)
+    triangles = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
+    cell = np.floor(triangles.mean(axis=1) / voxel_size_m)
+    own = np.isin(pack_keys((cell // BLOCK_SIDE).astype(np.int32)), pack_keys(tile))
+    return triangles[own]
+
+
+def open3d_grid(keys: Int32, voxel_size_m: float, **attributes: NDArray[np.generic]) -> Any:
+    """An ``open3d.t.geometry.VoxelBlockGrid`` on the CPU of blocks (B, 3), with attributes (B, 512) or (B, 512, C).
+
+    Raises:
+        DependencyError: Open3D cannot be loaded.
+    """
+    o3d = load_open3d()
+    dtypes = tuple(o3d.core.Tensor.from_numpy(np.empty(0, values.dtype)).dtype for values in attributes.values())
+    shapes = tuple(values.shape[2:] or (1,) for values in attributes.values())
+    device = o3d.core.Device("CPU:0")
+    grid = o3d.t.geometry.VoxelBlockGrid(tuple(attributes), dtypes, shapes, voxel_size_m, BLOCK_SIDE, len(keys), device)
+    places, _ = grid.hashmap().activate(o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys)))
+    for name, values in attributes.items():
+        memory = grid.attribute(name).numpy()
+        memory.reshape(len(memory), *values.shape[1:])[places.numpy()] = values
+    return grid
+
+
+def join_meshes(parts: Sequence[MapMesh]) -> MapMesh:
+    """One mesh of several that share vertices at their borders, in the order that ``triangle_mesh`` gives."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    corners = np.concatenate([part.vertices for part in parts])
+    vertices, first, inverse = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
+    faces = _in_order(inverse.reshape(-1)[faces])
+    read = ("rgb", "label", "confidence", "measured")
+    return MapMesh(vertices, faces, *(np.concatenate([getattr(part, name) for part in parts])[first] for name in read))
+
+
+def _in_order(faces: Int64) -> Int32:
+    """Faces (F, 3) in an order that does not depend on threads, those without area left out."""
+    first = faces.argmin(axis=1)[:, None]  # start each face at its least vertex: same winding, one spelling
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
+    return faces[proper].astype(np.int32)
+
+
+@parallel_kernel()
+def _cast_view_rows(
+    rows: int,
+    camera: Camera,
+    window: Window,
+    voxel_size_m: float,
+    truncation_voxels: float,
+    depth_max_m: float,
+    vote_discount: float,
+    unknown_below: float,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    depth: Float32,
+    rgb: UInt8,
+    channel: Int64,
+    confidence: Float32,
+    measured: Bool,
+) -> None:
+    """Fill the rows of a window of what ``cast_view`` returns."""
+    ...
+
+
+@parallel_kernel()
+def _read_map_points(
+    count: int,
+    voxels: Float64,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    vote_discount: float,
+    unknown_below: float,
+    rgb: UInt8,
+    channel: Int64,
+    confidence: Float32,
+    measured: Bool,
+) -> None:
+    """Fill rgb (N, 3), channel (N,), -1 = unknown, confidence (N,) and measured (N,) of points (N, 3)."""
+    ...
+
+
+@parallel_kernel()
+def _count_crossings(
+    count: int, keys: Int32, blocks: Int32, index: BlockIndex, buffers: GridBuffers, min_weight: float, counts: Int64
+) -> None:
+    """Crossings of each block (B,); keys (B, 3), buffer indices (B,)."""
+    ...
+
+
+@parallel_kernel()
+def _write_crossings(
+    count: int,
+    keys: Int32,
+    blocks: Int32,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    min_weight: float,
+    starts: Int64,
+    points: Float64,
+) -> None:
+    """The crossings of block n, in units of voxels, into ``points[starts[n] : starts[n + 1]]``; points (N, 3)."""
+    ...

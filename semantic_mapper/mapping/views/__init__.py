@@ -1,1 +1,0 @@
-"""The map and the field seen from a pose."""
