@@ -338,7 +338,7 @@ def hides_the_room(xyz_upright: Float64, azimuth: float) -> NDArray[np.bool_]:
 
 
 def _nearest_points(pixel: NDArray[np.int64], z: Float64, width: int, height: int, side: int) -> NDArray[np.int64]:
-    """Index (H, W) of the nearest point a pixel, each a square of ``side`` pixels; -1 where there is none."""
+    """Index (H, W) of the nearest point a pixel, each a square of ``side`` pixels; -1 without one."""
     inside = np.flatnonzero(((pixel >= 0) & (pixel < (width, height))).all(axis=1))
     near_to_far = inside[np.argsort(z[inside], kind="stable")]
     rank = np.full((height, width), len(inside), np.float32)  # exact below 2^24 points
