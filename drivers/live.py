@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
 
-from semantic_mapper.backoff import backoff_s
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics
 from semantic_mapper.errors import CameraError
@@ -231,7 +230,7 @@ class LiveCamera(Camera):
 
     def _open_again(self) -> Device | None:
         """Wait for the device, longer each time; None where it was stopped."""
-        while not self._stopping.wait(backoff_s(self._failures + 1, FIRST_PAUSE_S, MAX_PAUSE_S)):
+        while not self._stopping.wait(min(FIRST_PAUSE_S * 2.0 ** min(self._failures, 64), MAX_PAUSE_S)):
             self._read_at = time.monotonic()
             self._failures += 1
             try:

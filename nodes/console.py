@@ -29,8 +29,7 @@ from rich.table import Table
 from rich.text import Text
 
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.plain_text import visible
-from semantic_mapper.redaction import plain_without_secrets, without_secrets
+from semantic_mapper.plain_text import plain_without_secrets, visible, without_secrets
 from semantic_mapper.replay.job_monitor import JobMonitor
 
 _log = structlog.get_logger(__name__)

@@ -116,7 +116,7 @@ def run_node(
     try:
         job = job or _job_of_arguments()
         structlog.contextvars.bind_contextvars(node=job.name)
-        heartbeat = HeartbeatWriter(job.heartbeat_fd, job.orphan_timeout_s)
+        heartbeat = HeartbeatWriter(job.heartbeat_fd)
         heartbeat.start()
         options = convert_config(job.options, kind, f"node '{job.name}'")
         with StopRequest(patient=True, signals=_requests(job, kind)) as stop:

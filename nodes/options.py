@@ -258,4 +258,3 @@ class NodeJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     restarts: Count = 0  # how often it was restarted
     restartable: bool = False  # it restarts where it fails: its failure is no end of its stream
     folder: str = ""  # of the launch; a node leaves notes there for the process that replaces it
-    orphan_timeout_s: Count = 120  # without its launcher, it has this many seconds to write its results

@@ -14,8 +14,7 @@ from typing import Any, Self
 
 import structlog
 
-from semantic_mapper.plain_text import visible
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import visible, without_secrets
 
 STOP_SIGNAL = signal.SIGUSR1  # by which a launcher asks its nodes to end: SIGTERM may come from anybody
 EXIT_LOSS = 3  # of a node that came to its end in order, but a part of what it was to keep is lost

@@ -19,7 +19,7 @@ from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.files.formats import write_ply
+from semantic_mapper.mapping.formats import write_ply
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction, scale_name, voxel_size_text
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture

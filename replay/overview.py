@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from semantic_mapper.evaluation.upright import ceiling_height, plan_rotation, upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.plots import (
     DIM_TEXT,
     PANEL,
@@ -363,7 +362,6 @@ def point_spacing(xyz: Float64) -> float:
     """Typical distance of a point to its fourth neighbour, metres: the pitch of a surface sampled on a grid."""
     if len(xyz) < 5:
         return 0.05
-    check_room_for_scipy()
     asking = xyz[:: max(1, len(xyz) // 500)]
     distances, _ = scipy.spatial.KDTree(xyz).query(asking, k=5)
     return float(np.percentile(distances[:, 4], 75))

@@ -24,9 +24,8 @@ from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.plain_text import visible
+from semantic_mapper.plain_text import visible, without_secrets
 from semantic_mapper.plots import UNKNOWN, class_rows, encode_picture
-from semantic_mapper.redaction import without_secrets
 from semantic_mapper.replay.overview import open_side, point_spacing
 from semantic_mapper.types import Float64, UInt8
 

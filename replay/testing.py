@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike
 from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml
 from semantic_mapper.errors import LogError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import NearestSurface, at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.replay.compare import MAP_FILE, Comparison, Run, Tolerances, compare_runs, read_run
 from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.summary import SUMMARY_FILE

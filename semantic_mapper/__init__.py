@@ -21,7 +21,7 @@ __all__ = ["MapClient", "Mapper", "PosedFrame", "VoxelMap", "finetune", "load_we
 __version__ = "0.1.0"
 
 # OpenMP reads this once, when torch is loaded. Its threads otherwise spin for milliseconds after an operation and take
-# the cores from the kernels, which run on threads of their own; `kernels.threads` fixes it where torch came first.
+# the cores from the kernels, which run on threads of their own; `kernels.binding` fixes it where torch came first.
 SPINNING_THREADS = "torch" in _sys.modules and "OMP_WAIT_POLICY" not in _os.environ
 _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 

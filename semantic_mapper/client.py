@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import uuid
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from msgspec.structs import replace
@@ -16,12 +15,13 @@ from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses, MapPoi
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.questions import (
+    MAX_WAIT_S,
     NAMES,
     QUESTIONS,
+    AnswerT,
     AtRequest,
     BoxRequest,
     ChangesRequest,
@@ -32,25 +32,22 @@ from semantic_mapper.queries.questions import (
     InfoRequest,
     InstancesRequest,
     MapInfo,
+    MapState,
     NearestRequest,
     OccupancyRequest,
     Point,
     PoseRequest,
     RaysRequest,
+    Request,
     Weights,
     WeightsRequest,
-)
-from semantic_mapper.queries.rays import RayHits
-from semantic_mapper.transport.endpoints import default_endpoint
-from semantic_mapper.transport.keys import ServerIdentity
-from semantic_mapper.transport.query_messages import (
-    MAX_WAIT_S,
-    AnswerT,
-    MapState,
-    Request,
     decode_answer,
     encode_request,
 )
+from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.queries.surface import RayHits
+from semantic_mapper.transport.endpoints import default_endpoint
+from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.query_sockets import QuerySocket
 from semantic_mapper.types import Float64, UInt8
 
@@ -112,7 +109,7 @@ class MapClient:
         )
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
-        """The first surface that each ray meets; see ``queries.rays.cast_rays``."""
+        """The first surface that each ray meets; see ``queries.surface.cast_rays``."""
         return self._ask(
             RaysRequest(
                 origins=np.atleast_2d(as_numbers(origins, "origins")),
@@ -238,12 +235,10 @@ class MapClient:
         """Free the socket. Harmless when repeated."""
         self._socket.close()
 
-    def __enter__(self) -> MapClient:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _ask(self, request: Request[AnswerT]) -> AnswerT:

@@ -6,28 +6,23 @@ Every struct here is frozen; ``load_config`` fills one from a file, ``to_toml_di
 from __future__ import annotations
 
 import difflib
-import math
 import re
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import decode_text, read_regular
-from semantic_mapper.log_events import get_logger
 
 MAX_FILE_BYTES = 1 << 20  # of a file of settings
-MAX_DEPTH = 32  # tables and lists inside each other
 MAX_NUMBER = 1e12  # the largest float of any setting
 MAX_DURATION_S = 1e6  # eleven days; the longest time that every system call takes in milliseconds
 MAX_COUNT = 2**31 - 1
 MAX_STORED = 2**63 - 1  # the largest whole number: stamps in nanoseconds
-_log = get_logger(__name__)
-
 _MESSAGE = 400  # letters of what a file says, in a message
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
@@ -47,8 +42,6 @@ DeviceName = Literal["auto", "cpu", "cuda"]  # "auto": a GPU where there is one
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of all configuration structs."""
-
-    infinite: ClassVar[bool] = False  # whether ``inf`` is a value of its numbers
 
 
 class EncoderConfig(Config, frozen=True):
@@ -204,7 +197,7 @@ class VoxelMapConfig(Config, frozen=True):
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
     unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
-    clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``fusion/clearing.py``)
+    clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``mapping/clearing.py``)
 
     # The same for all maps:
     truncation_voxels: ClassVar[float] = 4.0
@@ -221,9 +214,6 @@ class PoseRefinerConfig(Config, frozen=True):
     # pictures ...
     sigma_m: Positive = 0.02
     sigma_deg: Positive = 0.5  # ... and of their rotations
-    window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 20  # keyframes that are adjusted together
-    corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
-    width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
 
 
 class HistoryConfig(Config, frozen=True):
@@ -270,7 +260,6 @@ class DepthFromMotionConfig(Config, frozen=True):
     planes: Annotated[int, msgspec.Meta(ge=16, le=256, multiple_of=16)] = 64  # depths tried, uniform in inverse depth
     near_m: Metres = 0.4
     far_m: Metres = 8.0
-    sources: Annotated[int, msgspec.Meta(ge=1, le=16)] = 4  # other frames that each is matched with
     # A frame waits for this many later ones, which see it from the other side: more accurate. 0 = live.
     delay_frames: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
 
@@ -461,12 +450,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: file missing, no regular file, larger than ``MAX_FILE_BYTES``, or not TOML.
     """
+    text = _read(path)
     try:
-        return tomllib.loads(_read(path).decode("utf-8-sig"))
+        return tomllib.loads(text.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # of TOML, UTF-8, and whole numbers of thousands of digits
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{path}: not valid TOML: {_reason(error)}") from error
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
 
 
 JsonT = TypeVar("JsonT")
@@ -482,9 +470,9 @@ def read_json(path: Path, kind: type[JsonT], limit: int = MAX_FILE_BYTES) -> Jso
     try:
         data = msgspec.json.decode(decode_text(_read(path, limit)), type=kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {_reason(error)}") from error
+        raise ConfigError(f"{path}: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid JSON: {_reason(error)}") from error
+        raise ConfigError(f"{path}: not valid JSON: {error}") from error
     check_values(msgspec.to_builtins(data), str(path))
     return data
 
@@ -496,56 +484,42 @@ def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
         ConfigError: an unknown key (with the nearest valid one), a value of the wrong type or out of its range, or one
             that ``check_values`` refuses.
     """
-    check_values(data, where, infinite=issubclass(kind, Config) and kind.infinite)
+    check_values(data, where)
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {_shorten(_explain(str(error), kind))}") from error
+        raise ConfigError(f"{where}: {_explain(str(error), kind)[:_MESSAGE]}") from error
 
 
-def check_values(data: Any, where: str, *, infinite: bool = False) -> None:
-    """Refuse what no setting can be: numbers that are not finite or too large to compute with, text
-    that the system takes for no name, and endless nesting.
+def check_values(data: Any, where: str, name: str = "") -> None:
+    """Refuse what no setting can be: numbers that are not finite or too large to compute with, text that is no name.
 
     Args:
         data: Plain data.
         where: Its file, for messages.
-        infinite: Whether ``inf`` is a value.
+        name: Of the setting, dotted.
 
     Raises:
         ConfigError: names the setting.
     """
-    left: list[tuple[str, Any, int]] = [("", data, 0)]
-    while left:
-        name, value, depth = left.pop()
-        if depth > MAX_DEPTH:
-            raise ConfigError(f"{where}: {name[:_MESSAGE]}: more than {MAX_DEPTH} tables or lists inside each other")
-        if isinstance(value, Mapping):
-            left += [(f"{name}.{key}" if name else str(key), item, depth + 1) for key, item in value.items()]
-        elif isinstance(value, list | tuple):
-            left += [(f"{name}[{n}]", item, depth + 1) for n, item in enumerate(value)]
-        elif isinstance(value, int | float) and not (infinite and value == math.inf):
-            _check_number(name, value, where)
-        elif isinstance(value, str):
-            _check_text(name, value, where)
-
-
-def _check_number(name: str, value: float, where: str) -> None:
-    limit = MAX_STORED if isinstance(value, int) else MAX_NUMBER
-    if name.endswith("_s"):
-        limit = MAX_DURATION_S
-    if not -limit <= value <= limit:  # NaN is not, either
-        text = f"{value:g}" if isinstance(value, float) else f"a number of {value.bit_length()} bits"
-        raise ConfigError(f"{where}: {name[:_MESSAGE]} = {text}: give a number between -{limit:g} and {limit:g}")
-
-
-def _check_text(name: str, value: str, where: str) -> None:
-    try:
-        value.encode()  # what the command line cannot decode is half a surrogate pair
-    except UnicodeEncodeError as error:
-        raise ConfigError(f"{where}: {name[:_MESSAGE]} is not UTF-8: {error.reason}; rename the file") from error
-    if "\0" in value:
-        raise ConfigError(f"{where}: {name[:_MESSAGE]} holds a NUL character, which no path and no name may")
+    match data:
+        case Mapping():
+            for key, value in data.items():
+                check_values(value, where, f"{name}.{key}" if name else str(key))
+        case list() | tuple():
+            for number, value in enumerate(data):
+                check_values(value, where, f"{name}[{number}]")
+        case int() | float():
+            limit = MAX_DURATION_S if name.endswith("_s") else MAX_STORED if isinstance(data, int) else MAX_NUMBER
+            if not -limit <= data <= limit:  # NaN is not, either
+                text = f"{data:g}" if isinstance(data, float) else f"a number of {data.bit_length()} bits"
+                raise ConfigError(f"{where}: {name} = {text}: give a number between -{limit:g} and {limit:g}")
+        case str() if "\0" in data:
+            raise ConfigError(f"{where}: {name} holds a NUL character, which no path and no name may")
+        case str() if re.search("[\ud800-\udfff]", data):  # what the command line cannot decode
+            raise ConfigError(f"{where}: {name} is not UTF-8; rename the file")
+        case _:
+            pass
 
 
 def _read(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
@@ -555,16 +529,6 @@ def _read(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         raise ConfigError(f"{path}: no such file") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, RecursionError):
-        return "too many tables or lists inside each other"
-    return _shorten(str(error).partition("; use sys.set_int_max_str_digits")[0])  # a way out for programmers
-
-
-def _shorten(text: str) -> str:
-    return text if len(text) <= _MESSAGE else f"{text[:_MESSAGE]}..."
 
 
 def to_plain(config: msgspec.Struct) -> dict[str, Any]:
@@ -585,76 +549,56 @@ _TOML_WORDS = {
 
 def _explain(message: str, kind: type[msgspec.Struct]) -> str:
     """msgspec's message for the author of the file: which key, what it must be, the nearest valid name."""
-    what, _, path = message.rpartition(" - at `$") if " - at `$" in message else (message, "", "")
+    what, _, path = message.partition(" - at `$")
     path = path.rstrip("`").removeprefix(".")
-    named = re.search(r"`([^`]*)`|'([^']*)'", what)
-    name = (named[1] or named[2] or "") if named is not None else ""
     at = f"`{path}`: " if path else ""
-    if "unknown field" in what:
-        return f"{at}unknown key `{name}`{_nearest(name, _keys_at(path, kind) - {name}, 'keys')}"
-    if "missing required field" in what:
+    found = re.fullmatch(r"(\D*?)[`'](.*?)[`'](?:, got `(\w+)`)?", what, re.DOTALL)
+    if found is None:
+        return f"{at}{what}"
+    text, name, actual = found.groups()
+    if "unknown field" in text:
+        keys = {item.encode_name for at in _types_at(path, kind) for item in getattr(at, "fields", ())}
+        return f"{at}unknown key `{name}`{_nearest(name, keys, 'keys')}"
+    if "missing required field" in text:
         return f"{at}the key `{name}` is missing"
-    if what.startswith("Invalid enum value"):
-        valid = {
-            str(value) for part in _types_at(path, kind) if get_origin(part) is Literal for value in get_args(part)
-        }
-        return f"{at}'{name}' is not valid{_nearest(name, valid, 'values')}"
-    expected = re.fullmatch(r"Expected `([^`]*)`, got `(\w+)`", what)
-    if expected is not None:
-        wanted = " or ".join(_TOML_WORDS.get(word, word) for word in expected[1].split(" | "))
-        return f"{at}must be {wanted}, not {_TOML_WORDS.get(expected[2], expected[2])}"
+    if "enum value" in text:
+        values = {str(value) for at in _types_at(path, kind) for value in getattr(at, "values", ())}
+        return f"{at}'{name}' is not valid{_nearest(name, values, 'values')}"
+    if actual is not None:
+        wanted = " or ".join(_TOML_WORDS.get(word, word) for word in name.split(" | "))
+        return f"{at}must be {wanted}, not {_TOML_WORDS.get(actual, actual)}"
     return f"{at}{what}"
 
 
 def _nearest(wrong: str, valid: Collection[str], what: str) -> str:
-    near = difflib.get_close_matches(wrong, sorted(valid), n=1, cutoff=0.5)
-    hint = f"; did you mean `{near[0]}`?" if near else ""
-    return hint or (f"; valid {what} are {', '.join(sorted(valid))}" if valid else "")
+    near = difflib.get_close_matches(wrong[:_MESSAGE], sorted(valid), n=1, cutoff=0.5)
+    if near:
+        return f"; did you mean `{near[0]}`?"
+    return f"; valid {what} are {', '.join(sorted(valid))}" if valid else ""
 
 
-def _types_at(path: str, kind: type[msgspec.Struct]) -> list[Any]:
-    """What a value may be at a place that msgspec names ("node[0].kind"), unions and annotations taken apart."""
-    found: list[Any] = [kind]
+def _types_at(path: str, kind: type[msgspec.Struct]) -> list[inspect.Type]:
+    """What a value may be at a place that msgspec names ("node[0].kind"), unions taken apart."""
+    found = _members(inspect.type_info(kind))
     for step in re.findall(r"\[[^\]]*\]|[^.\[\]]+", path):
-        inner: list[Any] = []
-        for part in found:
-            if step.startswith("["):
-                inner += get_args(part)
-            elif isinstance(part, type) and issubclass(part, msgspec.Struct):
-                inner += [item.type for item in msgspec.structs.fields(part) if item.name == step]
-        found = [member for part in inner for member in _members(part)]
+        found = [member for outer in found for inner in _inside(outer, step) for member in _members(inner)]
     return found
 
 
-def _structs(part: Any) -> list[Any]:
-    """Structs that a value may be or hold, in a list."""
-    found: list[Any] = []
-    for member in _members(part):
-        if isinstance(member, type) and issubclass(member, msgspec.Struct):
-            found.append(member)
-        elif get_origin(member) in (list, tuple):
-            found += [struct for inner in get_args(member) for struct in _structs(inner)]
-    return found
+def _inside(outer: inspect.Type, step: str) -> list[inspect.Type]:
+    """What may stand in a value: at a field, or at any index or key."""
+    match outer:
+        case inspect.StructType():
+            return [item.type for item in outer.fields if item.encode_name == step]
+        case inspect.VarTupleType() | inspect.ListType():
+            return [outer.item_type]
+        case inspect.TupleType():
+            return list(outer.item_types)
+        case inspect.DictType():
+            return [outer.value_type]
+        case _:
+            return []
 
 
-def _members(part: Any) -> list[Any]:
-    if get_origin(part) is Annotated:
-        return _members(get_args(part)[0])
-    if get_origin(part) in (Union, UnionType):
-        return [member for arg in get_args(part) for member in _members(arg)]
-    return [part]
-
-
-def _keys_at(path: str, kind: type[msgspec.Struct]) -> set[str]:
-    """Keys of the section at a place; of all sections where no section is there."""
-    sections = [part for part in _types_at(path, kind) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
-    return {item.name for part in sections for item in msgspec.structs.fields(part)} or _all_keys(kind)
-
-
-def _all_keys(kind: type[msgspec.Struct]) -> set[str]:
-    keys: set[str] = set()
-    for item in msgspec.structs.fields(kind):
-        keys.add(item.name)
-        if isinstance(item.type, type) and issubclass(item.type, msgspec.Struct):
-            keys |= _all_keys(item.type)
-    return keys
+def _members(found: inspect.Type) -> list[inspect.Type]:
+    return [m for part in found.types for m in _members(part)] if isinstance(found, inspect.UnionType) else [found]

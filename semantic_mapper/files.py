@@ -8,7 +8,6 @@ written, so that what a killed process has left can be distinguished from what a
 from __future__ import annotations
 
 import codecs
-import errno
 import fcntl
 import json
 import os
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
-from semantic_mapper.redaction import plain_without_secrets
+from semantic_mapper.plain_text import plain_without_secrets
 
 Sync = Literal["none", "file", "folder"]
 
@@ -40,7 +39,6 @@ def open_regular(path: Path) -> BinaryIO:
         ConfigError: no regular file.
         OSError: it is missing or cannot be read; ``filename`` is set.
     """
-    _check_name(path)
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not block
     if not stat.S_ISREG(os.fstat(fd).st_mode):
         os.close(fd)
@@ -151,18 +149,7 @@ def open_unlinked(path: str | Path, flags: int) -> int:
     Raises:
         OSError: as of ``os.open``; ELOOP for a link.
     """
-    _check_name(path)
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-
-
-def _check_name(path: str | Path) -> None:
-    """Python raises ``ValueError`` for such names, which nobody expects of a file.
-
-    Raises:
-        OSError: a NUL character in it.
-    """
-    if "\0" in os.fspath(path):
-        raise OSError(errno.EINVAL, "the name holds a NUL character, which no name may", str(path))
 
 
 def remove_stale(folder: Path, name: str = "") -> list[Path]:

@@ -1,4 +1,4 @@
-"""Resizing of frames to a working size: colours by area, depth by nearest pixel, holes filled where requested."""
+"""Frames at a working size (colours by area, depth by nearest pixel, holes filled on request), and turned upright."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from semantic_mapper.errors import FrameError
 from semantic_mapper.geometry import expect_shape, scale_intrinsics
 from semantic_mapper.kernels import parallel_kernel
-from semantic_mapper.types import MAX_DEPTH_M, MIN_DEPTH_M, CameraIntrinsics, Float32, PosedFrame, UInt8
+from semantic_mapper.types import MAX_DEPTH_M, MIN_DEPTH_M, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 REACH = 1 / 32  # of the image's width is looked at to either side: sensors err by their own pixels, not by ours
 # A leap from one surface to another, as wide as the guided interval: fraction of z, and metres
@@ -156,3 +157,47 @@ def draw_borders_to_edges(
 ) -> None:
     """The filter of ``depth_prior``: ``count`` rows, from depth without holes and with, (H, W) each, into ``out``."""
     ...
+
+
+def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntrinsics:
+    """Intrinsics of an image that was turned clockwise by this many quarters of a full turn.
+
+    Raises:
+        FrameError: an image that is not rectified.
+    """
+    if intrinsics.distorted:
+        raise FrameError("an image with lens distortion cannot be turned by itself; rectify it first")
+    k = intrinsics
+    for _ in range(quarters % 4):
+        k = CameraIntrinsics(k.fy, k.fx, k.height - 1 - k.cy, k.cx, k.height, k.width)
+    return k
+
+
+def rotate_frame(frame: PosedFrame, quarters: int) -> PosedFrame:
+    """The frame with its images turned clockwise by this many quarters of a full turn, and its pose and intrinsics with
+    them: every pixel keeps its ray in the world.
+
+    Raises:
+        FrameError: an image that is not rectified.
+    """
+    quarters %= 4
+    if quarters == 0:
+        return frame
+    return replace(
+        frame,
+        rgb=np.ascontiguousarray(np.rot90(frame.rgb, -quarters)),
+        depth_m=None if frame.depth_m is None else np.ascontiguousarray(np.rot90(frame.depth_m, -quarters)),
+        label=None if frame.label is None else np.ascontiguousarray(np.rot90(frame.label, -quarters)),
+        depth_sigma_m=(
+            None if frame.depth_sigma_m is None else np.ascontiguousarray(np.rot90(frame.depth_sigma_m, -quarters))
+        ),
+        intrinsics=rotate_intrinsics(frame.intrinsics, quarters),
+        T_world_camera=frame.T_world_camera @ _turn(quarters),
+    )
+
+
+def _turn(quarters: int) -> Float64:
+    """(4, 4): turning the image clockwise turns the camera's axes the other way about its optical axis."""
+    T = np.eye(4)
+    T[:2, :2] = np.linalg.matrix_power(np.array([[0.0, 1.0], [-1.0, 0.0]]), quarters)
+    return T

@@ -1,20 +1,14 @@
-"""What the C library does with memory that a process gives back."""
+"""What the C library does with memory that a process gives back, and what is said where memory does not suffice."""
 
 from __future__ import annotations
 
 import ctypes
-import mmap
-import os
-import resource
-import traceback
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of mallopt(3)
 _SHORTAGE = ("failed to map segment", "annot allocate memory", "can't allocate memory", "std::bad_alloc")
 LARGEST = 1 << 30  # bytes: tensors of a step are smaller
 # What mapping the demo takes, libraries included: a replay fails with 5.2 GB of address space, and holds 1 GB at most.
 NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 6, 1.5
-_SCIPY_BYTES = 200 << 20  # of address space, for the libraries that scipy.spatial loads
-_OPENBLAS_BYTES_A_THREAD, _OPENBLAS_THREADS = 40 << 20, 64
 _MAX_REASON = 160  # letters: NumPy explains a failed import on two pages
 
 
@@ -53,26 +47,18 @@ def give_back_freed_memory() -> bool:
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether a lack of memory, or of address space (``ulimit -v``), is behind an error.
 
-    Libraries that cannot be mapped fail to import, and tensors that find no room raise ``RuntimeError``. Where a limit
-    is lower than what the libraries need, any other error of an import counts, too: packages that were loaded in part
-    fail in their own words. A module that is not installed is another fault.
+    Libraries that cannot be mapped fail to import, and tensors that find no room raise ``RuntimeError``.
     """
-    errors = _with_causes(error)
-    if any(_says_shortage(e) for e in errors):
-        return True
-    return _is_limited() and any(map(_is_of_import, errors))
+    return any(map(_says_shortage, _with_causes(error)))
 
 
 def memory_message(error: BaseException) -> str:
     """What to say where memory does not suffice: one line."""
-    says = next((e for e in _with_causes(error) if _says_shortage(e)), error)
-    lines = [line.strip() for line in str(says).splitlines() if line.strip()] or [type(says).__name__]
+    says = str(next((e for e in _with_causes(error) if _says_shortage(e)), error)).strip()
+    lines = says.splitlines() or ["no memory left"]
     reason = next((line for line in lines if any(words in line for words in _SHORTAGE)), lines[0])
-    if len(reason) > _MAX_REASON:
-        reason = f"{reason[:_MAX_REASON]}..."
-    limit = f"; the limit is {_address_space() / 1e9:.1f} GB" if _is_limited() else ""
     return (
-        f"not enough memory or address space ({reason}){limit}; semantic-mapper needs about "
+        f"not enough memory or address space ({reason[:_MAX_REASON]}); semantic-mapper needs about "
         f"{NEEDED_ADDRESS_SPACE_GB:g} GB of address space and {NEEDED_MEMORY_GB:g} GB of memory, and more for large "
         "maps: free some, or raise the limit (ulimit -v)"
     )
@@ -93,34 +79,3 @@ def _says_shortage(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (
         any(words in text for words in _SHORTAGE) and "static TLS" not in text  # loaded too late: another fault
     )
-
-
-def _address_space() -> int:
-    """Bytes that this process may map; ``resource.RLIM_INFINITY`` where there is no limit."""
-    return resource.getrlimit(resource.RLIMIT_AS)[0]
-
-
-def _is_limited() -> bool:
-    """Whether a limit is lower than what the libraries need."""
-    return 0 <= _address_space() < NEEDED_ADDRESS_SPACE_GB * 1e9
-
-
-def _is_of_import(error: BaseException) -> bool:
-    """Whether a module was being loaded when it arose; one that is not installed is another fault."""
-    if isinstance(error, ModuleNotFoundError):
-        return False
-    files = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return isinstance(error, ImportError) or any(file.startswith("<frozen importlib") for file in files)
-
-
-def check_room_for_scipy() -> None:
-    """Call it before SciPy is imported late: its OpenBLAS tries for ever where it cannot map its buffers.
-
-    Raises:
-        MemoryError: too little memory or address space is left.
-    """
-    size = _SCIPY_BYTES + _OPENBLAS_BYTES_A_THREAD * min(os.cpu_count() or 1, _OPENBLAS_THREADS)
-    try:
-        mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
-    except OSError as error:
-        raise MemoryError(f"SciPy needs {size / 1e6:.0f} MB of address space") from error

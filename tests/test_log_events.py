@@ -52,21 +52,6 @@ def test_structlog_that_the_program_sets_up_later_is_used_as_it_is() -> None:
     assert '{"free_mb": 3, "path": "50 % of it", "event": "disk_full"}' in done.stdout and done.stderr == ""
 
 
-def test_library_code_says_nothing_on_stdout() -> None:
-    done = run(
-        "import research.train.rooms, semantic_mapper.replay.log.recording\n"
-        "import semantic_mapper.replay.session, semantic_mapper.drivers.live\n"
-        "from semantic_mapper.transport.sockets import log\n"
-        "from research.suites.store import RecordStore\n"
-        "import pathlib, tempfile\n"
-        "path = pathlib.Path(tempfile.mkdtemp()) / 'records.jsonl'\n"
-        "path.write_text('cut')\n"
-        "RecordStore(path)\n"
-        "log.warning('gap')\n"
-    )
-    assert done.stdout == "" and "last_record_incomplete" in done.stderr and "gap" in done.stderr
-
-
 def test_no_library_module_logs_past_log_events() -> None:
     """structlog's own loggers print to stdout where the program has not configured it."""
     root = Path(semantic_mapper.__file__).parent

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
 
 import pytest
 
-from semantic_mapper.memory import is_out_of_memory, memory_message
+from semantic_mapper.memory import is_out_of_memory
 from tests.nodes.support import COMMAND, error_line
 
 CODE = """
@@ -59,42 +58,9 @@ def test_a_lack_of_memory_is_known_by_its_words(error: BaseException, is_shortag
     assert is_out_of_memory(error) == is_shortage
 
 
-@pytest.mark.parametrize("kilobytes", [400_000, 600_000, 1_000_000])
-def test_doctor_without_enough_memory_says_in_one_line_how_much_is_needed(kilobytes: int) -> None:
-    limited = f"ulimit -v {kilobytes}; exec '{COMMAND}' doctor"
-    done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 1 and "Traceback" not in done.stderr
-    line = error_line(done.stderr)
-    assert "not enough memory or address space" in line and "needs about 6 GB of address space" in line
-
-
-def test_a_package_that_was_loaded_in_part_lacks_memory_where_there_is_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    error = ImportError("`torch` can only be initialized once per process")
-    assert not is_out_of_memory(error)
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (10**9, 10**9))
-    assert is_out_of_memory(error) and not is_out_of_memory(ModuleNotFoundError("No module named 'cv3'"))
-    assert "the limit is 1.0 GB" in memory_message(error)
-
-
 def test_a_verb_that_may_not_use_enough_memory_says_so() -> None:
     limited = f"ulimit -v 1500000; exec '{COMMAND}' replay {__file__} --out none"
     done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     line = error_line(done.stderr)
     assert "not enough memory or address space" in line and "ulimit -v" in line and "make setup" not in line
-
-
-def test_scipy_is_not_loaded_where_its_blas_would_try_for_ever() -> None:
-    program = """
-import resource, sys
-from semantic_mapper.replay.overview import point_spacing
-import numpy as np
-size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (size + (90 << 20),) * 2)
-try:
-    point_spacing(np.random.default_rng(0).random((50, 3)))
-except MemoryError as error:
-    print(error, "scipy.spatial" in sys.modules)
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
-    assert done.stdout.startswith("SciPy needs ") and done.stdout.endswith("False\n"), done.stderr

@@ -1,6 +1,6 @@
 import numpy as np
 
-from semantic_mapper.view_selection import select_views
+from semantic_mapper.geometry import select_views
 
 EVEN = np.ones(3)
 NOTHING = np.zeros(3)
@@ -17,9 +17,3 @@ def test_what_sees_nothing_is_never_chosen():
     assert select_views(seen, EVEN, np.full(3, 5.0), 3) == [0]
     assert select_views(np.zeros((3, 4), bool), EVEN, EVEN, 3) == []
     assert select_views(np.zeros((3, 0), bool), EVEN, EVEN, 3) == []
-
-
-def test_value_and_bonus_decide_between_views_that_see_as_much():
-    seen = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], bool)
-    assert select_views(seen, np.array([1.0, 2.0, 1.0]), NOTHING, 1) == [1]
-    assert select_views(seen, EVEN, np.array([0.0, 0.0, 0.1]), 1) == [2]

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import semantic_mapper
 from semantic_mapper.replay.page import Section, write_page
-from semantic_mapper.mapping.storage.block_index import find_blocks, make_block_index, pack_keys
+from semantic_mapper.mapping.blocks import find_blocks, make_block_index, pack_keys
 write_page(Path("page.html"), "a page, whose template is in the wheel", [Section()])
 keys = np.array([[0, 0, 3], [0, -1, 5]], np.int32)
 index = make_block_index(keys, np.array([30, 50], np.int32))

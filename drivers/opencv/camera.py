@@ -19,7 +19,7 @@ from semantic_mapper.drivers.live import NOT_CALIBRATED, LiveCamera, RawImage, S
 from semantic_mapper.drivers.opencv.config import Config
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, UInt8
 

@@ -46,10 +46,8 @@ def make_board(config: BoardPoses) -> Any:
     return cv2.aruco.GridBoard(size, config.marker_m, gap_m, dictionary)
 
 
-def draw_sheet(config: BoardPoses) -> tuple[UInt8, int]:
-    """The board with its margin, (H, W) uint8, and how many pixels of it are a metre.
-
-    Squares have a whole number of pixels, so that all are alike.
+def sheet_png(config: BoardPoses) -> bytes:
+    """The board with its margin as a PNG file that says how large it is; squares have a whole number of pixels.
 
     Raises:
         ConfigError: a board that cannot be, or too large to be drawn.
@@ -64,35 +62,19 @@ def draw_sheet(config: BoardPoses) -> tuple[UInt8, int]:
             f"a board of {width / a_metre:.2f} x {height / a_metre:.2f} m is too large to be drawn at {a_metre:.0f} "
             "pixels a metre; have it printed from a drawing of your own"
         )
-    board: Any = make_board(config)
     sheet = np.full((height + 2 * margin, width + 2 * margin), 255, np.uint8)
-    sheet[margin : margin + height, margin : margin + width] = board.generateImage((width, height), marginSize=0)
+    sheet[margin : margin + height, margin : margin + width] = make_board(config).generateImage(
+        (width, height), marginSize=0
+    )
     words = (
         f"{config.pattern} {config.columns} x {config.rows}, {1000 * config.square_m:g} mm a square, marker "
         f"{1000 * config.marker_m:g} mm. Print at 100 %, then measure a square."
     )
     scale = 0.6 * margin / 32  # Hershey letters are about 32 pixels high at 1
-    cv2.putText(
-        sheet,
-        words,
-        (margin, height + 2 * margin - round(0.25 * margin)),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        scale,
-        90,
-        max(1, round(2 * scale)),
-        cv2.LINE_AA,
-    )
-    return sheet, round(a_metre)
-
-
-def sheet_png(config: BoardPoses) -> bytes:
-    """The sheet as a PNG file that says how large it is.
-
-    Raises:
-        ConfigError: see ``draw_sheet``.
-    """
-    sheet, a_metre = draw_sheet(config)
-    data, dpi = io.BytesIO(), 0.0254 * a_metre
+    place = (margin, height + 2 * margin - round(0.25 * margin))
+    font, thickness = cv2.FONT_HERSHEY_SIMPLEX, max(1, round(2 * scale))
+    cv2.putText(sheet, words, place, font, scale, 90, thickness, cv2.LINE_AA)
+    data, dpi = io.BytesIO(), 0.0254 * round(a_metre)
     Image.fromarray(sheet).save(data, "PNG", dpi=(dpi, dpi))
     return data.getvalue()
 

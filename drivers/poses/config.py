@@ -145,9 +145,3 @@ def poses_of_rig(config: PoseConfig) -> bool:
     """Whether poses are of a rig, on which the camera sits somewhere, rather than of the camera itself."""
     rig = config.T_world_rig if isinstance(config, FixedPose) else None
     return (config.T_base_rig if isinstance(config, TopicPoses) else rig) is not None
-
-
-def matrices(config: PoseConfig) -> dict[str, Matrix]:
-    """All matrices of a config, by the name of their setting."""
-    names = [name for name in config.__struct_fields__ if name.startswith("T_")]
-    return {name: rows for name in names if (rows := getattr(config, name)) is not None}

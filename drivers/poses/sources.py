@@ -20,7 +20,6 @@ from semantic_mapper.drivers.poses.config import (
     PoseConfig,
     TopicPoses,
     VisualPoses,
-    matrices,
     matrix,
 )
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
@@ -28,11 +27,9 @@ from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.drivers.poses.visual import VisualPoseSource
 from semantic_mapper.errors import CameraError, ConfigError
 
-PATIENCE_S = 20.0  # how long a device that does not say that it tracks itself may take for its first pose
 
-
-def open_poses(config: Mapping[str, Any], where: str = "poses") -> PoseSource:
-    """A pose source of a launch file, ready to be entered.
+def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseConfig:
+    """Plain data -> checked settings of one kind; opens nothing.
 
     Args:
         config: ``kind`` ("device", "fixed", "topic", "board", "rgbd", "visual") and its settings, see ``config.py``.
@@ -41,26 +38,22 @@ def open_poses(config: Mapping[str, Any], where: str = "poses") -> PoseSource:
     Raises:
         ConfigError: no such kind, an unknown or bad setting, or a matrix that is no rigid transform.
     """
-    return make_poses(read_pose_config(config, where))
-
-
-def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseConfig:
-    """Plain data -> checked settings of one kind; opens nothing. See ``open_poses``."""
     kind = config.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
         near = difflib.get_close_matches(str(kind), KINDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         raise ConfigError(f"{where}: kind must be one of {', '.join(KINDS)}, got {kind!r}{hint}")
     checked = convert_config(dict(config), KINDS[kind], where)
-    for name, rows in matrices(checked).items():
-        rigid_matrix(rows, f"{where}: {name}")
+    for name in checked.__struct_fields__:
+        if name.startswith("T_") and (rows := getattr(checked, name)) is not None:
+            rigid_matrix(rows, f"{where}: {name}")
     if isinstance(checked, VisualPoses) and checked.scale:
         read_pose_config(checked.scale, f"{where}: scale")
     return checked
 
 
 def make_poses(config: PoseConfig) -> PoseSource:
-    """The source of checked settings."""
+    """The source of checked settings, ready to be entered."""
     match config:
         case DevicePoses():
             return DevicePoseSource()
@@ -73,33 +66,26 @@ def make_poses(config: PoseConfig) -> PoseSource:
         case OdometryPoses():
             return OdometryPoseSource(config)
         case VisualPoses():
-            return VisualPoseSource(config, open_poses(config.scale, "poses: scale") if config.scale else None)
+            scale = make_poses(read_pose_config(config.scale, "poses: scale")) if config.scale else None
+            return VisualPoseSource(config, scale)
 
 
 class DevicePoseSource(PoseSource):
     """Takes the poses that the device itself puts into its images."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._first_ns: int | None = None  # of the images
-        self._tracked = False
-
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """The image's own pose; None where the device does not know it now, or not yet.
 
         Raises:
-            CameraError: no image had one for ``PATIENCE_S``, and the camera does not track itself.
+            CameraError: the camera does not track itself.
         """
-        self._tracked |= image.tracks_itself
         if image.own_pose is not None:
-            self._tracked, self._warnings = True, ()
+            self._warnings = ()
             return image.own_pose
-        self._first_ns = image.stamp_ns if self._first_ns is None else self._first_ns
-        waited_s = (image.stamp_ns - self._first_ns) / 1e9
-        if not self._tracked and waited_s > PATIENCE_S:
+        if not image.tracks_itself:
             raise CameraError(
-                f"camera '{image.camera_id}' has given no pose of its own for {waited_s:.1f} s, so it does not "
-                f"track itself, or its tracking is not switched on; {WAYS_OUT}"
+                f"camera '{image.camera_id}' gives no pose of its own: it does not track itself, or its tracking is "
+                f"not switched on; {WAYS_OUT}"
             )
         self._warnings = (f"camera '{image.camera_id}' does not know where it is; frames are left out until it does",)
         return None

@@ -14,7 +14,6 @@ from typing import Any, Self
 
 import structlog
 
-from semantic_mapper.backoff import backoff_s
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
 from semantic_mapper.drivers.mounts import Mount, mount_of
@@ -143,7 +142,7 @@ def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, sta
             reporter.watch(source)
             return source
         failures += 1
-        _pause(context, backoff_s(failures, FIRST_PAUSE_S, MAX_PAUSE_S))
+        _pause(context, min(FIRST_PAUSE_S * 2.0 ** min(failures - 1, 64), MAX_PAUSE_S))
     return None
 
 

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import typer
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.mapping.files.merge import count_empty
-from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
+from semantic_mapper.mapping.merge import count_empty
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress

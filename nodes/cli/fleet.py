@@ -22,8 +22,7 @@ from semantic_mapper.nodes.fleet.store import Store
 from semantic_mapper.nodes.fleet.table import Tables
 from semantic_mapper.nodes.fleet.urls import find_inputs
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.plain_text import counted
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import counted, without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_SUFFIX, prepare_file
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from rich.table import Table
 from semantic_mapper.client import MapClient, Weights
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.mapping.files.map_file import describe_map
+from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit, voxel_size_text
 from semantic_mapper.nodes.cli.options import Remote
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, verb

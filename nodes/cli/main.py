@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 
 from semantic_mapper import __version__
 from semantic_mapper.nodes.cli.verb import Settings, VerbCommand
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 
 _UsageError = cast("type[Exception]", typer.BadParameter.__base__)  # Click's, or Typer's own copy of it
 _MODULES = "semantic_mapper.nodes.cli"

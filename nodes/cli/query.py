@@ -21,12 +21,10 @@ from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, results_file
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.running import map_endpoint
 from semantic_mapper.plots import write_picture
-from semantic_mapper.queries.graph import GraphTracker, SceneGraph
-from semantic_mapper.queries.graph_picture import draw_graph
+from semantic_mapper.queries.graph import GraphTracker, SceneGraph, draw_graph
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import at, nearest
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 from semantic_mapper.replay.run_folder import map_path, prepare_file
 

@@ -23,8 +23,7 @@ from semantic_mapper.nodes.cli.options import OptionGroup
 from semantic_mapper.nodes.console import stderr_console
 from semantic_mapper.nodes.failures import failure_message
 from semantic_mapper.nodes.process import prepare_process
-from semantic_mapper.plain_text import visible
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import visible, without_secrets
 
 EXIT_FAILED = 1
 EXIT_UNTRUSTED = 3  # poses and depth of a recording contradict each other, so that its map cannot be trusted

@@ -192,17 +192,7 @@ def _show_log(
 
     settings = load_mapper_config(config)
     with frame_progress("map", None) as bar:
-        show_log(
-            path,
-            weights,
-            settings,
-            max_frames,
-            page.begin,
-            refresh,
-            going=lambda: not stop and page.alive,
-            on_start=bar.start,
-            on_frame=bar.set,
-        )
+        show_log(path, weights, settings, max_frames, page.begin, refresh, lambda: not stop and page.alive, bar)
 
 
 def _show_status(place: str, remote: Remote, *, once: bool, json: bool) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 import structlog
 import torch
 
-from semantic_mapper.backoff import backoff_s
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import CodecError, FrameError, LabelError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import (
@@ -375,7 +374,7 @@ class Finetuner:
     def _fail(self, reason: str) -> None:
         """A round failed through no fault of the labels: they are kept, and tried again after a pause."""
         self._failures += 1
-        pause_s = backoff_s(self._failures, RETRY_S, MAX_RETRY_S)
+        pause_s = min(RETRY_S * 2.0 ** min(self._failures - 1, 64), MAX_RETRY_S)
         self._retry_at_s = time.monotonic() + pause_s
         self._counts["failed"] += 1
         self._failure = reason

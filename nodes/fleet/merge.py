@@ -14,12 +14,12 @@ import numpy as np
 from semantic_mapper.config import read_json
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.geometry import check_pose, yaw_transform
-from semantic_mapper.mapping.files.map_file import MapManifest, describe_map
 from semantic_mapper.mapping.map_alignment import find_alignment
+from semantic_mapper.mapping.map_file import MapManifest, describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.store import Store, is_store
 from semantic_mapper.nodes.fleet.urls import is_url, open_url, reaching
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX
 from semantic_mapper.types import Float64
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -112,7 +113,7 @@ def read_settings(
     plain = {} if config is None else read_toml(config)
     for name, value in parse_assignments(assignments).items():
         assign(plain, name, value, "--set")
-    data = msgspec.json.decode(msgspec.json.encode(plain))
+    data = copy.deepcopy(plain)
     for name, value in found.defaults.items():
         assign(data, name, value, "--set", replace=False)
     settings = convert_config(data, found.settings, "--set")

@@ -30,7 +30,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.operations import OPERATIONS, read_settings
 from semantic_mapper.nodes.fleet.store import Failure, Store, TaskResult, file_digest
 from semantic_mapper.nodes.fleet.urls import LogInput, MissingError, full_url, is_url, open_url, reaching
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 
 MAX_RETRIES = 3  # of a task whose process died, whose node was lost, or that could not reach log or store

@@ -25,7 +25,7 @@ import msgspec
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.fleet.urls import MissingError, is_url, open_url, reaching
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.replay.run_folder import STORE_MARK
 
 _MARK_CONTENT = b'{"format": "semantic-mapper-fleet", "version": 3}\n'

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from semantic_mapper.errors import ConfigError, DependencyError, FleetError, SemanticMapperError, StoreError
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import without_secrets
 
 _SCHEME = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://")
 _GLOB = re.compile(r"[*?[]")

@@ -25,8 +25,7 @@ from semantic_mapper.nodes.options import FoxgloveOptions, NodeJob
 from semantic_mapper.nodes.publishing import StatusReport
 from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.transport.codec import decode_as, read_envelope
 from semantic_mapper.transport.keys import ServerIdentity, load_keys

@@ -19,7 +19,6 @@ from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -257,9 +256,10 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             Raises:
                 _RefusedError: by somebody who may not.
             """
-            _check_name(self.headers.get("Host", ""))
-            if (origin := self.headers.get("Origin")) is not None:
-                _check_name(_netloc(origin))
+            host = self.headers.get("Host", "")  # of a tunnel, the port may be another
+            own = f"http://{host}"
+            if host.rpartition(":")[0] not in (HOST, "localhost") or self.headers.get("Origin", own) != own:
+                raise _RefusedError(HTTPStatus.FORBIDDEN, f"the page is at {HOST} or localhost")
             given, slash, path = self.path.removeprefix("/").partition("/")
             if not hmac.compare_digest(given.encode(), token.encode()):
                 raise _RefusedError(HTTPStatus.FORBIDDEN, "open the address that `label --serve` has shown")
@@ -317,24 +317,6 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             _log.debug("page_served", request=(format % args).replace(token, "TOKEN"))
 
     return Handler
-
-
-def _netloc(origin: str) -> str:
-    """Host and port of an ``Origin``; empty where that is no address."""
-    try:
-        return urlsplit(origin).netloc
-    except ValueError:  # such as http://[
-        return ""
-
-
-def _check_name(netloc: str) -> None:
-    """Refuse requests that came by another name than this machine's own: a tunnel may have another port.
-
-    Raises:
-        _RefusedError: they did.
-    """
-    if netloc.rpartition(":")[0] not in (HOST, "localhost"):
-        raise _RefusedError(HTTPStatus.FORBIDDEN, f"the page is at {HOST} or localhost")
 
 
 def _frame(path: str) -> tuple[int, str]:

@@ -25,13 +25,12 @@ import structlog
 
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.nodes.launcher.liveness import ProgressLimit, cpu_seconds, end_with_launcher
+from semantic_mapper.nodes.launcher.liveness import end_with_launcher
 from semantic_mapper.nodes.node import read_job
 from semantic_mapper.nodes.process import prepare_process
 
-START_S = 120.0  # without progress, for the imports
-ANSWER_S = 5.0  # the same, for a node
-_POLL_S = 0.1
+START_S = 300.0  # for the imports
+ANSWER_S = 30.0  # for a node, on a machine that has too much to do
 _PRELOAD = ("zmq", "torch", "cv2", "scipy.spatial")
 _PR_SET_CHILD_SUBREAPER = 36
 _READY = b"ready"
@@ -62,7 +61,7 @@ class ForkServer:
         try:
             channel = self._connect()
             socket.send_fds(channel, [module.encode()], [job, heartbeat, output])
-            answer = self._answer(channel, ANSWER_S)
+            answer = _answer(channel, ANSWER_S)
         except OSError:
             self.close()
             raise
@@ -98,28 +97,20 @@ class ForkServer:
                 process_group=0,
             )
         _log.info("fork_server_started", pid=self._process.pid)
-        ours.settimeout(_POLL_S)
-        self._answer(ours, START_S)
+        _answer(ours, START_S)
         return ours
 
-    def _answer(self, channel: socket.socket, limit_s: float) -> bytes:
-        """What the server says next, however slow it is.
 
-        Raises:
-            OSError: it has ended, or did nothing for ``limit_s``.
-        """
-        assert self._process is not None
-        pid = self._process.pid
-        limit = ProgressLimit(limit_s, lambda: cpu_seconds(pid))
-        while not limit.exceeded():
-            try:
-                answer = channel.recv(64)
-            except TimeoutError:
-                continue
-            if not answer:
-                raise OSError(errno.ECONNRESET, "the fork server has ended")
-            return answer
-        raise TimeoutError(errno.ETIMEDOUT, f"the fork server did nothing for {limit_s:g} s")
+def _answer(channel: socket.socket, limit_s: float) -> bytes:
+    """What the server says next."""
+    channel.settimeout(limit_s)
+    try:
+        answer = channel.recv(64)
+    except TimeoutError as error:
+        raise TimeoutError(errno.ETIMEDOUT, f"the fork server said nothing for {limit_s:g} s") from error
+    if not answer:
+        raise OSError(errno.ECONNRESET, "the fork server has ended")
+    return answer
 
 
 def serve(fd: int) -> None:

@@ -152,8 +152,7 @@ class Launcher:
         leave_launch_note(self._launch, folder)
         endpoints = {name: f"ipc://{folder}/{name}" for name in self._launch.sockets()}
         names = [n.name for n in self._launch.nodes]
-        status = LaunchStatus(endpoints, names, self._launch.publish, self._launch.keys)
-        self._status = self._stack.enter_context(status)
+        self._status = LaunchStatus(self._stack, endpoints, names, self._launch.publish, self._launch.keys)
         server = ForkServer(node_environment())
         self._stack.callback(server.close)
         for node in self._launch.nodes:
@@ -194,9 +193,6 @@ class Launcher:
         processes = [p for p in self._processes if p.kind == kind]
         began = time.monotonic()
         while True:
-            if kind == "mapper":  # its map was saved, the results that people look at were not
-                for process in processes:
-                    process.start_to_finish()
             progress = [p.makes_progress(limit_s) for p in processes]  # of all: limits begin now
             if not any(progress):
                 break
@@ -221,13 +217,14 @@ class Launcher:
 
 
 class LaunchStatus:
-    """Publishes a ``Status`` of each node, and one of the launch itself. A context manager.
+    """Publishes a ``Status`` of each node, and one of the launch itself.
 
     Counters and ages of a node's own status are passed on (a player of logs has none: its launcher counts ``published``
-    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``, ``fds`` and ``threads``, and the ages ``start``
+    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms`` and ``fds``, and the ages ``start``
     (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
 
     Args:
+        stack: Its sockets are freed with this.
         endpoints: Of the nodes and, under ``STATUS_SOCKET``, of this topic.
         nodes: Names of those that may publish a status.
         public, keys: A second endpoint for it, see ``PublicPublisher``.
@@ -236,25 +233,15 @@ class LaunchStatus:
         TransportError: the endpoint cannot be bound.
     """
 
-    def __init__(self, endpoints: Mapping[str, str], nodes: Sequence[str], public: str = "", keys: str = "") -> None:
+    def __init__(
+        self, stack: ExitStack, endpoints: Mapping[str, str], nodes: Sequence[str], public: str, keys: str
+    ) -> None:
         self._began = time.monotonic()
         self._reported_at = 0.0
         self._own: dict[str, Status] = {}
-        self._publisher = PublicPublisher(endpoints[STATUS_SOCKET], public, keys, linger_ms=200)
-        self._subscriber = NewestSubscriber([endpoints[name] for name in nodes], ("status",))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the sockets. Harmless when repeated."""
-        self._subscriber.close()
-        self._publisher.close()
+        publisher = PublicPublisher(endpoints[STATUS_SOCKET], public, keys, linger_ms=200)
+        self._publisher = stack.enter_context(publisher)
+        self._subscriber = stack.enter_context(NewestSubscriber([endpoints[name] for name in nodes], ("status",)))
 
     def report(self, processes: Sequence[ManagedProcess], state: NodeState, *, now: bool = False) -> None:
         """Publish, if it is time to."""
@@ -313,7 +300,7 @@ def node_status(managed: ManagedProcess, own: Status | None) -> Status:
 
 
 def process_stats(pid: int) -> dict[str, int]:
-    """``rss_kb``, ``cpu_ms`` (total), ``fds``, ``threads``; empty where the process has ended."""
+    """``rss_kb``, ``cpu_ms`` (total), ``fds``; empty where the process has ended."""
     try:
         process = psutil.Process(pid)
         with process.oneshot():
@@ -322,7 +309,6 @@ def process_stats(pid: int) -> dict[str, int]:
                 "rss_kb": process.memory_info().rss // 1024,
                 "cpu_ms": round(1000 * (times.user + times.system)),
                 "fds": process.num_fds(),
-                "threads": process.num_threads(),
             }
     except (psutil.Error, OSError):
         return {}

@@ -21,6 +21,7 @@ STARTING, RUNNING, ENDING = b"s", b"r", b"e"
 TURN, FRAME = b"t", b"f"
 PERIOD_S = 0.2
 START_S = STALL_S = 300.0  # until a node is ready, and for a turn of its main loop (kernels compile)
+ORPHAN_TIMEOUT_S = 120  # that a node has to write its results without its launcher, or may hang
 BUSY_SILENCE_S = 30.0  # loading packages may hold up all threads, and so may an overloaded machine
 _PR_SET_PDEATHSIG = 1
 _READ_BYTES = 65536
@@ -36,10 +37,10 @@ class HeartbeatWriter:
 
     Args:
         fd: Where to write; -1 = no launcher listens.
-        orphan_timeout_s: Once its launcher is gone, the process has this many seconds to write its results.
+        orphan_timeout_s: See ``ORPHAN_TIMEOUT_S``.
     """
 
-    def __init__(self, fd: int, orphan_timeout_s: int) -> None:
+    def __init__(self, fd: int, orphan_timeout_s: int = ORPHAN_TIMEOUT_S) -> None:
         self._fd = fd
         self._orphan_timeout_s = orphan_timeout_s
         self._phase = STARTING
@@ -117,7 +118,12 @@ def _signal_when_launcher_dies(signum: signal.Signals) -> None:
 
 
 class HeartbeatMonitor:
-    """The launcher's end of the pipe.
+    """The launcher's end of the pipe; it tells a frozen process from one that is busy or waits for a processor.
+
+    Args:
+        fd: The pipe.
+        pid: Of the process.
+        heartbeat_s: Of the launch file.
 
     Attributes:
         ready, ending: Whether start-up is over, and whether results are being written.
@@ -125,8 +131,11 @@ class HeartbeatMonitor:
         turns: How often turns were among it: of the main loop, or steps of writing results.
     """
 
-    def __init__(self, fd: int) -> None:
+    def __init__(self, fd: int, pid: int, heartbeat_s: float) -> None:
         self._fd = fd
+        self._pid = pid
+        self._heartbeat_s = heartbeat_s
+        self._cpu_s: float | None = None  # when the silence was noticed
         self._started = self._last_beat = time.monotonic()
         self._last_turn: float | None = None
         self._last_frame: float | None = None
@@ -171,6 +180,32 @@ class HeartbeatMonitor:
             self.frames += beats.count(FRAME)
         self.ending |= ENDING in beats
         self.ready |= RUNNING in beats or self.ending
+
+    def find_hang(self, *, stopping: bool) -> str:
+        """Why the process has to be killed; empty where it need not be.
+
+        Args:
+            stopping: It was requested to stop: start-up has no limit then.
+        """
+        self.poll()
+        frozen, busy_s = self._is_frozen(), max(self._heartbeat_s, BUSY_SILENCE_S)
+        if frozen or self.silent_s > busy_s:
+            return f"it gave no sign of life for {self._heartbeat_s if frozen else busy_s:g} s and was killed"
+        if not self.ready and not stopping and self.age_s > START_S:
+            return f"it was not ready after {START_S:g} s and was killed"
+        if self.stalled_s is not None and self.stalled_s > STALL_S:
+            return f"its main loop made no turn for {STALL_S:g} s, and it was killed"
+        return ""
+
+    def _is_frozen(self) -> bool:
+        """Whether a node that runs is silent, and neither has had nor wants processor time meanwhile."""
+        if self.silent_s <= self._heartbeat_s / 2:
+            self._cpu_s = None
+            return False
+        if self._cpu_s is None:
+            self._cpu_s = cpu_seconds(self._pid)
+        is_silent = self.ready and not self.ending and self.silent_s > self._heartbeat_s
+        return is_silent and cpu_seconds(self._pid) == self._cpu_s and not is_active(self._pid)
 
 
 class ProgressLimit:
@@ -218,52 +253,6 @@ class ProgressLimit:
         self._next_reading = self._since + self._limit_s / _CPU_READINGS
         self._cpu_at_mark: float | None = None  # read with the first reading
         self._cpu_at_progress = 0.0
-
-
-class HangDetector:
-    """Tells a frozen process from one that is busy or waits for a processor, while both are silent.
-
-    Args:
-        pid: Of the process.
-        heartbeat: Of the process.
-        heartbeat_s: Of the launch file.
-    """
-
-    def __init__(self, pid: int, heartbeat: HeartbeatMonitor, heartbeat_s: float) -> None:
-        self._pid = pid
-        self._heartbeat = heartbeat
-        self._heartbeat_s = heartbeat_s
-        self._cpu_s: float | None = None  # when the silence was noticed
-        self._busy_s = max(heartbeat_s, BUSY_SILENCE_S)
-
-    def find_hang(self, *, stopping: bool) -> str:
-        """Why the process has to be killed; empty where it need not be.
-
-        Args:
-            stopping: It was requested to stop: start-up has no limit then.
-        """
-        beat = self._heartbeat
-        beat.poll()
-        frozen = self._is_frozen()
-        if frozen or beat.silent_s > self._busy_s:
-            return f"it gave no sign of life for {self._heartbeat_s if frozen else self._busy_s:g} s and was killed"
-        if not beat.ready and not stopping and beat.age_s > START_S:
-            return f"it was not ready after {START_S:g} s and was killed"
-        if beat.stalled_s is not None and beat.stalled_s > STALL_S:
-            return f"its main loop made no turn for {STALL_S:g} s, and it was killed"
-        return ""
-
-    def _is_frozen(self) -> bool:
-        """Whether a node that runs is silent, and neither has had nor wants processor time meanwhile."""
-        beat = self._heartbeat
-        if beat.silent_s <= self._heartbeat_s / 2:
-            self._cpu_s = None
-            return False
-        if self._cpu_s is None:
-            self._cpu_s = cpu_seconds(self._pid)
-        running = beat.ready and not beat.ending
-        is_silent = running and beat.silent_s > self._heartbeat_s
-        return is_silent and cpu_seconds(self._pid) == self._cpu_s and not is_active(self._pid)
 
 
 def cpu_seconds(pid: int) -> float:

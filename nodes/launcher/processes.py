@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 import signal
 import subprocess
@@ -22,15 +21,13 @@ from semantic_mapper.nodes.launcher.fork_server import ForkServer
 from semantic_mapper.nodes.launcher.launch_file import Launch, NodeEntry
 from semantic_mapper.nodes.launcher.liveness import (
     BUSY_SILENCE_S,
-    HangDetector,
     HeartbeatMonitor,
     ProgressLimit,
     cpu_seconds,
 )
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT, STOP_SIGNAL
-from semantic_mapper.plain_text import visible
-from semantic_mapper.redaction import without_secrets
+from semantic_mapper.plain_text import visible, without_secrets
 from semantic_mapper.transport.messages import NodeState
 
 # How long a node may make no progress when it is to end: one that makes progress, be it slowly, may take as long as it
@@ -39,7 +36,6 @@ STOP_S, FINISH_S = 15.0, 300.0
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
 SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")  # for the launcher alone, not for its nodes
-ORPHAN_TIMEOUT_S = 120  # see ``NodeJob.orphan_timeout_s``
 # Of a process that somebody has requested to end, whether or not it was old enough to do so in order.
 TERMINATED = {code: s for s in (signal.SIGTERM, signal.SIGINT) for code in (128 + s, -s)}
 # Pauses before restarts: doubled with each failure in the window.
@@ -106,12 +102,15 @@ class NodeProcess:
         kind: A row of the process table.
         job: What it is to do (``heartbeat_fd`` is filled in here).
         server: Forks it, where its kind is preloaded; None = a new interpreter.
+        heartbeat_s: Of the launch file.
 
     Raises:
         OSError: no process, thread, file or memory is to be had; nothing is left behind.
     """
 
-    def __init__(self, kind: str, job: NodeJob, server: ForkServer | None = None) -> None:
+    def __init__(
+        self, kind: str, job: NodeJob, server: ForkServer | None = None, heartbeat_s: float = BUSY_SILENCE_S
+    ) -> None:
         self.name = job.name
         self.kind = kind
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
@@ -126,7 +125,7 @@ class NodeProcess:
             else:
                 self._process = _start_interpreter(kind, given, beats, output)
             ours.callback(self._end)
-            self.heartbeat = HeartbeatMonitor(self._beats)
+            self.heartbeat = HeartbeatMonitor(self._beats, self.pid, heartbeat_s)
             self._reader = threading.Thread(target=self._pass_on, name=f"stderr of {self.name}", daemon=True)
             try:
                 self._reader.start()
@@ -261,13 +260,10 @@ class ManagedProcess:
             subscribers=launch.listeners(entry.name),
             folder=folder,
             restartable=entry.restart != "never",
-            # The kernel ends what is silent for so long; before, it is the launcher's turn.
-            orphan_timeout_s=math.ceil(max(ORPHAN_TIMEOUT_S, 2 * launch.heartbeat_s, 2 * BUSY_SILENCE_S)),
         )
         self._backoff = RestartBackoff()
         self._due = 0.0  # of the next start, while there is no process
         self._last_end = self._last_reason = ""
-        self._finishing = self._hopeless = False
         self._start()
 
     @property
@@ -321,7 +317,7 @@ class ManagedProcess:
             elif not self.failure and time.monotonic() >= self._due:
                 self._start()
         elif self.process.exit_code() is None:
-            hang = self._detector.find_hang(stopping=self.process.stop_requested)
+            hang = self.process.heartbeat.find_hang(stopping=self.process.stop_requested)
             if hang:
                 self.process.kill()
                 self.process.wait(KILL_S)
@@ -357,24 +353,8 @@ class ManagedProcess:
 
     def request_stop(self) -> None:
         """Of its process, if there is one."""
-        if self.process is None or (self._finishing and not self.process.heartbeat.ready):  # it would end at once
-            return
-        self.process.request_stop()
-
-    def start_to_finish(self) -> None:
-        """Start a node that is given up once more, to be stopped: it writes results of what it saved."""
-        if not self.failure or self._finishing or self._hopeless or self._entry.restart == "never":
-            return
-        self._finishing = True
-        before = self.process
-        try:
-            self._start_process(self.restarts + 1)  # it goes on from what this launch saved
-        except OSError as error:
-            _log.error("results_not_written", node=self.name, reason=str(error))
-            return
-        if before is not None:
-            before.close()
-        _log.info("node_finishes", node=self.name, pid=self.process.pid if self.process else 0)
+        if self.process is not None:
+            self.process.request_stop()
 
     def close(self) -> None:
         """Leave no process behind."""
@@ -384,8 +364,10 @@ class ManagedProcess:
 
     def _start(self) -> None:
         count = self.restarts
+        # A restarted node waits for no subscribers: the others are there, and frames do not wait.
+        job = msgspec.structs.replace(self._job, restarts=count, subscribers=0 if count else self._job.subscribers)
         try:
-            process = self._start_process(count)
+            self.process = NodeProcess(self.kind, job, self._server, self._launch.heartbeat_s)
         except OSError as error:  # no process, memory or file is to be had: that may pass
             _log.error("node_not_started", node=self.name, reason=str(error))
             text = f"node '{self.name}' ({self.kind}) could not be started: {error}"
@@ -394,16 +376,8 @@ class ManagedProcess:
             else:
                 self._restart_later(text, f"could not be started: {error}")
             return
-        _log.info("node_started", node=self.name, kind=self.kind, pid=process.pid, restarts=count)
-
-    def _start_process(self, restarts: int) -> NodeProcess:
-        # A restarted node waits for no subscribers: the others are there, and frames do not wait.
-        subscribers = 0 if restarts else self._job.subscribers
-        job = msgspec.structs.replace(self._job, restarts=restarts, subscribers=subscribers)
-        self.process = process = NodeProcess(self.kind, job, self._server)
         self._end_limit: ProgressLimit | None = None  # of this process, once its end is awaited
-        self._detector = HangDetector(process.pid, process.heartbeat, self._launch.heartbeat_s)
-        return process
+        _log.info("node_started", node=self.name, kind=self.kind, pid=self.process.pid, restarts=count)
 
     def _on_failure(self, process: NodeProcess, why: str, *, last: bool) -> None:
         text = process.describe_end() + (f" ({why})" if why else "")
@@ -412,7 +386,6 @@ class ManagedProcess:
         process.heartbeat.poll()
         failed_itself = code is not None and code > 0 and not process.was_terminated
         hopeless = failed_itself and not process.heartbeat.ready and not self.restarts
-        self._hopeless |= hopeless
         if last or hopeless or self._entry.restart == "never":
             self._give_up(text)
         else:

@@ -21,8 +21,7 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
 from semantic_mapper.nodes.process_folder import is_in_use, own_folders
-from semantic_mapper.plain_text import visible
-from semantic_mapper.redaction import plain_without_secrets
+from semantic_mapper.plain_text import plain_without_secrets, visible
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 

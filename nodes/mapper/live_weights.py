@@ -7,8 +7,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import structlog
 
@@ -47,16 +46,6 @@ class _Task:
     trial: FieldTrial | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Answer:
-    """To the last offer; fields as of ``WeightsInUse``."""
-
-    judged: int = 0
-    accepted: bool = False
-    reason: str = ""
-    contradicts: bool = False
-
-
 class LiveWeights:
     """Takes, refuses and lists weights, and goes back to earlier ones. A context manager.
 
@@ -83,7 +72,7 @@ class LiveWeights:
         self._requested: int | None = None
         self._counts = {"taken": 0, "refused": 0, "rolled_back": 0}
         self._newest = 0
-        self._answer = _Answer()
+        self._answer: dict[str, Any] = {}  # to the last offer; fields of ``WeightsInUse``
         self._task: _Task | None = None
         self._pause_until = 0.0
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="weights")
@@ -92,17 +81,15 @@ class LiveWeights:
 
     def status(self) -> PartStatus:
         """For the mapper's status."""
-        refused = self._answer.judged and not self._answer.accepted
-        warnings = (f"weights {self._answer.judged} were refused: {self._answer.reason}",) if refused else ()
+        reason = self._answer.get("reason")
+        warnings = (f"weights {self._answer['judged']} were refused: {reason}",) if reason else ()
         counters = {f"weights_{name}": count for name, count in self._counts.items()}
         return PartStatus({"weights_version": self._in_use, **counters}, warnings)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
         self._offers.close()
 
@@ -248,7 +235,7 @@ class LiveWeights:
             self._counts["rolled_back" if back else "taken"] += 1
             self._forget()
         if not task.requested:
-            self._answer = _Answer(number, accepted=True)
+            self._answer = {"judged": number, "accepted": True}
         then = "a mapper that replaces it begins with the weights of the last note, else with those of its start"
         self._context.try_to_leave_note(_NOTE, f"{number} {task.version.digest}", then)
         event = "weights_rolled_back" if back else "weights_exchanged"
@@ -271,7 +258,7 @@ class LiveWeights:
             self._refuse(task.version, reason)
 
     def _refuse(self, entry: WeightsEntry, reason: str, *, contradicts: bool = False) -> None:
-        self._answer = _Answer(entry.version, accepted=False, reason=reason, contradicts=contradicts)
+        self._answer = {"judged": entry.version, "reason": reason, "contradicts": contradicts}
         with self._lock:
             self._versions.setdefault(entry.version, replace(entry, reason=reason[:512]))
             self._counts["refused"] += 1
@@ -295,10 +282,7 @@ class LiveWeights:
             self._in_use,
             self._versions[self._in_use].digest,
             self._newest,
-            self._answer.judged,
-            self._answer.accepted,
-            self._answer.reason,
-            self._counts["rolled_back"],
-            self._answer.contradicts,
+            rolled_back=self._counts["rolled_back"],
+            **self._answer,
         )
         self._publisher.publish(encode(in_use))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import structlog
@@ -19,11 +18,11 @@ from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.mapping.moving import KEPT_S
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
-from semantic_mapper.nodes.mapper.autosave import Autosave
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.nodes.mapper.resume import (
+from semantic_mapper.nodes.mapper.saved_map import (
+    Autosave,
     continue_map,
     forbid,
     keep_earlier,
@@ -141,9 +140,7 @@ class MapperNode:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._resources.close()
 
     def run(self) -> None:

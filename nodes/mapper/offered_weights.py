@@ -1,4 +1,4 @@
-"""Files of the weights that a mapper is offered."""
+"""Files of the weights that a mapper is offered; a finetuner reads them, too, and loads no mapper for that."""
 
 from __future__ import annotations
 
@@ -19,18 +19,7 @@ def file_of_version(folder: Path, number: int) -> Path:
 
 
 def read_kept(folder: Path, number: int, digest: str, like: Checkpoint) -> Checkpoint:
-    """Weights that a mapper has kept.
-
-    Args:
-        folder: Of the mapper's weights.
-        number: Their version.
-        digest: SHA-256 of the file that is meant, hexadecimal.
-        like: Weights in use.
-
-    Raises:
-        WeightsError: another file, or weights that cannot replace ``like``.
-        OSError: they cannot be read.
-    """
+    """Weights that were kept, whose file has this digest; refused where they cannot replace ``like``."""
     path = file_of_version(folder, number)
     if digest_of(path.read_bytes()) != digest:
         raise WeightsError(f"{path.name}: is another file than the one that was in use")
@@ -38,12 +27,7 @@ def read_kept(folder: Path, number: int, digest: str, like: Checkpoint) -> Check
 
 
 def keep_offer(update: WeightsUpdate, folder: Path, like: Checkpoint) -> Checkpoint:
-    """Write the file of an offer and read it; where it is no good, it is not kept.
-
-    Raises:
-        WeightsError: no weights that can replace ``like``.
-        OSError: it cannot be written.
-    """
+    """Write the file of an offer and read it; it is not kept where the weights cannot replace ``like``."""
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(file_of_version(folder, update.version)) as part:
         part.write_bytes(update.data)

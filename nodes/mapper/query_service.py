@@ -13,37 +13,38 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.map_types import PoseInMap
 from semantic_mapper.mapping.moving import MovingSpace
-from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries import questions
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
-from semantic_mapper.queries.questions import NAMES, InstanceArrays, MapInfo, Point, decode_question
-from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import points_in_box
-from semantic_mapper.transport.keys import Keys
-from semantic_mapper.transport.query_messages import (
+from semantic_mapper.queries.questions import (
+    NAMES,
+    InstanceArrays,
+    MapInfo,
     MapState,
+    Point,
     Request,
+    decode_question,
     encode_answer,
     encode_error,
 )
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.surface import cast_rays, points_in_box
+from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.query_sockets import QueryServer
 
 PERIOD_S = 0.1  # between two snapshots, at least
@@ -69,31 +70,18 @@ class _PendingRequest:
     """A question that waits for a snapshot or a worker, or that one answers.
 
     Args:
-        client: Its name, or its address where it gives none.
         address: Socket that the answer goes to.
         until: When the client stops waiting, monotonic seconds.
         parts: As they came.
         request: What they mean.
-        lane: Number of the worker; -1 = it waits for a snapshot.
-        answer: Its parts; None where nobody waits for it any more.
+        answer: Of the worker: parts, or None where nobody waits for them any more; None = it waits for a snapshot.
     """
 
-    client: bytes
     address: bytes
     until: float
     parts: list[bytes]
     request: Request[Any]
-    lane: int = -1
-    answer: list[bytes] | None = None
-
-
-class _Tracked(NamedTuple):
-    """A tracker, and what it found last: in which version of the map."""
-
-    tracker: InstanceTracker
-    version: int
-    things: tuple[Instance, ...]
-    gone: tuple[Instance, ...]
+    answer: Future[list[bytes] | None] | None = None
 
 
 class QueryService:
@@ -104,7 +92,7 @@ class QueryService:
 
     Args:
         endpoint: Where to listen.
-        voxel_map: The map; only ``follow`` and ``hand_over`` read it.
+        voxel_map: The map; only ``follow`` and ``hand_over`` read its blocks.
         correction: Takes corrected poses; without it they are refused.
         keys: See ``QueryServer``.
         weights: Takes other weights; without it questions about them are refused.
@@ -133,26 +121,22 @@ class QueryService:
         self._pose_in_map = pose_in_map or PoseInMap()
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        self._tracked: dict[Point, _Tracked] = {}  # by direction; the last one used stands last
+        # By direction, the last one used last: a tracker, and what it found last, in which version of the map.
+        self._tracked: dict[Point, tuple[InstanceTracker, int, tuple[Instance, ...]]] = {}
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
-        self._copy_again_at = 0.0
-        self._copied_at = 0.0
-        self.used = False  # whether there ever was a question about the map
-        self._listened_until = 0.0  # monotonic seconds
+        self._copied_at = self._copy_again_at = 0.0  # monotonic seconds, as ``_listened_until``
+        self._listened_until = 0.0
         self._awaited_version = 0  # that questions after a pause wait for
-
         self._pending: list[_PendingRequest] = []  # in order of arrival, until the answer is sent
-        self._finished: deque[_PendingRequest] = deque()  # from the workers
         self._closed = threading.Event()
         self._broken = False  # no snapshot can be made, by a bug
         self._map_is_busy = False  # a snapshot did not come in time
         self.answered = 0
-        self.abandoned = 0  # questions dropped because nobody waited for the answer any more
         self._server = QueryServer(endpoint, keys=keys)
         self.endpoint = self._server.endpoint
-        self._workers = [ThreadPoolExecutor(1, f"{lane} queries {endpoint}") for lane in ("quick", "long")]
+        self._quick, self._long = (ThreadPoolExecutor(1, f"{lane} queries {endpoint}") for lane in ("quick", "long"))
         self._thread = threading.Thread(target=self._serve, name=f"queries {endpoint}", daemon=True)
         self._thread.start()
 
@@ -164,24 +148,22 @@ class QueryService:
     def status(self) -> PartStatus:
         """For the mapper's status."""
         dead = () if self.alive else ("questions about the map are no longer answered; see the log",)
-        return PartStatus({"answered": self.answered, "abandoned": self.abandoned}, dead)
+        return PartStatus({"answered": self.answered}, dead)
 
     def follow(self) -> None:
         """Copy what has changed for the next snapshot; for the thread that changes the map, after each step.
 
         Costs nothing while nobody asks, and never waits.
         """
-        now = time.monotonic()
-        wanted = now <= self._listened_until or self._copied_version < self._awaited_version
-        if not wanted or self._copies or self._copied_version == self._map.version or not self.alive:
-            return
-        if self._copied_version < self._awaited_version or now >= self._copy_again_at:
+        now, awaited = time.monotonic(), self._copied_version < self._awaited_version
+        wanted = awaited or self._copy_again_at <= now <= self._listened_until
+        if wanted and not self._copies and self._copied_version != self._map.version and self.alive:
             self._copy(MAX_BLOCKS)
             self._copy_again_at = now + PERIOD_S
 
     def hand_over(self) -> None:
         """Copy all that has changed, if there ever was a question; for before the map's thread does something long."""
-        if self.used and self.alive and self._copied_version != self._map.version:
+        if self._listened_until and self.alive and self._copied_version != self._map.version:
             self._copy(0)
 
     def close(self) -> None:
@@ -192,16 +174,14 @@ class QueryService:
         self._closed.set()
         self._server.wake()
         self._thread.join()
-        for worker in self._workers:
+        for worker in (self._quick, self._long):
             worker.shutdown(cancel_futures=True)
         self._server.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _copy(self, limit: int) -> None:
@@ -223,17 +203,16 @@ class QueryService:
             while not self._closed.is_set() and (received := self._server.receive()) is not None:
                 self._take(*received)
                 self._send_finished()
-        for request in self._pending:
-            if request.lane < 0:
-                self._send(request.address, encode_error(MapError(_NOT_READY)))
+        for pending in self._pending:
+            if pending.answer is None:
+                self._send(pending.address, encode_error(MapError(_NOT_READY)))
 
     def _make_snapshots(self) -> None:
         try:
             while self._copies and not self._broken:
                 self._mirror.apply(self._copies[0].compact())
                 self._copies.popleft()
-                self._copied_at = time.monotonic()
-                self._map_is_busy = False
+                self._copied_at, self._map_is_busy = time.monotonic(), False
         except Exception:  # noqa: BLE001 -- whatever it is, the mapper continues
             self._broken = True
             _log.exception("snapshot_failed", version=self._copies[0].version)
@@ -245,29 +224,25 @@ class QueryService:
         except (SemanticMapperError, MemoryError) as error:
             self._send(address, encode_error(_to_error(error)))
             return
-        client, until = request.asker.encode() or address, time.monotonic() + request.waits_s
-        earlier = [pending for pending in self._pending if pending.client == client]
-        if request.asker and earlier and earlier[-1].parts == parts:  # it timed out and asks again, in its turn
-            earlier[-1].address, earlier[-1].until = address, until
-            return
-        if len(earlier) >= MAX_OF_CLIENT or len(self._pending) >= MAX_WAITING:
+        until = time.monotonic() + request.waits_s
+        for pending in self._pending:
+            if request.asker and pending.parts == parts:  # it timed out and asks again, in its turn
+                pending.address, pending.until = address, until
+                return
+        of_client = sum(pending.address == address for pending in self._pending)
+        if of_client >= MAX_OF_CLIENT or len(self._pending) >= MAX_WAITING:
             self._send(address, encode_error(MapError(_TOO_MANY)))
             return
-        if request.asker and earlier:  # it awaits each answer, and no longer that one
-            earlier[-1].until = 0.0
-        pending = _PendingRequest(client, address, until, parts, request)
-        self._pending.append(pending)
+        self._pending.append(_PendingRequest(address, until, parts, request))
         if request.about_map:
             self._note_question()
-        if not (request.about_map and self._snapshot_lags()):
-            self._start(pending)
+        self._start_waiting()
 
     def _note_question(self) -> None:
         """After a pause, questions wait until there is a snapshot of the map as it is now."""
         now = time.monotonic()
         if now > self._listened_until:
             self._awaited_version, self._copied_at = self._map.version, now
-        self.used = True
         self._listened_until = now + LISTENED_S
 
     def _snapshot_lags(self) -> bool:
@@ -280,31 +255,23 @@ class QueryService:
         return False
 
     def _start_waiting(self) -> None:
-        """Pass on the questions that wait for a snapshot, once it is there or will not come in time."""
-        waiting = [pending for pending in self._pending if pending.lane < 0]
-        if waiting and not self._snapshot_lags():
-            for pending in waiting:
-                self._start(pending)
-
-    def _start(self, pending: _PendingRequest) -> None:
-        """Answers to one client come in the order of its questions, so that all that wait go to the same worker."""
-        same_client = [other for other in self._pending if other.client == pending.client]
-        before = same_client[: same_client.index(pending)]
-        lane = before[-1].lane if before else int(pending.request.takes_long)
-        if lane >= 0:
-            pending.lane = lane
-            self._workers[lane].submit(self._work, pending)
+        """Pass on the questions that wait for no snapshot, or whose snapshot is there or will not come in time."""
+        lags = self._snapshot_lags()
+        for pending in self._pending:
+            if pending.answer is None and not (lags and pending.request.about_map):
+                worker = self._long if pending.request.takes_long else self._quick
+                pending.answer = worker.submit(self._answer, pending)
+                pending.answer.add_done_callback(lambda _: self._server.wake())
 
     def _send_finished(self) -> None:
-        while self._finished:
-            pending = self._finished.popleft()
+        for pending in [p for p in self._pending if p.answer is not None and p.answer.done()]:
             self._pending.remove(pending)
-            if pending.answer is None:
-                self.abandoned += 1
-            else:
-                self._send(pending.address, pending.answer)
-                if pending.request.about_map:
-                    self._listened_until = time.monotonic() + LISTENED_S
+            answer = pending.answer.result() if pending.answer is not None else None
+            if answer is None:
+                continue
+            self._send(pending.address, answer)
+            if pending.request.about_map:
+                self._listened_until = time.monotonic() + LISTENED_S
 
     def _send(self, address: bytes, parts: Sequence[bytes]) -> None:
         self._server.send(address, parts)
@@ -312,14 +279,11 @@ class QueryService:
 
     # The workers.
 
-    def _work(self, pending: _PendingRequest) -> None:
-        if time.monotonic() <= pending.until:
-            pending.answer = self._answer(pending.request)
-        self._finished.append(pending)
-        self._server.wake()
-
-    def _answer(self, request: Request[Any]) -> list[bytes]:
-        name, snapshot = NAMES[type(request)], self._mirror.snapshot()
+    def _answer(self, pending: _PendingRequest) -> list[bytes] | None:
+        if time.monotonic() > pending.until:
+            return None
+        request, snapshot = pending.request, self._mirror.snapshot()
+        name = NAMES[type(request)]
         try:
             if request.about_map and self._map_is_busy and not snapshot.version:
                 raise MapError(_NOT_READY)
@@ -332,16 +296,15 @@ class QueryService:
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
 
     def _find(self, snapshot: MapSnapshot, request: Request[Any]) -> object:
+        _refuse_too_much(snapshot, request)
         match request:
             case questions.InfoRequest():
                 return self._describe(snapshot)
             case questions.AtRequest():
-                _bound_points(snapshot, request)
                 return at(self._with_moving(snapshot), request.points, request.radius_m)
             case questions.NearestRequest():
                 return nearest(snapshot, request.class_name, request.point, request.min_confidence)
             case questions.RaysRequest():
-                _bound_rays(request)
                 return cast_rays(snapshot, request.origins, request.directions, request.max_m)
             case questions.BoxRequest():
                 return points_in_box(snapshot, request.lower, request.upper)
@@ -350,7 +313,6 @@ class QueryService:
             case questions.OccupancyRequest():
                 return occupancy(self._with_moving(snapshot), request.points)
             case questions.DistanceRequest():
-                _bound_field(snapshot, request)
                 box = request.lower, request.upper
                 return distance_field(
                     self._with_moving(snapshot), *box, unknown_is_occupied=request.unknown_is_occupied
@@ -388,16 +350,15 @@ class QueryService:
         )
 
     def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> InstanceArrays:
-        up = request.up
-        tracked = self._tracked.pop(up, None)  # out of here while it updates: one that fails half way is not used again
-        if tracked is None or tracked.version != snapshot.version:
-            tracker = tracked.tracker if tracked else InstanceTracker(up=up)
-            tracked = _Tracked(tracker, snapshot.version, tracker.update(snapshot), tracker.gone)
-        self._tracked[up] = tracked
+        # Out of there while it updates: one that fails half way is not used again.
+        tracker, version, things = self._tracked.pop(request.up, (None, -1, ()))
+        tracker = tracker or InstanceTracker(up=request.up)
+        if version != snapshot.version:
+            things = tracker.update(snapshot)
+        self._tracked[request.up] = tracker, snapshot.version, things
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
-        things = (*tracked.things, *tracked.gone) if request.gone else tracked.things
-        return InstanceArrays.of(things, snapshot.label_set)
+        return InstanceArrays.of((*things, *(tracker.gone if request.gone else ())), snapshot.label_set)
 
 
 def _to_error(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
@@ -406,29 +367,20 @@ def _to_error(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
     return error
 
 
-def _bound_points(snapshot: MapSnapshot, request: questions.AtRequest) -> None:
-    radius = RADIUS_VOXELS if request.radius_m is None else request.radius_m / snapshot.voxel_size_m
-    visited = len(request.points) * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3
-    if visited > MAX_VISITED_VOXELS:
-        raise MapError(
-            f"at: {len(request.points)} points with a radius of {request.radius_m} m are too much for one question; "
-            "ask for fewer points at once, or keep a mirror"
-        )
-
-
-def _bound_rays(request: questions.RaysRequest) -> None:
-    count = max(request.origins.size, request.directions.size) // 3
-    if count * request.max_m > MAX_RAY_METRES:
-        raise MapError(
-            f"cast_rays: {count} rays of {request.max_m:g} m are too much for one question; at most "
-            f"{MAX_RAY_METRES:g} m together, or keep a mirror"
-        )
-
-
-def _bound_field(snapshot: MapSnapshot, request: questions.DistanceRequest) -> None:
-    sides = [(b - a) / snapshot.voxel_size_m for a, b in zip(request.lower, request.upper, strict=True)]
-    if min(sides) > 0 and math.prod(sides) > MAX_FIELD_VOXELS:
-        raise MapError(
-            f"distance_field: a box of {' x '.join(f'{s:.0f}' for s in sides)} voxels; over a socket at most "
-            f"{MAX_FIELD_VOXELS} are computed at once; keep a mirror for more"
-        )
+def _refuse_too_much(snapshot: MapSnapshot, request: Request[Any]) -> None:
+    match request:
+        case questions.AtRequest():
+            radius = RADIUS_VOXELS if request.radius_m is None else request.radius_m / snapshot.voxel_size_m
+            size = len(request.points) * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3
+            limit, what = MAX_VISITED_VOXELS, f"{len(request.points)} points with a radius of {request.radius_m} m"
+        case questions.RaysRequest():
+            count = max(request.origins.size, request.directions.size) // 3
+            size, limit, what = count * request.max_m, MAX_RAY_METRES, f"{count} rays of {request.max_m:g} m"
+        case questions.DistanceRequest():
+            sides = [(b - a) / snapshot.voxel_size_m for a, b in zip(request.lower, request.upper, strict=True)]
+            size, limit = math.prod(sides) if min(sides) > 0 else 0, MAX_FIELD_VOXELS
+            what = f"a box of {' x '.join(f'{side:.0f}' for side in sides)} voxels"
+        case _:
+            return
+    if size > limit:
+        raise MapError(f"{what}: too much for one question over a socket; ask for less at once, or keep a mirror")

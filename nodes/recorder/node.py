@@ -149,7 +149,6 @@ class Recorder:
     Attributes:
         recording: None while no stream has begun.
         rejected: Messages that could not be read.
-        unpacked: Frames that were kept as they came, because they could not be packed as ``options.rgb`` says.
         cut_off: Whether there was no time to write all that had come before a stop.
         received: Frames that came.
 
@@ -174,7 +173,7 @@ class Recorder:
         if options.rgb != "as-sent":
             self._packing = CodecOptions(rgb=options.rgb, jpeg_quality=options.jpeg_quality)
         self.recording: Recording | None = None
-        self.rejected = self.unpacked = self.received = 0
+        self.rejected = self.received = 0
         self.cut_off = False
         self.missing_frames = MissingFrames()
         self._streams = Streams(options.streams)
@@ -288,17 +287,12 @@ class Recorder:
         try:
             return repack_rgb(parts, self._packing)
         except CodecError as error:  # the reader of the log judges it
-            self.unpacked += 1
             _log.warning("frame_kept_as_sent", seq=envelope.seq, error=str(error))
             return parts
 
 
 def _publish_status(report: StatusReport, recorder: Recorder, state: NodeState) -> None:
-    counters = {
-        "missed": recorder.missing_frames.missed,
-        "rejected": recorder.rejected,
-        "unpacked": recorder.unpacked,
-    }
+    counters = {"missed": recorder.missing_frames.missed, "rejected": recorder.rejected}
     degraded: tuple[str, ...] = ()
     if (r := recorder.recording) is not None:
         counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost}

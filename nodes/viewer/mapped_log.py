@@ -9,8 +9,9 @@ from pathlib import Path
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.viewer.sources import Begin, MapShow
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.replay.exporters.rerun_log import RerunLog
+from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import PosedFrame
@@ -24,8 +25,7 @@ def show_log(
     begin: Begin,
     refresh_s: float,
     going: Callable[[], bool],
-    on_start: Callable[[int], None],
-    on_frame: Callable[[int], None],
+    monitor: JobMonitor,
 ) -> None:
     """Map a log and show it meanwhile, its map every n seconds and at the end.
 
@@ -36,8 +36,7 @@ def show_log(
         begin: Says where to write it, once log and weights are open.
         refresh_s: Time between two maps.
         going: Whether to go on.
-        on_start: Called with how many frames there are.
-        on_frame: Called with how many are done.
+        monitor: Hears how many frames there are, and how many are done.
 
     Raises:
         LogError, WeightsError, ConfigError, MapError: it cannot be mapped.
@@ -56,7 +55,7 @@ def show_log(
             rerun=log,
         )
         total = min(len(reader), frames or len(reader))
-        on_start(total)
+        monitor.start(total)
         shown_at, stamp_ns = time.monotonic(), 0
         for done, item in enumerate(reader.frames_or_errors(total), 1):
             if not going():
@@ -66,7 +65,7 @@ def show_log(
                 stamp_ns = item.stamp_ns
             else:
                 session.refuse(done - 1, 0, str(item))
-            on_frame(done)
+            monitor.set(done)
             if time.monotonic() - shown_at > refresh_s:
                 show.show(mirror.apply(voxel_map.changes(mirror.version)), stamp_ns)
                 shown_at = time.monotonic()

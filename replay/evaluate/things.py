@@ -19,13 +19,12 @@ from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.imaging import resize_label, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.mapping.map_types import MapView
-from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.surface import class_surface
+from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.replay.evaluate.truth import TRUTH_WIDTH
 from semantic_mapper.replay.importers.base import BadFrameError, read_plane
@@ -94,13 +93,12 @@ class ThingSurface:
 
     def __init__(self, voxel_map: VoxelMap, *, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
         snapshot = MapMirror.of(voxel_map).snapshot()
-        every = class_surface(snapshot, np.ones(256, np.bool_))
-        row = np.repeat(np.arange(len(every.packed)), np.diff(every.start))
-        keys = (row << 9) | every.voxel  # ascending
+        every = surface_voxels(snapshot)
+        keys = (every.row.astype(np.int64) << 9) | every.voxel  # ascending
         self.things = InstanceTracker(up=up).update(snapshot)
         self.number: NDArray[np.int64] = np.full(len(keys), -1, np.int64)
         for index, thing in enumerate(self.things):
-            block = np.searchsorted(every.packed, pack_keys(thing.voxels >> 3))
+            block = np.searchsorted(snapshot.packed, pack_keys(thing.voxels >> 3))
             x, y, z = (thing.voxels & 7).T
             self.number[np.searchsorted(keys, (block << 9) | (z * 64 + y * 8 + x))] = index
         self.xyz: Float64 = every.point * snapshot.voxel_size_m
@@ -132,7 +130,6 @@ class ThingSurface:
 
     def _nearest(self) -> Any:
         if self._tree is None:
-            check_room_for_scipy()
             from scipy.spatial import KDTree
 
             self._tree = KDTree(self.xyz)

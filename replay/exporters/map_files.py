@@ -14,8 +14,8 @@ from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
 from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.floor_plan import FREE, OCCUPIED, UNKNOWN, find_up, occupancy_grid, write_map_server
-from semantic_mapper.mapping.files.formats import (
+from semantic_mapper.mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, find_up, occupancy_grid, write_map_server
+from semantic_mapper.mapping.formats import (
     ColorBy,
     colored,
     sure_faces,
@@ -25,7 +25,7 @@ from semantic_mapper.mapping.files.formats import (
     write_obj,
     write_ply,
 )
-from semantic_mapper.mapping.fusion.fuse import SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_types import MapMesh, require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
-from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
+from semantic_mapper.imaging import rotate_frame, rotate_intrinsics
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, read_note
 from semantic_mapper.replay.importers.base import (

@@ -20,7 +20,7 @@ from semantic_mapper.drivers.calibration import Rectifier, load_calibration
 from semantic_mapper.errors import ConfigError, DependencyError, FrameError, ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import camera_matrix, scale_intrinsics, transform
-from semantic_mapper.image_rotation import rotate_intrinsics
+from semantic_mapper.imaging import rotate_intrinsics
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.format import LogWriter, atomic_log
 from semantic_mapper.replay.sfm import colmap_process as colmap
@@ -223,8 +223,6 @@ class _Lens:
             self.source, self.about = f"found, beginning with the given {options.focal_prior_px:g}", False
         if options.calibration is None:
             return
-        if options.focal_prior_px is not None:
-            raise ConfigError("give a calibration or a guess of the focal length, not both")
         given = rotate_intrinsics(load_calibration(options.calibration), options.quarters)
         if given.width * film.full_height != given.height * film.full_width:
             raise ConfigError(

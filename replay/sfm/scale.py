@@ -54,29 +54,12 @@ class MarkedDistance:
 
 @dataclass(frozen=True, slots=True)
 class ScaleHint:
-    """What tells the size of the scene; at most one of these.
+    """What tells the size of the scene; the first of these that is given."""
 
-    Args:
-        factor: Metres per unit of the log that comes without a scale: by how much its map is too small.
-        distance: Two marked points.
-        board: A printed board that is seen in the film.
-        camera_height_m: Of the camera over the floor, the median over the film.
-
-    Raises:
-        ConfigError: several of them, or a number that cannot be.
-    """
-
-    factor: float | None = None
+    factor: float | None = None  # metres per unit of the log that comes without a scale
     distance: MarkedDistance | None = None
-    board: BoardPoses | None = None
-    camera_height_m: float | None = None
-
-    def __post_init__(self) -> None:
-        if sum(getattr(self, name) is not None for name in self.__slots__) > 1:
-            raise ConfigError("the scale comes from one source only: a factor, a distance, a board or a height")
-        for number in (self.factor, self.camera_height_m):
-            if number is not None and not 1e-6 < number < 1e6:
-                raise ConfigError(f"a scale or height of {number:g} cannot be; give a number above 0")
+    board: BoardPoses | None = None  # a printed board that is seen in the film
+    camera_height_m: float | None = None  # of the camera over the floor, the median over the film
 
 
 def parse_distance(text: str) -> MarkedDistance:

@@ -71,7 +71,7 @@ def samples(walk: Walk, config: DepthFromMotionConfig, ahead: int) -> Iterator[S
     for k, (_, truth) in enumerate(walk):
         view = views[k]
         others: list[PreparedView] = [*views[:k], *views[k + 1 : k + 1 + ahead]]
-        sources = choose_sources(view, others, config.sources, None, 2.0)
+        sources = choose_sources(view, others, None, 2.0)
         if not sources:
             continue
         swept = sweep_and_match(view, sources, planes, None)

@@ -24,22 +24,24 @@ from mcap.opcode import Opcode
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.labels import NYU40
-from semantic_mapper.mapping.storage.changes import NONE_CLEARED
-from semantic_mapper.queries.questions import QUESTIONS, WeightsEntry, decode_question
+from semantic_mapper.mapping.changes import NONE_CLEARED
+from semantic_mapper.queries.questions import (
+    QUESTIONS,
+    MapState,
+    WeightsEntry,
+    decode_answer,
+    decode_question,
+    encode_answer,
+    encode_error,
+    encode_request,
+    read_name,
+)
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.transport import codec
 from semantic_mapper.transport.codec import pack_parts, unpack_parts
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
-from semantic_mapper.transport.query_messages import (
-    MapState,
-    decode_answer,
-    encode_answer,
-    encode_error,
-    encode_request,
-    read_name,
-)
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 Spoil = Callable[[bytes], bytes]

@@ -105,13 +105,13 @@ def stages(walk: Walk, config: DepthFromMotionConfig, repeats: int = 5) -> dict[
     views = [prepare_view(frame, config.width) for frame, _ in walk]
     middle, frame = len(views) // 2, walk[len(walk) // 2][0]
     reference, others = views[middle], views[max(middle - 24, 0) : middle]
-    sources = choose_sources(reference, others, config.sources, None, 2.0)
+    sources = choose_sources(reference, others, None, 2.0)
     planes = inverse_depths(config.planes, config.near_m, config.far_m)
     estimate = estimate_depth(reference, sources, config)
     neighbours = [replace(v, estimate=estimate) for v in others[-6:]]
     work: dict[str, Callable[[], object]] = {
         "prepare": lambda: prepare_view(frame, config.width),
-        "choose sources": lambda: choose_sources(reference, others, config.sources, None, 2.0),
+        "choose sources": lambda: choose_sources(reference, others, None, 2.0),
         "sweep and match": lambda: sweep_and_match(reference, sources, planes, None),
         "estimate in all": lambda: estimate_depth(reference, sources, config, None, neighbours),
         "enlarge": lambda: enlarge_estimate(estimate, reference.rgb, frame.rgb),

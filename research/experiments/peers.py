@@ -41,7 +41,6 @@ class Run:
         encoder: The run whose encoder it starts from; empty = random weights.
         images: Trained on single images, not on rays.
         fraction: Of the recipe's steps.
-        encoder_rate: Other than the recipe's; 0 = the recipe's.
     """
 
     kind: str
@@ -49,7 +48,6 @@ class Run:
     encoder: str = ""
     images: bool = False
     fraction: float = 1.0
-    encoder_rate: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,13 +82,10 @@ RUNS = {
     "sray": Run("sray", depth=True, encoder="unet-depth"),
     "neuray": Run("neuray", depth=False, encoder="unet"),
     "sray-none": Run("sray-none", depth=True, encoder="unet-depth"),
-    # Its features have to match across views, which an encoder of classes has never been asked for.
-    "mvsnerf": Run("mvsnerf", depth=False, encoder="unet", encoder_rate=1.0),
     "sray-cross": Run("sray-cross", depth=True, encoder="unet-depth"),
     "sray-intra": Run("sray-intra", depth=True, encoder="unet-depth"),
     "sray-colours": Run("sray", depth=False, encoder="unet"),
     "neuray-depth": Run("neuray", depth=True, encoder="unet-depth"),
-    "mvsnerf-depth": Run("mvsnerf", depth=True, encoder="unet-depth", encoder_rate=1.0),
     "sray-paper": Run("sray-paper", depth=True, encoder="unet-depth"),
 }
 
@@ -102,8 +97,6 @@ def recipe(name: str, budget: Budget) -> str:
     plain: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
     steps = budget.steps or round(run.fraction * plain["steps"])
     plain |= {"kind": run.kind, "seed": budget.seed, "steps": steps}
-    if run.encoder_rate:
-        plain["encoder_rate"] = run.encoder_rate
     plain["field"] = {"encoder": {"depth": run.depth} | budget.encoder}
     return "\n".join(_lines(plain, "")) + "\n"
 

@@ -23,8 +23,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import CELL_M, GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.types import Bool, CameraIntrinsics, PosedFrame
 
 CAMERA = CameraIntrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)

@@ -24,12 +24,11 @@ from torch.nn import functional
 from research.suites.predict import Prediction
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.geometry import invert_pose, transform, unproject, visible_points
 from semantic_mapper.imaging import depth_prior, fill_holes
 from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
-from semantic_mapper.view_selection import visible_points
 
 BASELINES = ("own", "vote", "vote_exact", "oracle")
 

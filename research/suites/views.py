@@ -14,10 +14,9 @@ from research.suites.config import SpacingConfig
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.geometry import LABELLED_VALUE, select_views, transform, unproject, visible_points
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
-from semantic_mapper.view_selection import LABELLED_VALUE, select_views, visible_points
 
 PROBE_WIDTH = 40  # pixels a row of the query that are asked what another view sees of them
 

@@ -27,8 +27,8 @@ from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.blocks import KEY_LIMIT
 from semantic_mapper.mapping.refine import surface_voxels, up_frame
-from semantic_mapper.mapping.storage.block_index import KEY_LIMIT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.sequence import LogSequence, open_log
 from semantic_mapper.types import Float64, PosedFrame

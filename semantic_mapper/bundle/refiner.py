@@ -16,6 +16,8 @@ from semantic_mapper.geometry import invert_pose, nearest_pose, pose_distance, t
 from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
+_WINDOW = 20  # keyframes that are adjusted together
+_CORNERS, _WIDTH = 300, 640  # followed in an image, and its width at most
 _LEAST_POINTS = 20  # that must agree on a frame's pose
 _MAX_SIGMAS = 4.0  # a pose that is further from the given one is not believed
 _ITERATIONS = 8
@@ -73,8 +75,8 @@ class PoseRefiner:
     def __init__(self, intrinsics: CameraIntrinsics, config: PoseRefinerConfig, *, background: bool = False) -> None:
         self._config = config
         self._intrinsics = intrinsics
-        self._tracker = Tracker(config.corners)
-        self._map = KeyframeMap(working_intrinsics(intrinsics, config.width), config.window)
+        self._tracker = Tracker(_CORNERS)
+        self._map = KeyframeMap(working_intrinsics(intrinsics, _WIDTH), _WINDOW)
         self._frames: list[_Frame] = []
         self._given: Float64 | None = None  # pose of the frame before
         self._refined = np.eye(4)
@@ -122,7 +124,7 @@ class PoseRefiner:
             moved_m, turned = pose_distance(frame.reported, pose)
             if moved_m > _CORRECTED_M or turned > _CORRECTED_RAD:
                 changed[frame.key] = frame.reported = pose
-        alive = {k.number for k in self._map.keyframes[-self._config.window :]}
+        alive = {k.number for k in self._map.keyframes[-_WINDOW:]}
         self._frames = [frame for frame in self._frames if frame.keyframe.number in alive]
         return changed
 

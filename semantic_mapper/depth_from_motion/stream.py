@@ -28,7 +28,7 @@ TURN_WEIGHT_M = 0.5  # a turn of one radian counts as this much way, where views
 USUAL_DEPTH_M = 2.0  # until something is known
 WAIT_FACTOR = 4  # a frame whose camera is gone waits until this many times ``delay_frames`` frames wait
 
-BASELINES = (0.06, 0.10, 0.15, 0.22)  # wanted way aside, in depths of what is seen
+BASELINES = (0.06, 0.10, 0.15, 0.22)  # wanted ways aside of the frames that one is matched with, in depths
 LEAST_BASELINE, MOST_BASELINE = 0.02, 0.5  # beyond these a frame tells nothing of depth, or looks too different
 LEAST_OVERLAP = 0.4  # fraction of the reference that a source must see
 OVERLAP_COST = 1.5  # of no overlap at all, against a baseline that is off by a factor of e
@@ -128,7 +128,7 @@ class DepthFromMotion:
         camera = self._cameras.get(camera_id, _CameraViews())
         others = [v for v in camera.views if v is not view]
         known = hint.depth_m if hint is not None else None
-        sources = choose_sources(view, others, self._config.sources, known, camera.usual_m)
+        sources = choose_sources(view, others, known, camera.usual_m)
         if not sources:
             return None
         neighbours = _nearest_estimates(view, others)
@@ -171,9 +171,9 @@ def _nearest_estimates(view: PreparedView, others: list[PreparedView]) -> list[P
 
 
 def choose_sources(
-    reference: PreparedView, candidates: Sequence[PreparedView], count: int, depth_m: Float32 | None, usual_m: float
+    reference: PreparedView, candidates: Sequence[PreparedView], depth_m: Float32 | None, usual_m: float
 ) -> list[PreparedView]:
-    """At most ``count`` of the candidates; none where the camera only turned or stood still.
+    """Candidates to match with, at most one for each baseline; none where the camera only turned or stood still.
 
     Args:
         candidates: Other frames of the same camera.
@@ -187,7 +187,7 @@ def choose_sources(
     baseline, overlap, side = (np.array(part) for part in zip(*relations, strict=True))
     usable = (baseline >= LEAST_BASELINE) & (baseline <= MOST_BASELINE) & (overlap >= LEAST_OVERLAP)
     chosen: list[int] = []
-    for wanted in _spread_over(BASELINES, count):
+    for wanted in BASELINES:
         free = [k for k in np.flatnonzero(usable) if k not in chosen]
         if not free:
             break
@@ -199,12 +199,6 @@ def choose_sources(
         ]
         chosen.append(int(free[int(np.argmin(cost))]))
     return [candidates[k] for k in chosen]
-
-
-def _spread_over(values: Sequence[float], count: int) -> Float64:
-    """``count`` values between the first and the last, in equal ratios where there are more than these."""
-    positions = np.linspace(0, len(values) - 1, count) if count > 1 else np.array([(len(values) - 1) / 2])
-    return np.exp(np.interp(positions, np.arange(len(values)), np.log(values)))
 
 
 def _grid_points(reference: PreparedView, depth_m: Float32 | None, usual_m: float) -> Float64:

@@ -34,10 +34,10 @@ from semantic_mapper.config import HistoryConfig
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.geometry import check_pose, interpolate_pose, invert_pose, move, transform
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.blocks import ScratchFile
 from semantic_mapper.mapping.keyframes import KeyframeStore
+from semantic_mapper.mapping.map_snapshot import MapSnapshot
 from semantic_mapper.mapping.map_types import ALWAYS, CorrectedPoses, CorrectionStatus
-from semantic_mapper.mapping.storage.block_store import ScratchFile
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 

@@ -10,10 +10,16 @@ import torch
 
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.geometry import (
+    GUESSED_DEPTHS_M,
+    LABELLED_VALUE,
+    select_views,
+    transform,
+    unproject,
+    visible_points,
+)
 from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
-from semantic_mapper.view_selection import GUESSED_DEPTHS_M, LABELLED_VALUE, select_views, visible_points
 
 ROTATION_DEG = 12.0  # that a frame has turned from every keyframe near it, to become one
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views

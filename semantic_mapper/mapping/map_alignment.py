@@ -23,9 +23,9 @@ from semantic_mapper.localization.relocalizer import (
     sighting,
 )
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.files.map_file import open_map
-from semantic_mapper.mapping.files.merge import check_fit
+from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.mapping.map_types import require_same_scale
+from semantic_mapper.mapping.merge import check_fit
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float64

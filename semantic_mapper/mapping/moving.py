@@ -14,7 +14,7 @@ which it hid itself.
 
 Not found: what moves away along the line of sight (it hid the space where it is now), what had moved before it was seen
 for the first time, and what is slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through
-it (``fusion/clearing.py``).
+it (``mapping/clearing.py``).
 
 Alignment is Gauss-Newton from point to plane on small depth images, with a prior that the given pose is right to within
 ``SIGMA_M`` and ``SIGMA_RAD``: a pose that jitters or drifts is corrected, one that jumps is not, and ``misfit`` tells.

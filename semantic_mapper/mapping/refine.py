@@ -28,10 +28,10 @@ from semantic_mapper.fields.nesf import (
 )
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.floor_plan import find_up
-from semantic_mapper.mapping.fusion.fuse import PROBABILITY_FLOOR, SURFACE_WEIGHT
-from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
-from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.blocks import find_blocks, pack_keys
+from semantic_mapper.mapping.floor_plan import find_up
+from semantic_mapper.mapping.fusion import PROBABILITY_FLOOR, SURFACE_WEIGHT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64
 

@@ -25,7 +25,7 @@ from semantic_mapper.fields.render import render_sparse_view, render_view
 from semantic_mapper.fields.volume import around_computed
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
-from semantic_mapper.mapping.fusion.fuse import PROBABILITY_FLOOR
+from semantic_mapper.mapping.fusion import PROBABILITY_FLOOR
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, UInt8
 
 SAMPLES_WITHOUT_DEPTH = 32  # a ray, of views of which neither sensor nor map knows any depth

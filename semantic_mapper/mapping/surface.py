@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.fusion.allocation import Camera, blocks_in_view, blocks_within_reach
+from semantic_mapper.mapping.allocation import Camera, blocks_in_view, blocks_within_reach
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, NEIGHBOURS, BlockGrid, GridBuffers
+from semantic_mapper.mapping.blocks import BlockIndex, find_blocks, pack_keys, unpack_keys
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, NEIGHBOURS, BlockGrid, GridBuffers
-from semantic_mapper.mapping.storage.block_index import BlockIndex, find_blocks, pack_keys, unpack_keys
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, UInt8
 
 MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh

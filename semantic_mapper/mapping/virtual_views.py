@@ -14,10 +14,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from semantic_mapper.geometry import check_pose, invert_pose, look_at, nearest_pixels, scale_intrinsics, transform
+from semantic_mapper.geometry import (
+    check_pose,
+    invert_pose,
+    look_at,
+    nearest_pixels,
+    scale_intrinsics,
+    transform,
+    visible_points,
+)
 from semantic_mapper.kernels import parallel_kernel
-from semantic_mapper.mapping.fusion.allocation import blocks_in_band, make_camera
-from semantic_mapper.mapping.fusion.fuse import (
+from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
+from semantic_mapper.mapping.block_grid import GridBuffers
+from semantic_mapper.mapping.blocks import pack_keys
+from semantic_mapper.mapping.fusion import (
     FULL_TRUST_RANGE_M,
     ProbabilityTable,
     checked_depth,
@@ -27,11 +37,8 @@ from semantic_mapper.mapping.fusion.fuse import (
     vote_into_blocks,
 )
 from semantic_mapper.mapping.keyframes import Keyframe
-from semantic_mapper.mapping.storage.block_grid import GridBuffers
-from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64
-from semantic_mapper.view_selection import visible_points
 
 VOTE_WEIGHT = 0.3  # of a vote, against one of a frame
 MAX_VOTES = 0.3  # only voxels with fewer take votes; a frame's vote from up to 2 m, head on, is 1

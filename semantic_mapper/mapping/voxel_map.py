@@ -18,23 +18,10 @@ from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.places import Place, PlaceStore, moved_place, shared_places
-from semantic_mapper.mapping.files.map_file import BlockPart, MapManifest, open_map
-from semantic_mapper.mapping.files.map_snapshot import MapSnapshot
-from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
-from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
-from semantic_mapper.mapping.fusion.clearing import NO_BOUNDS, clear_in_view, depth_bounds
-from semantic_mapper.mapping.fusion.fuse import (
-    SURFACE_WEIGHT,
-    checked_depth,
-    frame_votes,
-    fuse_blocks,
-    make_limits,
-    probability_table,
-)
-from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView, require_same_scale, scale_name
-from semantic_mapper.mapping.storage.block_grid import BLOCK_SIDE, BlockGrid
-from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.changes import (
+from semantic_mapper.mapping.allocation import blocks_in_band, frame_budget, make_camera
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.blocks import pack_keys, unpack_keys
+from semantic_mapper.mapping.changes import (
     NONE_CLEARED,
     BlockChanges,
     ClearedBlocks,
@@ -43,6 +30,19 @@ from semantic_mapper.mapping.storage.changes import (
     oldest_first,
     packed_parts,
 )
+from semantic_mapper.mapping.clearing import NO_BOUNDS, clear_in_view, depth_bounds
+from semantic_mapper.mapping.fusion import (
+    SURFACE_WEIGHT,
+    checked_depth,
+    frame_votes,
+    fuse_blocks,
+    make_limits,
+    probability_table,
+)
+from semantic_mapper.mapping.map_file import BlockPart, MapManifest, open_map
+from semantic_mapper.mapping.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView, require_same_scale, scale_name
+from semantic_mapper.mapping.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.surface import (
     cast_view,
     join_meshes,
@@ -169,7 +169,7 @@ class VoxelMap:
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
                 which row is a pixel's, -1 = unknown. ``known`` is None then.
             trust: (H, W) float32 0..1, how much of its full weight each depth and its vote count; None = 1.
-            measured: Whether a sensor measured the depth; what was computed weighs less (``fusion/fuse.py``).
+            measured: Whether a sensor measured the depth; what was computed weighs less (``mapping/fusion.py``).
 
         Returns:
             Blocks touched, 0 where the depth image holds no measurement.

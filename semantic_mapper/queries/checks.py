@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.blocks import KEY_LIMIT
 from semantic_mapper.mapping.map_types import require_metres
-from semantic_mapper.mapping.storage.block_index import KEY_LIMIT
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64
 
@@ -59,6 +59,14 @@ def check_direction(direction: ArrayLike, name: str) -> Float64:
     if array.size and not (np.isfinite(length).all() and (length > 0).all()):
         raise MapError(f"{name}: a direction must have a finite length above 0")
     return array / length
+
+
+def check_up(up: ArrayLike) -> Float64:
+    """One direction (3,) -> of unit length; see ``check_direction``."""
+    unit = check_direction(up, "up")
+    if unit.shape != (3,):
+        raise MapError(f"up: expected shape (3,), got {unit.shape}")
+    return unit
 
 
 def check_box(lower: ArrayLike, upper: ArrayLike, snapshot: MapSnapshot) -> tuple[Float64, Float64]:

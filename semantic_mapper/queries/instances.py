@@ -14,21 +14,36 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.kernels import kernel
-from semantic_mapper.labels import STUFF_NAMES, LabelSet
+from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, pack_keys, unpack_keys
+from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.mapping.map_types import require_metres
-from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
-from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
-from semantic_mapper.queries.checks import check_direction
+from semantic_mapper.queries.checks import check_up
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import ClassSurface, class_surface, surface_voxels
+from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8
 
 MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
 SURE_VOXELS = 200  # smaller things are wrong more often
 MAX_GONE = 64  # things that have gone, kept to be reported
 LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it became
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OrientedBox:
+    """A box that stands upright.
+
+    Args:
+        center: (3,) float64 world metres.
+        size: (3,) float64 metres along its own axes: x the longer level side, y the shorter, z along up.
+        R_world_box: (3, 3) float64, columns are its axes in the world.
+    """
+
+    center: Float64
+    size: Float64
+    R_world_box: Float64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,14 +77,44 @@ class Instance:
         return self.confidence * min(1.0, len(self.voxels) / SURE_VOXELS) ** 0.5
 
 
-class _Found(NamedTuple):
-    """What one update has found; ``ids`` (C,), ``sizes`` (C,) in voxels and ``things`` go with the components."""
+class ThingVoxels(NamedTuple):
+    """N surface voxels of some classes in the B blocks of a map, ordered as in ``SurfaceVoxels``.
 
-    surface: ClassSurface
+    Args:
+        packed: (B,) int64 sorted keys.
+        start: (B + 1,) int64; block b has the voxels ``start[b] .. start[b + 1] - 1``.
+        row: (N,) int32 position of the block in ``packed``.
+        voxel: (N,) int32 within the block, ascending in each.
+        point: (N, 3) float64 surface point in units of voxels.
+        label: (N,) uint8 class ids.
+    """
+
+    packed: Int64
+    start: Int64
+    row: Int32
+    voxel: Int32
+    point: Float64
+    label: UInt8
+
+
+def thing_voxels(snapshot: MapSnapshot, wanted: Bool) -> ThingVoxels:
+    """The surface voxels of the classes with ids ``wanted`` (256,)."""
+    bits = np.packbits(wanted, bitorder="little").view("<u8")
+    rows = np.flatnonzero((snapshot.voxels.classes[snapshot.slots] & bits).any(axis=1))
+    row, voxel, point = surface_voxels(snapshot, rows)
+    label = snapshot.voxels.label[snapshot.slots[row], voxel]
+    kept = wanted[label]
+    start = np.searchsorted(row[kept], np.arange(snapshot.block_count + 1))
+    return ThingVoxels(snapshot.packed, start, row[kept], voxel[kept], point[kept], label[kept])
+
+
+class _Found(NamedTuple):
+    """What one update has found; ``ids`` (C,) and ``sizes`` (C,) in voxels go with the components."""
+
+    voxels: ThingVoxels
     components: Components
-    ids: NDArray[np.int64]
-    sizes: NDArray[np.int64]
-    things: tuple[Instance, ...]
+    ids: Int64
+    sizes: Int64
 
 
 class _Whole(NamedTuple):
@@ -80,22 +125,12 @@ class _Whole(NamedTuple):
     most_voxels: int
 
 
-class _LabelledVoxels(NamedTuple):
-    """``packed``, ``start`` and ``voxel`` of a ``ClassSurface``, and the components (N,) of its voxels."""
-
-    packed: Int64
-    start: Int64
-    voxel: Int32
-    component: Int64
-
-
 class InstanceTracker:
-    """Finds the instances of one map again and again.
+    """Finds the instances of one map again and again. Safe to call from several threads.
 
     An instance is what an earlier one became where it holds the most of that one's voxels, and at least a tenth. Of
     several that became one, the oldest id stays; of a split, the part with the most voxels keeps the id. Matching looks
-    at the last update alone: a thing that was not found in it comes back under a new id. What has not changed since
-    then is not computed again. Safe to call from several threads.
+    at the last update alone: a thing that was not found in it comes back under a new id.
 
     A thing of which more than half was seen through since it was whole has gone (``gone``); what is left of it gets a
     new id. One that is only no longer found (its class or the map's poses have changed, or it became part of another)
@@ -111,18 +146,13 @@ class InstanceTracker:
     """
 
     def __init__(
-        self,
-        stuff: Collection[str] = STUFF_NAMES,
-        min_voxels: int = MIN_VOXELS,
-        up: ArrayLike = (0.0, 0.0, 1.0),
+        self, stuff: Collection[str] = STUFF_NAMES, min_voxels: int = MIN_VOXELS, up: ArrayLike = (0.0, 0.0, 1.0)
     ) -> None:
         if min_voxels < 1:
             raise MapError(f"min_voxels must be at least 1, got {min_voxels}")
         self._stuff = frozenset(stuff)
         self._min_voxels = min_voxels
-        self._up = check_direction(up, "up")
-        if self._up.shape != (3,):
-            raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
+        self._up = check_up(up)
         self._next_id = 1
         self._last: _Found | None = None
         self._epoch = 0
@@ -147,70 +177,61 @@ class InstanceTracker:
         wanted = np.zeros(256, np.bool_)
         wanted[list(snapshot.label_set.thing_ids(self._stuff))] = True
         with self._lock:
-            last = self._last
-            surface = class_surface(snapshot, wanted, last.surface if last else None)
-            found = find_components(surface, self._min_voxels)
+            voxels = thing_voxels(snapshot, wanted)
+            found = find_components(voxels, self._min_voxels)
             sizes = np.diff(found.ends, prepend=0)
-            ids, same = np.zeros(len(sizes), np.int64), np.full(len(sizes), -1, np.int64)
-            if last:
-                self._match(last, surface, found, ids, same)
+            ids = np.zeros(len(sizes), np.int64)
+            if self._last:
+                self._match(self._last, voxels, found, ids)
                 self._find_gone(snapshot, ids, sizes)
             new = np.flatnonzero(ids == 0)
             ids[new] = self._next_id + np.arange(len(new))
             self._next_id += len(new)
-            row = np.repeat(np.arange(len(surface.packed)), np.diff(surface.start))
             parts = np.split(found.order, found.ends[:-1]) if len(ids) else []
-            things = tuple(
-                last.things[kept]
-                if last and kept >= 0
-                else describe_thing(
-                    int(number),
-                    snapshot.label_set,
-                    snapshot.voxel_size_m,
-                    self._up,
-                    surface,
-                    row,
-                    part,
-                    snapshot.measured(snapshot.slots[row[part]].astype(np.int64), surface.voxel[part].astype(np.int64)),
-                )
-                for part, number, kept in zip(parts, ids, same, strict=True)
-            )
-            self._last = _Found(surface, found, ids, sizes, things)
+            things = [
+                self._describe(snapshot, int(number), voxels, part) for part, number in zip(parts, ids, strict=True)
+            ]
+            things.sort(key=lambda thing: thing.id)
+            self._last = _Found(voxels, found, ids, sizes)
             self._keep_whole(snapshot, things)
-        return tuple(sorted(things, key=lambda thing: thing.id))
+        return tuple(things)
 
-    def _match(
-        self,
-        last: _Found,
-        surface: ClassSurface,
-        found: Components,
-        ids: NDArray[np.int64],
-        same: NDArray[np.int64],
-    ) -> None:
-        """Write the id that each component had, and which component of the last update it still is, bit for bit."""
-        sizes, count = np.diff(found.ends, prepend=0), len(found.ends)
-        held = np.empty(len(surface.voxel), np.int64)
-        overlap_count = find_overlaps(
-            _LabelledVoxels(last.surface.packed, last.surface.start, last.surface.voxel, last.components.component),
-            _LabelledVoxels(surface.packed, surface.start, surface.voxel, found.component),
-            count,
-            held,
+    def _describe(self, snapshot: MapSnapshot, number: int, voxels: ThingVoxels, part: Int64) -> Instance:
+        """The thing that some of the voxels, ``part`` (M,), are; ``number`` is its id."""
+        row, voxel, labels = voxels.row[part], voxels.voxel[part].astype(np.int64), snapshot.label_set
+        slot, class_id = snapshot.slots[row].astype(np.int64), int(voxels.label[part[0]])
+        xyz = voxels.point[part] * snapshot.voxel_size_m
+        return Instance(
+            number,
+            class_id,
+            labels.names[labels.ids.index(class_id)],
+            float(snapshot.voxels.confidence[slot, voxel].mean(dtype=np.float64) / CONFIDENCE_STEPS),
+            xyz.mean(axis=0),
+            upright_box(xyz, self._up),
+            unpack_keys(voxels.packed[row]) * 8 + _within(voxels.voxel[part]),
+            float(snapshot.measured(slot, voxel).mean()),
         )
-        pairs, overlaps = np.unique(held[:overlap_count], return_counts=True)
-        changed = _changed(surface.fresh, surface.start, found.component, count)
+
+    def _match(self, last: _Found, voxels: ThingVoxels, found: Components, ids: Int64) -> None:
+        """Write the id that each component had."""
+        count = len(ids)
+        blocks = np.union1d(last.voxels.packed, voxels.packed)
+        places = [np.searchsorted(blocks, v.packed)[v.row] * BLOCK_VOXELS + v.voxel for v in (last.voxels, voxels)]
+        _, before, now = np.intersect1d(*places, assume_unique=True, return_indices=True)
+        was, became = last.components.component[before], found.component[now]
+        both = (was >= 0) & (became >= 0)
+        pairs, overlaps = np.unique(was[both] * count + became[both], return_counts=True)
         ends = np.searchsorted(pairs, count * np.arange(len(last.ids) + 1))
         for old in np.argsort(last.ids):  # so that the oldest of several has its component first
             part = slice(ends[old], ends[old + 1])
             if part.start == part.stop:
                 continue
             best = int(np.argmax(overlaps[part]))
-            overlap, successor = overlaps[part][best], pairs[part][best] % count
-            if overlap >= LEAST_OVERLAP * last.sizes[old] and ids[successor] == 0:
+            successor = pairs[part][best] % count
+            if overlaps[part][best] >= LEAST_OVERLAP * last.sizes[old] and ids[successor] == 0:
                 ids[successor] = last.ids[old]
-                if overlap == last.sizes[old] == sizes[successor] and not changed[successor]:
-                    same[successor] = old
 
-    def _find_gone(self, snapshot: MapSnapshot, ids: NDArray[np.int64], sizes: NDArray[np.int64]) -> None:
+    def _find_gone(self, snapshot: MapSnapshot, ids: Int64, sizes: Int64) -> None:
         """Note which things have gone, and take the ids of their remains away."""
         if snapshot.epoch != self._epoch:  # all may have moved
             self._epoch, self._whole = snapshot.epoch, {}
@@ -227,7 +248,7 @@ class InstanceTracker:
             self._gone.append(replace(whole.thing, gone_ns=int(stamps[len(stamps) // 2])))
             ids[ids == number] = 0
 
-    def _keep_whole(self, snapshot: MapSnapshot, things: tuple[Instance, ...]) -> None:
+    def _keep_whole(self, snapshot: MapSnapshot, things: Collection[Instance]) -> None:
         """Note the things as they are, save those that are about to go; what else has shrunk is whole again."""
         before, found = self._whole, {thing.id for thing in things}
         lost = [number for number in self._going if number not in found]
@@ -238,54 +259,9 @@ class InstanceTracker:
             self._whole[thing.id] = self._going.get(thing.id) or _Whole(thing, snapshot.version, most)
 
 
-def describe_thing(
-    number: int,
-    labels: LabelSet,
-    voxel_size_m: float,
-    up: Float64,
-    surface: ClassSurface,
-    row: NDArray[np.int64],
-    part: NDArray[np.int64],
-    measured: Bool,
-) -> Instance:
-    """One thing, of some of N surface voxels.
-
-    Args:
-        number: Its id.
-        labels: Of the map.
-        voxel_size_m: Edge of a voxel.
-        up: (3,) unit vector along which its box stands.
-        surface: The N voxels.
-        row: (N,) of the block of each.
-        part: (M,) which of them are the thing.
-        measured: (M,) whether a sensor measured these.
-    """
-    voxel, class_id = surface.voxel[part], int(surface.label[part[0]])
-    xyz = surface.point[part] * voxel_size_m
-    confidence = surface.confidence[part].mean(dtype=np.float64) / CONFIDENCE_STEPS
-    within = np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
-    return Instance(
-        number,
-        class_id,
-        labels.names[labels.ids.index(class_id)],
-        float(confidence),
-        xyz.mean(axis=0),
-        upright_box(xyz, up),
-        unpack_keys(surface.packed[row[part]]) * 8 + within,
-        float(measured.mean()),
-    )
-
-
-@kernel
-def find_overlaps(old: _LabelledVoxels, new: _LabelledVoxels, count: int, pairs: Int64) -> int:
-    """Write ``old component * count + new component`` of every voxel that has both; returns how many there are.
-
-    Args:
-        old, new: Two states of a map.
-        count: Of new components.
-        pairs: (N,) written, for the N voxels of ``new``.
-    """
-    ...
+def _within(voxel: Int32) -> Int32:
+    """Coordinates (N, 3) in their blocks of voxels (N,)."""
+    return np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
 
 
 def _seen_through(snapshot: MapSnapshot, whole: _Whole) -> tuple[int, NDArray[np.int64]]:
@@ -310,13 +286,6 @@ def _count_left(snapshot: MapSnapshot, packed: NDArray[np.int64], voxels: NDArra
     return int(np.isin(row * BLOCK_VOXELS + (z * 8 + y) * 8 + x, there).sum())
 
 
-def _changed(fresh: NDArray[np.bool_], start: Int64, component: Int64, count: int) -> NDArray[np.bool_]:
-    """Whether each component (C,) has voxels in blocks that were computed again."""
-    changed = np.zeros(count + 1, np.bool_)  # the last is for voxels without a component
-    changed[component[np.repeat(fresh, np.diff(start))]] = True
-    return changed[:count]
-
-
 class Components(NamedTuple):
     """C components of N surface voxels.
 
@@ -331,21 +300,14 @@ class Components(NamedTuple):
     ends: NDArray[np.int64]
 
 
-def find_components(surface: ClassSurface, min_voxels: int) -> Components:
+def find_components(voxels: ThingVoxels, min_voxels: int) -> Components:
     """Surface voxels of one class that touch by face, edge or corner; pieces of fewer voxels are left out."""
-    count = len(surface.voxel)
-    used = np.diff(surface.start) > 0
-    node, first = np.full((int(used.sum()), 512), -1, np.int32), np.empty(count, np.int64)
-    connect_voxels(surface.packed, surface.start, surface.voxel, surface.label, np.cumsum(used) - 1, node, first)
-    return _kept(first, min_voxels)
-
-
-def _kept(first: NDArray[np.int64], min_voxels: int) -> Components:
-    """The components that are large enough, given the first voxel (N,) of each voxel's."""
-    count = len(first)
-    sizes = np.bincount(first, minlength=count)  # at the first voxel of each component
+    used = np.diff(voxels.start) > 0
+    node, first = np.full((int(used.sum()), 512), -1, np.int32), np.empty(len(voxels.voxel), np.int64)
+    connect_voxels(voxels.packed, voxels.start, voxels.voxel, voxels.label, np.cumsum(used) - 1, node, first)
+    sizes = np.bincount(first, minlength=len(first))  # at the first voxel of each component
     large = np.flatnonzero(sizes >= min_voxels)
-    number = np.full(count, -1, np.int64)
+    number = np.full(len(first), -1, np.int64)
     number[large] = np.arange(len(large))
     component = number[first]
     kept = np.flatnonzero(component >= 0)
@@ -361,27 +323,12 @@ def connect_voxels(
     """Write the first voxel of each voxel's component (N,): union-find over 26 neighbours.
 
     Args:
-        packed, start, voxel, label: Of a ``ClassSurface``.
+        packed, start, voxel, label: Of ``ThingVoxels``.
         used: (B,) number of each block among the U that have voxels.
         node: (U, 512) scratch, -1.
         first: (N,) written.
     """
     ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OrientedBox:
-    """A box that stands upright.
-
-    Args:
-        center: (3,) float64 world metres.
-        size: (3,) float64 metres along its own axes: x the longer level side, y the shorter, z along up.
-        R_world_box: (3, 3) float64, columns are its axes in the world.
-    """
-
-    center: Float64
-    size: Float64
-    R_world_box: Float64
 
 
 def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
@@ -391,7 +338,7 @@ def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
         xyz: (N, 3) points, N > 0.
         up: (3,) unit vector.
     """
-    frame = _level_frame(up)
+    frame = turn_onto(np.array((0.0, 0.0, 1.0)), up)
     middle = xyz.mean(axis=0)
     plan = (xyz - middle) @ frame
     hull = cv2.convexHull(plan[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
@@ -403,15 +350,6 @@ def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
     own = (xyz - middle) @ R
     low, high = own.min(axis=0), own.max(axis=0)
     return OrientedBox(middle + R @ ((low + high) / 2), high - low, R)
-
-
-def _level_frame(up: Float64) -> Float64:
-    """A right-handed rotation (3, 3) whose third column is ``up``; the identity for up = z."""
-    ux, uy, uz = up
-    x = np.array((uz, 0.0, -ux) if abs(uy) < 0.9 else (-uy, ux, 0.0))
-    x /= np.linalg.norm(x)
-    y = np.array((uy * x[2] - uz * x[1], uz * x[0] - ux * x[2], ux * x[1] - uy * x[0]))
-    return np.stack((x, y, up), axis=1)
 
 
 def _turn(yaw: float) -> Float64:

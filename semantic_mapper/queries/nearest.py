@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.storage.block_index import BlockIndex
-from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
+from semantic_mapper.mapping.blocks import BlockIndex
+from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point, check_points, check_positive
 from semantic_mapper.queries.occupancy import read_states
 from semantic_mapper.queries.snapshot import MEASURED, BlockVoxels, MapSnapshot
@@ -51,82 +51,32 @@ def nearest(
     """
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
-    found = np.array((0.0, 0.0, 0.0, np.inf))
-    return nearer_surface(snapshot, p, class_id, confidence_steps(min_confidence), found)
-
-
-def confidence_steps(min_confidence: float) -> int:
-    """The least stored confidence that is at least ``min_confidence``.
-
-    Raises:
-        MapError: no such confidence.
-    """
     if not 0 <= min_confidence <= 1:
         raise MapError(f"min_confidence must be 0..1, got {min_confidence}")
-    return int(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
-
-
-def nearer_surface(
-    snapshot: MapSnapshot, p: Float64, class_id: int, least: int, found: Float64
-) -> NearestSurface | None:
-    """A surface point of a class that is nearer than one that is known; ``None`` where there is no such.
-
-    Args:
-        snapshot: The map, or a part of it: its ``packed`` are looked at, its ``index`` knows their neighbours.
-        p: (3,) in units of voxels.
-        class_id: The class.
-        least: Places of less confidence, times 255, do not count.
-        found: (4,) the nearest surface point so far and the square of its distance, in units of voxels; updated.
-    """
-    place = _search(snapshot, p, class_id, least, found)
+    least = int(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
+    voxels, index = snapshot.voxels, snapshot.index
+    rows, bounds = np.empty(snapshot.block_count, np.int64), np.empty(snapshot.block_count)
+    count = bound_blocks(p, class_id, snapshot.packed, snapshot.slots, voxels.classes, rows, bounds)
+    order = np.argsort(bounds[:count], kind="stable")
+    rows, bounds = rows[order], bounds[order]
+    found = np.array((0.0, 0.0, 0.0, np.inf))
+    place = search_blocks(p, class_id, least, snapshot.packed[rows], snapshot.slots[rows], bounds, index, voxels, found)
     if place < 0:
         return None
-    confidence = float(snapshot.voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS
-    distance = float(np.sqrt(found[3]))
-    measured = bool(snapshot.voxels.weight.ravel()[place] == MEASURED)
-    return NearestSurface(found[:3] * snapshot.voxel_size_m, distance * snapshot.voxel_size_m, confidence, measured)
-
-
-def _search(snapshot: MapSnapshot, p: Float64, class_id: int, least: int, found: Float64) -> int:
-    """Slot * 512 + voxel of the nearest surface point of a class, -1 = none is nearer than ``found``, which is updated.
-
-    Blocks are gone through in the order of the least distance that their surface may have, until that is more than
-    what was found. The first alone leaves few of the others to be put in order.
-    """
-    rows, bounds = np.empty(snapshot.block_count, np.int64), np.empty(snapshot.block_count)
-    count = bound_blocks(p, class_id, snapshot.packed, snapshot.slots, snapshot.voxels.classes, rows, bounds)
-    if count == 0:
-        return -1
-    rows, bounds = rows[:count], bounds[:count]
-    first = np.array([bounds.argmin()])
-    place = _search_rows(snapshot, p, class_id, least, rows[first], bounds[first], found)
-    left = np.flatnonzero(bounds <= found[3])
-    left = left[np.argsort(bounds[left], kind="stable")]
-    nearer = _search_rows(snapshot, p, class_id, least, rows[left], bounds[left], found)
-    return nearer if nearer >= 0 else place
-
-
-def _search_rows(
-    snapshot: MapSnapshot, p: Float64, class_id: int, least: int, rows: Int64, bounds: Float64, found: Float64
-) -> int:
-    packed, slots = snapshot.packed[rows], snapshot.slots[rows]
-    return search_blocks(p, class_id, least, packed, slots, bounds, snapshot.index, snapshot.voxels, found)
+    return NearestSurface(
+        found[:3] * snapshot.voxel_size_m,
+        float(np.sqrt(found[3])) * snapshot.voxel_size_m,
+        float(voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS,
+        bool(voxels.weight.ravel()[place] == MEASURED),
+    )
 
 
 @kernel
 def bound_blocks(
     p: Float64, class_id: int, packed: Int64, slots: Int32, classes: NDArray[np.uint64], rows: Int64, bounds: Float64
 ) -> int:
-    """Find the blocks that may have surface of a class; returns how many there are.
-
-    Args:
-        p: (3,) in units of voxels.
-        class_id: The class.
-        packed, slots: (B,) of the snapshot.
-        classes: (S, 4) of its ``BlockVoxels``.
-        rows: (B,) written: positions of these blocks in ``packed``, ascending.
-        bounds: (B,) written: squares of the least distances that their surfaces may have.
-    """
+    """Write the rows (B,) of the blocks that may have surface of a class, and the squares (B,) of the least distances
+    that it may have from ``p`` (3,), in voxels; returns how many there are."""
     ...
 
 
@@ -142,16 +92,10 @@ def search_blocks(
     voxels: BlockVoxels,
     found: Float64,
 ) -> int:
-    """Look for a surface point nearer than ``found``; returns slot * 512 + voxel of it, -1 where no point is nearer.
+    """Look for the surface point of a class nearest to ``p`` in blocks (R,) in the order of their ``bounds``.
 
-    Args:
-        p: (3,) in units of voxels, as all that follows.
-        class_id: The class that is looked for.
-        least: Places of less confidence, times 255, do not count.
-        packed, slots: (R,) blocks in the order of ``bounds``.
-        bounds: (R,) squares of the least distances that their surfaces may have.
-        index, voxels: Of the snapshot.
-        found: (4,) the nearest surface point and the square of its distance; updated.
+    Places of less confidence than ``least``, times 255, do not count. Returns slot * 512 + voxel, -1 = none is nearer
+    than ``found`` (4,), the nearest point so far and the square of its distance in voxels, which is updated.
     """
     ...
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.storage.block_index import BlockIndex
+from semantic_mapper.mapping.blocks import BlockIndex
 from semantic_mapper.queries.checks import check_box, check_points
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8

@@ -1,17 +1,25 @@
-"""One state of a mirrored map, which never changes: what all queries look at."""
+"""One state of a map, which never changes, and mirrors that follow a map by its changes; all queries look at these.
+
+Neither needs Open3D or the map's own process. Blocks are written once, one behind the other, into a pool; a snapshot is
+a table of where its blocks lie. So a new snapshot costs its changed blocks and a new table, and an old one stays as it
+was. A full pool is replaced by a larger one with only the living blocks; the old pool goes when its last snapshot does.
+"""
 
 from __future__ import annotations
 
+import itertools
+import threading
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.errors import MapError
+from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
-from semantic_mapper.mapping.storage.changes import (
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, KEY_LIMIT, BlockIndex, make_block_index, pack_keys, unpack_keys
+from semantic_mapper.mapping.changes import (
     CONFIDENCE_STEPS,
     NONE_CLEARED,
     TSDF_STEPS,
@@ -19,8 +27,16 @@ from semantic_mapper.mapping.storage.changes import (
     ClearedBlocks,
     oldest_first,
 )
+from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
+if TYPE_CHECKING:
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+
+NEAREST_STEPS = 60  # farther from zero, a voxel is the nearer end of no crossing of the TSDF; as in surface.h
+LEAST_SPARE = 256  # blocks that a new pool has room for beyond the living ones; or half of these, if that is more
+
+_deliveries = itertools.count()  # that mirrors of this process have taken over; counting takes no lock
 COMPUTED, MEASURED = 1, 2  # ``BlockVoxels.weight``: depth was computed, or a sensor measured it
 
 
@@ -143,6 +159,175 @@ class MapSnapshot:
             (voxels.weight[slots] == COMPUTED).astype(np.uint8),
             self.cleared.between(since, version),
         )
+
+
+class MapMirror:
+    """Follows a map by its changes and hands out snapshots of it. Safe to use from several threads.
+
+    Args:
+        voxel_size_m, truncation_voxels: Of the map (``VoxelMapConfig``).
+        label_set: Of the map.
+    """
+
+    def __init__(self, voxel_size_m: float, truncation_voxels: float, label_set: LabelSet) -> None:
+        none = np.empty(0, np.int64)
+        slots = np.empty(0, np.int32)
+        index = make_block_index(unpack_keys(none), slots)
+        self._snapshot = MapSnapshot(
+            0, 0, voxel_size_m, truncation_voxels, label_set, none, slots, none, none, index, _new_pool(LEAST_SPARE)
+        )
+        self._next = self._snapshot  # ahead of it while a new epoch of the map is not complete
+        self._used = 0
+        self._lock = threading.Lock()
+
+    @classmethod
+    def of(cls, voxel_map: VoxelMap) -> MapMirror:
+        """Mirror of a live or loaded map as it is now; further ``changes`` since its version may be applied."""
+        mirror = cls(voxel_map.config.voxel_size_m, voxel_map.config.truncation_voxels, voxel_map.label_set)
+        mirror.apply(voxel_map.changes(0))
+        return mirror
+
+    @classmethod
+    def load(cls, path: Path) -> MapMirror:
+        """Mirror of a saved map, as ``of`` makes it of the loaded one, without its class evidence in memory.
+
+        Raises:
+            MapError: no such file, not a map, of another format version, or damaged (and what is).
+        """
+        with open_map(path) as reader:
+            config = reader.manifest.config
+            mirror = cls(config.voxel_size_m, config.truncation_voxels, reader.manifest.label_set)
+            mirror.apply(reader.changes())
+        return mirror
+
+    @property
+    def version(self) -> int:
+        """What to ask the map's next ``changes`` with."""
+        return self._next.version
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the snapshot has all that was applied: not while blocks of a new epoch of the map are missing."""
+        return self._next is self._snapshot
+
+    def snapshot(self) -> MapSnapshot:
+        """The present state; stays as it is whatever is applied later."""
+        return self._snapshot
+
+    def apply(self, changes: BlockChanges) -> MapSnapshot:
+        """Take over changes and return the present state.
+
+        After a new epoch, that is the last one of the old epoch until changes have come up to the map's newest version.
+
+        Raises:
+            MapError: changes are missing between the mirror's version and these, these are older than the mirror, or
+                their arrays are not of the form that ``BlockChanges`` has.
+            LabelError: a class id that is not in the label set.
+            In every case the mirror is as it was.
+        """
+        packed = _check(changes, self._snapshot.label_set)
+        with self._lock:
+            old = self._next
+            if not changes.since <= old.version <= changes.version:
+                raise MapError(
+                    f"changes from version {changes.since} to {changes.version} do not continue a mirror at version "
+                    f"{old.version}; ask the map for its changes since {old.version}"
+                )
+            staying = ~np.isin(old.packed, packed) & (changes.epoch == old.epoch)
+            merged = np.concatenate((old.packed[staying], packed))
+            pool, kept = self._make_room(old, old.slots[staying], len(packed))
+            slots = np.concatenate((kept, np.arange(self._used, self._used + len(packed), dtype=np.int32)))
+            _write(pool, self._used, changes, old.label_set.ignore_id)
+            self._used += len(packed)
+            fresh = (next(_deliveries) << 32) + np.arange(len(packed))
+            serials = np.concatenate((old.serials[staying], fresh))
+            versions = np.concatenate((old.versions[staying], np.full(len(packed), changes.version)))
+            order = np.argsort(merged)
+            merged, slots = merged[order], slots[order]
+            index = make_block_index(unpack_keys(merged), slots)
+            self._next = replace(
+                old,
+                version=changes.version,
+                epoch=changes.epoch,
+                packed=merged,
+                slots=slots,
+                serials=serials[order],
+                versions=versions[order],
+                index=index,
+                voxels=pool,
+                scale_known=changes.scale_known,
+                cleared=old.cleared.followed_by(changes.cleared.between(old.version, changes.version)),
+            )
+            if changes.epoch == self._snapshot.epoch or changes.version >= changes.newest:
+                self._snapshot = self._next
+            return self._snapshot
+
+    def _make_room(self, old: MapSnapshot, kept: NDArray[np.int32], more: int) -> tuple[BlockVoxels, NDArray[np.int32]]:
+        """A pool with room for ``more`` blocks behind those in use, and where in it those in slots ``kept`` lie."""
+        if self._used + more <= len(old.voxels.tsdf):
+            return old.voxels, kept
+        living = len(kept) + more
+        pool = _new_pool(living + max(living // 2, LEAST_SPARE))
+        for mine, theirs in zip(pool, old.voxels, strict=True):
+            mine[: len(kept)] = theirs[kept]
+        self._used = len(kept)
+        return pool, np.arange(len(kept), dtype=np.int32)
+
+
+def _new_pool(blocks: int) -> BlockVoxels:
+    flat = (blocks, BLOCK_VOXELS)
+    tsdf, rgb, classes = np.empty(flat, np.int8), np.empty((*flat, 3), np.uint8), np.empty((blocks, 4), np.uint64)
+    weight, label, confidence = (np.empty(flat, np.uint8) for _ in range(3))
+    return BlockVoxels(tsdf, weight, label, confidence, rgb, classes)
+
+
+def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int) -> None:
+    part = slice(start, start + len(changes.keys))
+    pool.tsdf[part] = changes.tsdf
+    computed = 0 if changes.computed is None else changes.computed
+    pool.weight[part] = np.where(changes.observed, np.where(computed, COMPUTED, MEASURED), 0)
+    pool.label[part] = changes.label
+    pool.confidence[part] = changes.confidence
+    pool.rgb[part] = changes.rgb
+    pool.classes[part] = _collect_classes(pool.tsdf[part], pool.weight[part], pool.label[part], ignore_id)
+
+
+def _collect_classes(tsdf: NDArray[np.int8], weight: UInt8, label: UInt8, ignore_id: int) -> NDArray[np.uint64]:
+    """Classes (B, 4) of the voxels that lie near enough to a surface to be one of its own (``surface_voxels``)."""
+    near = (label != ignore_id) & (weight != 0) & (tsdf <= NEAREST_STEPS) & (tsdf >= -NEAREST_STEPS)
+    at = np.flatnonzero(near)
+    has_class = np.zeros((len(tsdf), 256), np.bool_)
+    has_class[at // BLOCK_VOXELS, label.ravel()[at]] = True
+    return np.packbits(has_class, axis=1, bitorder="little").view("<u8").astype(np.uint64)
+
+
+def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:
+    """Packed keys of changes that may come from a network."""
+    blocks = len(changes.keys)
+    forms = {"keys": (np.int32, (3,)), "tsdf": (np.int8, (BLOCK_VOXELS,)), "label": (np.uint8, (BLOCK_VOXELS,))}
+    forms |= {"confidence": (np.uint8, (BLOCK_VOXELS,)), "rgb": (np.uint8, (BLOCK_VOXELS, 3))}
+    forms |= {} if changes.computed is None else {"computed": (np.uint8, (BLOCK_VOXELS,))}
+    for name, (dtype, tail) in forms.items():
+        array: NDArray[np.generic] = getattr(changes, name)
+        if array.dtype != dtype or array.shape != (blocks, *tail):
+            raise MapError(
+                f"changes up to version {changes.version}: {name} must be {np.dtype(dtype).name} {(blocks, *tail)}, "
+                f"got {array.dtype.name} {array.shape}"
+            )
+    if blocks and not -KEY_LIMIT <= changes.keys.min() <= changes.keys.max() < KEY_LIMIT:
+        raise MapError(f"changes up to version {changes.version}: block coordinates beyond {KEY_LIMIT}")
+    packed = pack_keys(changes.keys)
+    if len(np.unique(packed)) != blocks:
+        raise MapError(f"changes up to version {changes.version}: a block comes twice")
+    known = np.zeros(256, np.bool_)
+    known[[*label_set.ids, label_set.ignore_id]] = True
+    if not known[changes.label].all():
+        foreign = sorted({int(i) for i in np.unique(changes.label)} - {*label_set.ids, label_set.ignore_id})
+        raise LabelError(
+            f"changes up to version {changes.version}: class ids {foreign} are not in label set '{label_set.name}'; "
+            "the mirror was made for another map"
+        )
+    return packed
 
 
 class BlockAges:

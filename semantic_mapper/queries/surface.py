@@ -1,4 +1,4 @@
-"""Surface voxels: the observed voxels that the surface passes, each with one point of it.
+"""The surface: its voxels, each with one point of it, and what a ray meets.
 
 A zero crossing of the TSDF on the edge between two observed voxels belongs to the nearer of the two (half way: to the
 lower). A voxel with crossings is a surface voxel; their mean is its surface point. So every surface point has the
@@ -7,19 +7,28 @@ class, confidence and colour of its own voxel.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.blocks import BlockIndex
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.mapping.storage.block_index import BlockIndex
-from semantic_mapper.queries.checks import check_box, rows_in_box
+from semantic_mapper.queries.checks import (
+    as_numbers,
+    check_box,
+    check_direction,
+    check_points,
+    check_positive,
+    rows_in_box,
+)
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt8
 
-NEAREST_STEPS = 60  # farther from zero, a voxel is the nearer end of no crossing; as in surface.h
+MAX_RANGE_M = 100.0  # beyond, a ray through nothing takes long
 
 
 class SurfaceVoxels(NamedTuple):
@@ -87,122 +96,83 @@ def collect_surface_voxels(
     ...
 
 
-ScalarT = TypeVar("ScalarT", bound=np.generic)
-
-_ROOM = 1 << 14  # voxels that the first memory for new ones holds
-
-
-class ClassSurface(NamedTuple):
-    """N surface voxels in the B blocks of a map, ordered as in ``SurfaceVoxels``.
+@dataclass(frozen=True, slots=True, eq=False)
+class RayHits:
+    """What N rays meet.
 
     Args:
-        packed: (B,) int64 sorted keys.
-        serials: (B,) int64 which content the blocks had.
-        fresh: (B,) bool whether the block's voxels were computed again, because it or a neighbour has changed.
-        start: (B + 1,) int64; block b has the voxels ``start[b] .. start[b + 1] - 1``.
-        voxel: (N,) int32 within the block, ascending in each.
-        point: (N, 3) float64 surface point in units of voxels.
-        label: (N,) uint8 class ids.
-        confidence: (N,) uint8 probability of ``label``, times 255.
+        distance_m: (N,) float32 along the ray, 0 where it meets no surface.
+        label: (N,) uint8 class ids, the ignore id at misses and where unknown.
+        confidence: (N,) float32 probability of the likeliest class, 0 at misses and where nothing voted.
+        rgb: (N, 3) uint8.
+        measured: (N,) bool, whether a sensor measured that surface; False at misses; None = unknown.
     """
 
-    packed: NDArray[np.int64]
-    serials: NDArray[np.int64]
-    fresh: NDArray[np.bool_]
-    start: NDArray[np.int64]
-    voxel: NDArray[np.int32]
-    point: Float64
+    distance_m: Float32
     label: UInt8
-    confidence: UInt8
+    confidence: Float32
+    rgb: UInt8
+    measured: Bool | None = None
 
 
-def class_surface(snapshot: MapSnapshot, wanted: NDArray[np.bool_], before: ClassSurface | None = None) -> ClassSurface:
-    """The surface voxels of some classes.
+def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
+    """The first surface that each ray meets from its front.
 
     Args:
         snapshot: The map.
-        wanted: (256,) which class ids.
-        before: The same for an earlier state of any map; saves time, and changes nothing but ``fresh``.
+        origins: (N, 3) or (3,) world metres.
+        directions: (N, 3) or (3,), of any length; one origin or direction stands for all.
+        max_m: How far rays go, at most 100.
+
+    Raises:
+        MapError: see ``checks``; shapes that do not go together; a range out of bounds.
     """
-    before = before or _nothing()
-    row_of = np.empty(len(snapshot.voxels.tsdf), np.int32)
-    row_of[snapshot.slots] = np.arange(snapshot.block_count, dtype=np.int32)
-    source = np.empty(snapshot.block_count, np.int64)
-    changed = np.empty(snapshot.block_count + len(before.packed), np.int64)
-    packed, serials = snapshot.packed, snapshot.serials
-    find_block_sources(packed, serials, snapshot.index, row_of, before.packed, before.serials, changed, source)
-    return ClassSurface(packed, serials, source < 0, *_collect(snapshot, source, np.ascontiguousarray(wanted), before))
-
-
-def _nothing() -> ClassSurface:
-    none, byte = np.empty(0, np.int64), np.empty(0, np.uint8)
-    start, voxel = np.zeros(1, np.int64), np.empty(0, np.int32)
-    return ClassSurface(none, none, np.empty(0, np.bool_), start, voxel, np.empty((0, 3)), byte, byte)
-
-
-def _collect(
-    snapshot: MapSnapshot, source: Int64, wanted: Bool, before: ClassSurface
-) -> tuple[Int64, Int32, Float64, UInt8, UInt8]:
-    """``start``, ``voxel``, ``point``, ``label`` and ``confidence`` of a ``ClassSurface``."""
-    start, room = np.zeros(snapshot.block_count + 1, np.int64), len(before.voxel) + _ROOM
-    voxel, point = np.empty(room, np.int32), np.empty((room, 3))
-    label, confidence = np.empty(room, np.uint8), np.empty(room, np.uint8)
-    blocks, row = (snapshot.packed, snapshot.slots, source, snapshot.index, snapshot.voxels), 0
-    while True:
-        row = collect_class_surface(*blocks, wanted, before, row, start, voxel, point, label, confidence)
-        count = int(start[row])
-        if row == snapshot.block_count:
-            return start, voxel[:count].copy(), point[:count].copy(), label[:count].copy(), confidence[:count].copy()
-        room *= 2
-        voxel, point = _enlarge(voxel, room, count), _enlarge(point, room, count)
-        label, confidence = _enlarge(label, room, count), _enlarge(confidence, room, count)
-
-
-def _enlarge(values: NDArray[ScalarT], room: int, count: int) -> NDArray[ScalarT]:
-    """An array of ``room`` rows with the first ``count`` of ``values``."""
-    larger = np.empty((room, *values.shape[1:]), values.dtype)
-    larger[:count] = values[:count]
-    return larger
+    origin = check_points(np.atleast_2d(as_numbers(origins, "origins")), snapshot, "origins")
+    direction = np.atleast_2d(check_direction(directions, "directions"))
+    if len(origin) != len(direction) and 1 not in (len(origin), len(direction)):
+        raise MapError(f"cast_rays: {len(origin)} origins and {len(direction)} directions do not go together")
+    count = max(len(origin), len(direction)) if len(origin) and len(direction) else 0
+    origin, direction = np.broadcast_to(origin, (count, 3)), np.broadcast_to(direction, (count, 3))
+    if check_positive(max_m, "max_m") > MAX_RANGE_M:
+        raise MapError(f"max_m must be at most {MAX_RANGE_M:g}, got {max_m}")
+    step = np.ascontiguousarray(direction / snapshot.voxel_size_m)
+    distance, slot, voxel = np.empty(count, np.float32), np.empty(count, np.int64), np.empty(count, np.int64)
+    march_rays(
+        np.ascontiguousarray(origin),
+        step,
+        snapshot.voxels_per_step,
+        max_m,
+        snapshot.index,
+        snapshot.voxels,
+        distance,
+        slot,
+        voxel,
+    )
+    label, confidence, rgb = snapshot.read(slot, voxel)
+    return RayHits(distance, label, confidence, rgb, snapshot.measured(slot, voxel))
 
 
 @kernel
-def find_block_sources(
-    packed: Int64,
-    serials: Int64,
-    index: BlockIndex,
-    row_of: Int32,
-    old_packed: Int64,
-    old_serials: Int64,
-    changed: Int64,
-    source: Int64,
-) -> None:
-    """Write the row (B,) of each block in an earlier state, -1 where it or one of its six neighbours has changed.
-
-    Args:
-        packed, serials, index: Of the B blocks.
-        row_of: (S,) row of the block that lies in each slot.
-        old_packed, old_serials: (A,) of the earlier state.
-        changed: (A + B,) scratch.
-        source: (B,) written.
-    """
-    ...
-
-
-@kernel
-def collect_class_surface(
-    packed: Int64,
-    slots: Int32,
-    source: Int64,
+def march_rays(
+    origins: Float64,
+    directions: Float64,
+    voxels_per_step: float,
+    max_m: float,
     index: BlockIndex,
     voxels: BlockVoxels,
-    wanted: Bool,
-    before: ClassSurface,
-    first_row: int,
-    start: Int64,
-    voxel: Int32,
-    point: Float64,
-    label: UInt8,
-    confidence: UInt8,
-) -> int:
-    """Write the arrays of a ``ClassSurface`` from a row on, as far as there is room; returns the row it came to."""
+    distance: Float32,
+    slots: Int64,
+    chosen: Int64,
+) -> None:
+    """Write distances (N,), 0 = miss, and the observed voxel nearest to each place that was hit, among the eight round
+    it; of those with votes if any has some.
+
+    Args:
+        origins: (N, 3) in units of voxels.
+        directions: (N, 3) voxels a unit of the distance.
+        voxels_per_step: Length of one step of the quantised TSDF.
+        max_m: Where rays end, in units of the distance.
+        index, voxels: Of the snapshot.
+        distance, slots, chosen: (N,) written.
+    """
     ...

@@ -12,13 +12,19 @@ from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import FrameError, PoseError
 from semantic_mapper.fields.base import UNSURE_SPREAD
 from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
-from semantic_mapper.geometry import camera_matrix, check_pose, transform, unproject
+from semantic_mapper.geometry import (
+    GUESSED_DEPTHS_M,
+    camera_matrix,
+    check_pose,
+    transform,
+    unproject,
+    visible_points,
+)
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.rays import pixel_rays
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64, PosedFrame, RayBatch, SourceViews, UInt8
-from semantic_mapper.view_selection import GUESSED_DEPTHS_M, visible_points
 
 _log = get_logger(__name__)
 

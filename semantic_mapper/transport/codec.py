@@ -2,20 +2,21 @@
 
 What encodes and decodes raises nothing but ``CodecError``. Every size is bounded and checked before anything is
 allocated by it. Decoded arrays are fresh and writable. In a log a message is a msgpack array of binaries, which any
-msgpack reader opens. Questions about a map have a codec of their own, ``query_messages``.
+msgpack reader opens. Questions about a map have a codec of their own, ``queries.questions``.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import msgpack
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError, LabelError
 from semantic_mapper.labels import LabelSet
@@ -66,6 +67,7 @@ PROTOCOL_VERSION = 1  # raise it when a header changes its meaning; readers refu
 
 _DEFAULTS = CodecOptions()
 _ROWS = {row.message: row for row in TOPICS.values()}
+_FRAME_SCALARS = "stamp_ns seq camera_id intrinsics pose_source pose_sigma world".split()
 _UPDATE_SCALARS = (
     "stamp_ns seq camera_id fused is_keyframe source_seqs blocks blocks_touched rays samples stage_ms world".split()
 )
@@ -80,6 +82,8 @@ _NOT_SENT_AS_0 = (  # what most messages do not need
     "T_map_world",
 )
 _Pose = Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)]  # (4, 4) float64 row by row, exact
+
+_Packed = dict[str, tuple[Wire, bytes]]  # images of a message by their fields in the header
 
 MessageT = TypeVar("MessageT")
 WireT = TypeVar("WireT")
@@ -192,6 +196,11 @@ class MapUpdateHeader(Wire, frozen=True, kw_only=True):
         """How errors call the update."""
         return f"map of camera '{self.camera_id}' seq={self.seq}"
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of its images."""
+        return self.height, self.width
+
 
 class KeyframeHeader(Wire, frozen=True):
     """``LabelledKeyframe`` without its frame; then come header and buffers of that."""
@@ -201,6 +210,7 @@ class KeyframeHeader(Wire, frozen=True):
     label_set: LabelSet
 
 
+_ImageHeader = FrameHeader | MapUpdateHeader
 _HEADERS: dict[str, type[Wire]] = {"frame": FrameHeader, "map": MapUpdateHeader, "keyframe": KeyframeHeader}
 
 
@@ -238,18 +248,6 @@ def unpack_parts(payload: Buffer) -> list[bytes]:
     if not isinstance(parts, list) or not all(isinstance(p, bytes) for p in cast("list[object]", parts)):
         raise CodecError("payload is not a framed message: expected an array of binaries")
     return cast("list[bytes]", parts)
-
-
-def check_buffers(parts: Parts, sizes: Sequence[int], what: str) -> Parts:
-    """The buffers of a message: all parts after topic and header.
-
-    Raises:
-        CodecError: they do not have the sizes that the header announces; names both.
-    """
-    actual = [len(p) for p in parts[2:]]
-    if actual != list(sizes):
-        raise CodecError(f"{what}: the header announces buffers of {list(sizes)} bytes, got {actual}")
-    return parts[2:]
 
 
 def to_plain(value: object, what: str) -> Any:
@@ -381,7 +379,7 @@ def encode_frame(
         encoding, rgb = options.rgb, encode_rgb(frame.rgb, options.rgb, options.jpeg_quality)
     else:
         encoding, rgb = encoded_rgb.encoding, encoded_rgb.data
-    packed: dict[str, tuple[Wire, bytes]] = {"rgb": (RgbSpec(encoding, len(rgb)), rgb)}
+    packed: _Packed = {"rgb": (RgbSpec(encoding, len(rgb)), rgb)}
     if frame.depth_m is not None:
         packed["depth"] = encode_depth(frame.depth_m, options.depth_scale)
     if frame.label is not None:
@@ -389,18 +387,12 @@ def encode_frame(
     if frame.depth_sigma_m is not None:
         packed["depth_sigma"] = encode_depth(frame.depth_sigma_m, options.depth_scale)
     header = FrameHeader(
-        stamp_ns=frame.stamp_ns,
-        seq=frame.seq,
-        camera_id=frame.camera_id,
-        intrinsics=frame.intrinsics,
         T_world_camera=tuple(frame.T_world_camera.ravel().tolist()),
-        pose_source=frame.pose_source,
-        pose_sigma=float(frame.pose_sigma),
         pseudo_label=frame.label_is_pseudo and frame.label is not None,
-        world=int(frame.world),
+        **{name: getattr(frame, name) for name in _FRAME_SCALARS},
         **{name: cast(Any, spec) for name, (spec, _) in packed.items()},
     )
-    return [topic_bytes("frame", frame.camera_id), _pack_struct(header), *(data for _, data in packed.values())]
+    return [topic_bytes("frame", frame.camera_id), _pack_header_of(header), *(data for _, data in packed.values())]
 
 
 def with_label(parts: Parts, pseudo_label: UInt8 | None) -> list[bytes]:
@@ -409,8 +401,8 @@ def with_label(parts: Parts, pseudo_label: UInt8 | None) -> list[bytes]:
     Raises:
         CodecError: no frame.
     """
-    packed = None if pseudo_label is None else encode_uint8(pseudo_label)
-    return _rebuilt(parts, {"label": packed}, pseudo_label=packed is not None)
+    packed: _Packed = {} if pseudo_label is None else {"label": encode_uint8(pseudo_label)}
+    return _with_images(parts, packed, without="label", pseudo_label=pseudo_label is not None)
 
 
 def with_computed_depth(parts: Parts, depth_m: Float32, sigma_m: Float32) -> list[bytes]:
@@ -420,18 +412,7 @@ def with_computed_depth(parts: Parts, depth_m: Float32, sigma_m: Float32) -> lis
         CodecError: no frame.
     """
     scale = _DEFAULTS.depth_scale
-    return _rebuilt(parts, {"depth": encode_depth(depth_m, scale), "depth_sigma": encode_depth(sigma_m, scale)})
-
-
-def _rebuilt(parts: Parts, images: Mapping[str, tuple[Wire, bytes] | None], **fields: Any) -> list[bytes]:
-    """A frame with other images, by their fields in the header, and other fields; None = without the image."""
-    header, buffers = _open_as(FrameHeader, parts)
-    data = {name: bytes(buffer) for name, buffer in _by_name(header, buffers).items()}
-    for name, packed in images.items():
-        fields[name], data[name] = (None, b"") if packed is None else packed
-    header = msgspec.structs.replace(header, **fields)
-    kept = [data[name] for name in FrameHeader.IMAGES if getattr(header, name) is not None]
-    return [bytes(parts[0]), _pack_struct(header), *kept]
+    return _with_images(parts, {"depth": encode_depth(depth_m, scale), "depth_sigma": encode_depth(sigma_m, scale)})
 
 
 def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
@@ -443,8 +424,22 @@ def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
     header, buffers = _open_as(FrameHeader, parts)
     if header.rgb.encoding == options.rgb:
         return [bytes(part) for part in parts]
-    data = encode_rgb(_decode_rgb(header, buffers[0]), options.rgb, options.jpeg_quality)
-    return _rebuilt(parts, {"rgb": (RgbSpec(options.rgb, len(data)), data)})
+    rgb = _decode_image(header, "rgb", header.rgb, buffers[0])
+    data = encode_rgb(rgb, options.rgb, options.jpeg_quality)
+    return _with_images(parts, {"rgb": (RgbSpec(options.rgb, len(data)), data)})
+
+
+def _with_images(parts: Parts, packed: _Packed, *, without: str = "", **fields: Any) -> list[bytes]:
+    """A frame with some other images and fields, and without one image that is not given again."""
+    header, buffers = _open_as(FrameHeader, parts)
+    specs = _specs(header)
+    images: _Packed = {name: (specs[name], bytes(data)) for name, data in zip(specs, buffers, strict=True)}
+    images.pop(without, None)
+    images |= packed
+    changed = {name: images[name][0] if name in images else None for name in FrameHeader.IMAGES}
+    header = msgspec.structs.replace(header, **changed, **fields)
+    kept = [images[name][1] for name in FrameHeader.IMAGES if name in images]
+    return [bytes(parts[0]), _pack_header_of(header), *kept]
 
 
 def decode(parts: Parts) -> Message:
@@ -495,34 +490,35 @@ def read_envelope(parts: Parts) -> Envelope:
     if isinstance(header, KeyframeHeader):
         header, _ = _open_as(FrameHeader, buffers)
     stamp_ns, seq, world = (getattr(header, name, 0) for name in ("stamp_ns", "seq", "world"))
-    if isinstance(header, MapUpdateHeader):
-        return Envelope(row.name, source, stamp_ns, seq, world=world, T_map_world=header.T_map_world or ())
-    if not isinstance(header, FrameHeader):
-        return Envelope(row.name, source, stamp_ns, seq)
-    return Envelope(
-        topic=row.name,
-        source=source,
-        stamp_ns=stamp_ns,
-        seq=seq,
-        T_world_camera=header.T_world_camera,
-        world=world,
-        has_depth=header.depth is not None,
-        has_label=header.label is not None,
-        rgb_encoding=header.rgb.encoding,
-        depth_scale=header.depth.scale if header.depth else 0.0,
-        has_computed_depth=header.depth_sigma is not None,
-        has_pseudo_label=header.pseudo_label and header.label is not None,
-    )
+    envelope = Envelope(row.name, source, stamp_ns, seq, world=world)
+    match header:
+        case MapUpdateHeader():
+            return replace(envelope, T_map_world=header.T_map_world or ())
+        case FrameHeader():
+            return replace(
+                envelope,
+                T_world_camera=header.T_world_camera,
+                has_depth=header.depth is not None,
+                has_label=header.label is not None,
+                rgb_encoding=header.rgb.encoding,
+                depth_scale=header.depth.scale if header.depth else 0.0,
+                has_computed_depth=header.depth_sigma is not None,
+                has_pseudo_label=header.pseudo_label and header.label is not None,
+            )
+        case _:
+            return envelope
 
 
 def _pack(header: dict[str, Any], kind: type[object], what: str) -> bytes:
     """A header, checked as its reader will check it."""
-    _leave_out_zeros(header)
+    for name in _NOT_SENT_AS_0:
+        if header.get(name, 1) in (0, None):
+            del header[name]
     _read(header, kind, what)
     return pack_header(header, what)
 
 
-def _pack_struct(header: FrameHeader | MapUpdateHeader) -> bytes:
+def _pack_header_of(header: _ImageHeader) -> bytes:
     return _pack(to_plain(header, header.name), type(header), header.name)
 
 
@@ -543,25 +539,26 @@ def _open(parts: Parts) -> tuple[Topic, Any, Parts]:
     Of a keyframe the buffers are the parts of its frame; of weights the header is the message.
     """
     row, source = read_topic(parts)
-    what = f"{row.name} message"
+    what, buffers = f"{row.name} message", parts[2:]
     fields = unpack_header(parts[1], what)
     if row.message is WeightsUpdate:  # the size of the file stands in the place of the file
         size = check_header(fields.get("bytes"), cast("type[int]", _WeightsBytes), f"{what}: bytes")
-        (data,) = check_buffers(parts, [size], what)
-        fields["bytes"] = bytes(data)
+        _check_sizes(buffers, [size], what)
+        fields["bytes"], buffers = bytes(buffers[0]), ()
     header = cast(Any, _read(fields, _HEADERS.get(row.name, row.message), what))
     if row.source and getattr(header, row.source) != source:
         raise CodecError(f"topic '{row.name}/{source}/' carries a message of '{getattr(header, row.source)}'")
-    match header:
-        case FrameHeader() | MapUpdateHeader():
-            specs = [getattr(header, name) for name in header.IMAGES]
-            return row, header, check_buffers(parts, [s.bytes for s in specs if s is not None], header.name)
-        case KeyframeHeader():
-            return row, header, _open_keyframe(header, parts)
-        case WeightsUpdate():
-            return row, header, ()
-        case _:
-            return row, header, check_buffers(parts, (), what)
+    if isinstance(header, KeyframeHeader):
+        return row, header, _open_keyframe(header, parts)
+    sizes = [spec.bytes for spec in _specs(header).values()] if isinstance(header, _ImageHeader) else []
+    _check_sizes(buffers, sizes, getattr(header, "name", what))
+    return row, header, buffers
+
+
+def _check_sizes(buffers: Parts, sizes: list[int], what: str) -> None:
+    actual = [len(buffer) for buffer in buffers]
+    if actual != sizes:
+        raise CodecError(f"{what}: the header announces buffers of {sizes} bytes, got {actual}")
 
 
 def _open_as(kind: type[WireT], parts: Parts) -> tuple[WireT, Parts]:
@@ -571,36 +568,40 @@ def _open_as(kind: type[WireT], parts: Parts) -> tuple[WireT, Parts]:
     return header, buffers
 
 
-def _by_name(header: FrameHeader, buffers: Parts) -> dict[str, Buffer]:
-    """The buffers of a frame by the fields of its header."""
-    names = [name for name in FrameHeader.IMAGES if getattr(header, name) is not None]
-    return dict(zip(names, buffers, strict=True))
+def _specs(header: _ImageHeader) -> dict[str, Any]:
+    """How the images of a message are packed, by name, in the order of its buffers."""
+    found = {name: getattr(header, name) for name in header.IMAGES}
+    return {name: spec for name, spec in found.items() if spec is not None}
 
 
-def _decode_rgb(header: FrameHeader, buffer: Buffer) -> UInt8:
-    try:
-        return decode_rgb(buffer, header.rgb.encoding, *header.size)
-    except CodecError as error:
-        raise CodecError(f"{header.name}: rgb: {error}") from error
+def _decode_images(header: _ImageHeader, buffers: Parts) -> dict[str, Any]:
+    specs = _specs(header)
+    return {
+        name: _decode_image(header, name, spec, data) for (name, spec), data in zip(specs.items(), buffers, strict=True)
+    }
+
+
+def _decode_image(header: _ImageHeader, name: str, spec: RgbSpec | DepthSpec | Uint8Spec, data: Buffer) -> NDArray[Any]:
+    what = f"{header.name}: {name}"
+    match spec:
+        case RgbSpec():
+            return decode_rgb(data, spec.encoding, *header.size, what)
+        case DepthSpec():
+            return decode_depth(spec, data, header.size, what)
+        case Uint8Spec():
+            return decode_uint8(data, header.size, what)
 
 
 def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
-    size, what, data = header.size, header.name, _by_name(header, buffers)
-    sigma = header.depth_sigma
+    images = _decode_images(header, buffers)
     return PosedFrame(
-        stamp_ns=header.stamp_ns,
-        seq=header.seq,
-        camera_id=header.camera_id,
-        rgb=_decode_rgb(header, data["rgb"]),
-        depth_m=None if header.depth is None else decode_depth(header.depth, data["depth"], size, what),
-        label=None if header.label is None else decode_uint8(data["label"], size, f"{what}: label"),
-        intrinsics=header.intrinsics,
+        rgb=images["rgb"],
+        depth_m=images.get("depth"),
+        label=images.get("label"),
+        depth_sigma_m=images.get("depth_sigma"),
         T_world_camera=np.array(header.T_world_camera, np.float64).reshape(4, 4),
-        pose_source=header.pose_source,
-        pose_sigma=header.pose_sigma,
-        depth_sigma_m=None if sigma is None else decode_depth(sigma, data["depth_sigma"], size, f"{what}: spread of"),
         label_is_pseudo=header.pseudo_label and header.label is not None,
-        world=header.world,
+        **{name: getattr(header, name) for name in _FRAME_SCALARS},
     )
 
 
@@ -613,33 +614,31 @@ def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
             raise CodecError(f"{what}: {name} {image.shape} must have the size of label, {update.label.shape}")
     if not bool(np.all((update.confidence >= 0) & (update.confidence <= 1 + 1e-5))):
         raise CodecError(f"{what}: confidence must lie in [0, 1]")
-    packed: dict[str, tuple[Wire, bytes]] = {
+    packed: _Packed = {
         "label": encode_uint8(update.label),
         "confidence": encode_uint8(np.rint(np.minimum(update.confidence, 1) * 255).astype(np.uint8)),
         "depth": encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options.depth_scale),
     }
     if update.moving is not None and update.moving.any():
         packed["moving"] = encode_uint8(update.moving.astype(np.uint8))
+    is_motion = not np.array_equal(update.T_map_world, np.eye(4))
     header = MapUpdateHeader(
         width=width,
         height=height,
-        T_map_world=None
-        if np.array_equal(update.T_map_world, np.eye(4))
-        else tuple(update.T_map_world.ravel().tolist()),
+        T_map_world=tuple(update.T_map_world.ravel().tolist()) if is_motion else None,
         **{name: getattr(update, name) for name in _UPDATE_SCALARS},
         **{name: cast(Any, spec) for name, (spec, _) in packed.items()},
     )
-    return [topic_bytes("map", update.camera_id), _pack_struct(header), *(data for _, data in packed.values())]
+    return [topic_bytes("map", update.camera_id), _pack_header_of(header), *(data for _, data in packed.values())]
 
 
 def _decode_map_update(header: MapUpdateHeader, buffers: Parts) -> MapUpdate:
-    size, what, T = (header.height, header.width), header.name, header.T_map_world
-    label, confidence, depth, *moving = buffers
+    images, T = _decode_images(header, buffers), header.T_map_world
     return MapUpdate(
-        label=decode_uint8(label, size, f"{what}: label"),
-        confidence=decode_uint8(confidence, size, f"{what}: confidence").astype(np.float32) / np.float32(255),
-        depth_m=decode_depth(header.depth, depth, size, what),
-        moving=decode_uint8(moving[0], size, f"{what}: moving") > 0 if moving else None,
+        label=images["label"],
+        confidence=images["confidence"].astype(np.float32) / np.float32(255),
+        depth_m=images["depth"],
+        moving=images["moving"] > 0 if "moving" in images else None,
         T_map_world=np.eye(4) if T is None else np.array(T, np.float64).reshape(4, 4),
         **{name: getattr(header, name) for name in _UPDATE_SCALARS},
     )
@@ -650,17 +649,17 @@ def _encode_keyframe(keyframe: LabelledKeyframe, options: CodecOptions) -> list[
     what = f"keyframe of camera '{frame.camera_id}' seq={frame.seq}"
     if frame.label is None:
         raise CodecError(f"{what}: has no label image, so that there is nothing to learn from it")
-    _check_keyframe_size(frame.intrinsics, (), what)
     labels = to_plain(LabelSetForm.of(keyframe.label_set), what)
     header = {"camera_id": frame.camera_id, "teacher": keyframe.teacher, "label_set": labels}
     packed = _pack(header, KeyframeHeader, what)
     parts = [topic_bytes("keyframe", frame.camera_id), packed, *encode_frame(frame, options)[1:]]
-    _check_keyframe_size(frame.intrinsics, parts, what)
+    _open(parts)  # is it too large?
     return parts
 
 
 def _open_keyframe(header: KeyframeHeader, parts: Parts) -> Parts:
-    """The parts of its frame, whose header and sizes are checked."""
+    """The parts of its frame, whose header and sizes are checked; it is bounded as a whole, packed and unpacked, as
+    learners keep dozens of them."""
     inner = [topic_bytes("frame", header.camera_id), *parts[2:]]
     if len(inner) < 2:
         raise CodecError(f"keyframe of camera '{header.camera_id}': has no frame")
@@ -668,20 +667,9 @@ def _open_keyframe(header: KeyframeHeader, parts: Parts) -> Parts:
     what = f"keyframe of camera '{frame.camera_id}' seq={frame.seq}"
     if frame.label is None:
         raise CodecError(f"{what}: has no label image")
-    _check_keyframe_size(frame.intrinsics, parts, what)
-    return inner
-
-
-def _check_keyframe_size(lens: CameraIntrinsics, parts: Parts, what: str) -> None:
-    """Refuse a keyframe that is too large as a whole, packed or unpacked: learners keep dozens of them."""
-    width, height, size = lens.width, lens.height, sum(map(len, parts))
+    height, width = frame.size
     if width * height > MAX_KEYFRAME_PIXELS:
         raise CodecError(f"{what}: image of {width}x{height}; a keyframe has at most {MAX_KEYFRAME_PIXELS} pixels")
-    if size > MAX_KEYFRAME_BYTES:
+    if (size := sum(map(len, parts))) > MAX_KEYFRAME_BYTES:
         raise CodecError(f"{what}: {size} bytes in all; a keyframe has at most {MAX_KEYFRAME_BYTES}")
-
-
-def _leave_out_zeros(header: dict[str, Any]) -> None:
-    for name in _NOT_SENT_AS_0:
-        if header.get(name, 1) in (0, None):
-            del header[name]
+    return inner

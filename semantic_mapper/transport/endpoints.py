@@ -15,7 +15,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 
 import zmq
@@ -63,7 +62,7 @@ def check_bind(endpoint: str, keys: Keys | None = None) -> None:
     Raises:
         TransportError: an address beyond this machine without these, or a transport other than ipc, inproc and tcp.
     """
-    transport, _, address = _split(endpoint)
+    transport, _, address = endpoint.partition("://")
     if transport == "ipc":
         if address.startswith("@") or len(os.fsencode(address)) > _MAX_IPC_PATH or not address:
             raise TransportError(
@@ -84,7 +83,7 @@ def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None
         TransportError: an address beyond this machine without the server's identity, or a transport other than ipc,
             inproc and tcp.
     """
-    transport, _, address = _split(endpoint)
+    transport, _, address = endpoint.partition("://")
     if transport not in ("ipc", "inproc", "tcp"):
         raise TransportError(f"{endpoint}: no endpoint; endpoints read ipc://PATH or tcp://HOST:PORT")
     if transport == "tcp" and identity is None and not is_loopback(address):
@@ -94,17 +93,6 @@ def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None
             "then name that machine (--server NAME, or the option `server`); or tunnel it (ssh -L) and connect to "
             "tcp://127.0.0.1:PORT"
         )
-
-
-def _split(endpoint: str) -> tuple[str, str, str]:
-    """Transport, ``://`` and address.
-
-    Raises:
-        TransportError: a NUL character, at which ZeroMQ would take the address to end.
-    """
-    if "\0" in endpoint:
-        raise TransportError(f"{endpoint}: holds a NUL character, which no address may")
-    return endpoint.partition("://")
 
 
 def _check_keys(endpoint: str, keys: Keys | None) -> None:
@@ -194,11 +182,3 @@ class EndpointLock:
         if self._file is not None:
             self._file.close()
             self._file = None
-
-    def __enter__(self) -> EndpointLock:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.release()

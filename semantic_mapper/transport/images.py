@@ -6,7 +6,6 @@ is decoded; of colour images they, and whether the file is complete, are read fr
 
 from __future__ import annotations
 
-import math
 import struct
 import threading
 from dataclasses import dataclass
@@ -119,54 +118,17 @@ def depth_to_uint16(depth_m: Float32, scale: float) -> NDArray[np.uint16] | None
     return units if same else None
 
 
-def pack_depth(depth_m: Float32, *scales: float) -> tuple[float, bytes]:
-    """(H, W) float32 metres -> the first of the scales whose units give exactly these metres, and the packed units.
-
-    Where no scale does, 0 and the packed floats. Either way it is bit exact, NaN included.
-    """
-    for scale in scales:
-        units = depth_to_uint16(depth_m, scale)
-        if units is not None:
-            delta = units.copy()
-            delta[:, 1:] -= units[:, :-1]  # modulo 2^16, undone exactly by the running sum
-            planes = delta.astype("<u2", copy=False).view(np.uint8).reshape(-1, 2).T  # low bytes before high bytes
-            return scale, zstd_compress(planes.tobytes())
-    return 0.0, pack_float32(depth_m)
-
-
-def unpack_depth(data: Buffer, scale: float, size: tuple[int, int], what: str) -> Float32:
-    """Inverse of ``pack_depth``.
-
-    Raises:
-        CodecError: damaged, or not of ``size`` (height, width).
-    """
-    if scale == 0:
-        return unpack_float32(data, size, what)
-    planes = np.frombuffer(zstd_decompress(data, 2 * size[0] * size[1], what), np.uint8).reshape(2, *size)
-    delta = planes[0] | (planes[1].astype(np.uint16) << 8)
-    return depth_from_uint16(np.cumsum(delta, axis=1, dtype=np.uint16), scale)
-
-
-def pack_float32(values: Float32) -> bytes:
-    """Float32 of any shape -> four byte planes, zstd. Bit exact, NaN included."""
-    planes = np.ascontiguousarray(values, dtype="<f4").view(np.uint8).reshape(-1, 4).T
-    return zstd_compress(planes.tobytes())
-
-
-def unpack_float32(data: Buffer, shape: tuple[int, ...], what: str) -> Float32:
-    """Inverse of ``pack_float32``.
-
-    Raises:
-        CodecError: damaged, or not of that shape.
-    """
-    planes = np.frombuffer(zstd_decompress(data, 4 * math.prod(shape), what), np.uint8).reshape(4, -1)
-    return np.ascontiguousarray(planes.T).view("<f4").reshape(shape).astype(np.float32, copy=False)
-
-
 def encode_depth(depth_m: Float32, scale: float) -> tuple[DepthSpec, bytes]:
-    """Depth (H, W) in metres -> how it is packed, and the bytes; see ``pack_depth``."""
-    used, data = pack_depth(depth_m, scale)
-    return DepthSpec("u16_delta_planes_zstd" if used else "f32_planes_zstd", len(data), float(used)), data
+    """Depth (H, W) in metres -> how it is packed, and the bytes: units of ``scale`` where these give it back exactly,
+    else floats. Either way it is bit exact, NaN included."""
+    units = depth_to_uint16(depth_m, scale)
+    if units is None:
+        data = _compress_planes(np.ascontiguousarray(depth_m, "<f4"))
+        return DepthSpec("f32_planes_zstd", len(data)), data
+    delta = units.copy()
+    delta[:, 1:] -= units[:, :-1]  # modulo 2^16, undone exactly by the running sum
+    data = _compress_planes(delta.astype("<u2", copy=False))
+    return DepthSpec("u16_delta_planes_zstd", len(data), float(scale)), data
 
 
 def decode_depth(spec: DepthSpec, data: Buffer, size: tuple[int, int], what: str) -> Float32:
@@ -175,10 +137,21 @@ def decode_depth(spec: DepthSpec, data: Buffer, size: tuple[int, int], what: str
     Raises:
         CodecError: damaged, or not of ``size`` (height, width).
     """
-    units = spec.encoding == "u16_delta_planes_zstd"
-    if units and np.float32(spec.scale) <= 0:
+    is_units = spec.encoding == "u16_delta_planes_zstd"
+    if is_units and np.float32(spec.scale) <= 0:
         raise CodecError(f"{what}: scale of depth must be positive, got {spec.scale}")
-    return unpack_depth(data, spec.scale if units else 0.0, size, f"{what}: depth")
+    itemsize = 2 if is_units else 4
+    planes = np.frombuffer(zstd_decompress(data, itemsize * size[0] * size[1], what), np.uint8)
+    values = np.ascontiguousarray(planes.reshape(itemsize, -1).T)
+    if not is_units:
+        return values.view("<f4").reshape(size).astype(np.float32, copy=False)
+    delta = values.view("<u2").reshape(size)
+    return depth_from_uint16(np.cumsum(delta, axis=1, dtype=np.uint16), spec.scale)
+
+
+def _compress_planes(values: NDArray[np.generic]) -> bytes:
+    """The first bytes of all elements, then the second ones, and so on."""
+    return zstd_compress(values.view(np.uint8).reshape(-1, values.itemsize).T.tobytes())
 
 
 def encode_uint8(image: UInt8) -> tuple[Uint8Spec, bytes]:
@@ -215,7 +188,7 @@ def encode_rgb(rgb: UInt8, encoding: ImageEncoding, jpeg_quality: int) -> bytes:
     return data.tobytes()
 
 
-def decode_rgb(data: Buffer, encoding: ImageEncoding, height: int, width: int) -> UInt8:
+def decode_rgb(data: Buffer, encoding: ImageEncoding, height: int, width: int, what: str = "rgb") -> UInt8:
     """Bytes -> (H, W, 3) uint8 RGB.
 
     Raises:
@@ -223,25 +196,33 @@ def decode_rgb(data: Buffer, encoding: ImageEncoding, height: int, width: int) -
     """
     if encoding == "raw":
         if len(data) != 3 * height * width:
-            raise CodecError(f"raw rgb of {width}x{height} must have {3 * height * width} bytes, got {len(data)}")
+            raise CodecError(f"{what}: raw {width}x{height} must have {3 * height * width} bytes, got {len(data)}")
         return np.frombuffer(data, np.uint8).reshape(height, width, 3).copy()
-    data = bytes(data)
-    found, size = sniff_image(data)
-    if found != encoding or size != (height, width):
-        raise CodecError(
-            f"the header announces a {encoding} image of {width}x{height}, the data are {found} of {size[1]}x{size[0]}"
-        )
-    return _decode(data)
+    try:
+        rgb, found = decode_image_file(bytes(data), (height, width))
+    except CodecError as error:
+        raise CodecError(f"{what}: {error}") from error
+    if found != encoding:
+        raise CodecError(f"{what}: the header announces {encoding}, the data are {found}")
+    return rgb
 
 
-def decode_image_file(data: bytes) -> tuple[UInt8, Literal["png", "jpeg"]]:
-    """A JPEG or PNG file -> (H, W, 3) uint8 RGB and its encoding; just what ``decode_rgb`` makes of the same bytes.
+def decode_image_file(data: bytes, expected: tuple[int, int] | None = None) -> tuple[UInt8, Literal["png", "jpeg"]]:
+    """A JPEG or PNG file -> (H, W, 3) uint8 RGB and its encoding.
 
     Raises:
-        CodecError: neither, damaged, or cut off.
+        CodecError: neither, damaged, cut off, or not of the ``expected`` (height, width).
     """
-    encoding, _ = sniff_image(data)
-    return _decode(data), encoding
+    encoding, size = sniff_image(data)
+    if expected is not None and size != expected:
+        raise CodecError(f"the header announces {expected[1]}x{expected[0]}, the data are {size[1]}x{size[0]}")
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
+    except cv2.error as error:
+        raise CodecError(f"OpenCV cannot decode the image: {error}") from error
+    if bgr is None:  # pyright: ignore[reportUnnecessaryComparison] -- the stubs do not know
+        raise CodecError("OpenCV cannot decode the image; the file is damaged")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8), encoding
 
 
 def sniff_image(data: bytes) -> tuple[Literal["png", "jpeg"], tuple[int, int]]:
@@ -291,13 +272,3 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             return size
         at += 2 + max(length, 2)
     raise CodecError("JPEG image is cut off or damaged: no size, scan or end mark")
-
-
-def _decode(data: bytes) -> UInt8:
-    try:
-        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
-    except cv2.error as error:
-        raise CodecError(f"OpenCV cannot decode the image: {error}") from error
-    if bgr is None:  # pyright: ignore[reportUnnecessaryComparison] -- the stubs do not know
-        raise CodecError("OpenCV cannot decode the image; the file is damaged")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

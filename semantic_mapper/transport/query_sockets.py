@@ -5,19 +5,18 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Sequence
-from types import TracebackType
+from typing import Self
 
 import zmq
 
-from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
 from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
 from semantic_mapper.transport.messages import MAX_HEADER_BYTES, MAX_PART_BYTES, MAX_PARTS, Buffer
-from semantic_mapper.transport.query_messages import encode_error
 from semantic_mapper.transport.sockets import receive_bounded
 
 MAX_REQUEST_BYTES = 10_000_000  # of a part: 65,536 poses, and some room; a client that sends more is cut off
-_ENVELOPE_PARTS = 2  # who asks, and the empty part that REQ sockets put first
+_QUESTION_PARTS = 5  # who asks, the empty part that REQ sockets put first, and a question's three
 _WAITING = 64  # questions and answers that may wait for each client
 
 
@@ -35,12 +34,10 @@ class QueryServer:
             no keys.
     """
 
-    def __init__(
-        self, endpoint: str, *, keys: Keys | None = None, context: zmq.Context[zmq.Socket[bytes]] | None = None
-    ) -> None:
+    def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
         check_bind(endpoint, keys)
         self._endpoint_lock = EndpointLock(endpoint)
-        self._socket = (context or zmq.Context.instance()).socket(zmq.ROUTER)
+        self._socket = zmq.Context.instance().socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 200)
         self._socket.setsockopt(zmq.RCVHWM, _WAITING)
         self._socket.setsockopt(zmq.SNDHWM, _WAITING)
@@ -64,18 +61,16 @@ class QueryServer:
             os.eventfd_read(self._wake)
 
     def receive(self) -> tuple[bytes, list[bytes]] | None:
-        """Who asks, and the parts of the question; None where nobody does, or one that is too large was refused."""
+        """Who asks, and the parts of the question; None where nobody does. One that is too large has a part too many,
+        or lacks its last ones."""
         try:
-            (sender, *parts), trouble = receive_bounded(
+            (sender, *parts), _ = receive_bounded(
                 self._socket,
-                max_parts=3 + _ENVELOPE_PARTS,
+                max_parts=_QUESTION_PARTS + 1,
                 max_bytes=MAX_REQUEST_BYTES + MAX_HEADER_BYTES,
                 flags=zmq.NOBLOCK,
             )
         except zmq.Again:
-            return None
-        if trouble:
-            self.send(sender, encode_error(CodecError(trouble)))
             return None
         return sender, parts[1:] if parts[:1] == [b""] else parts
 
@@ -118,14 +113,12 @@ class QuerySocket:
         timeout_s: float,
         attempts: int,
         identity: ServerIdentity | None = None,
-        context: zmq.Context[zmq.Socket[bytes]] | None = None,
     ) -> None:
         check_connect(endpoint, identity)
         self.endpoint = endpoint
         self._timeout_s = timeout_s
         self._attempts = attempts
         self._identity = identity
-        self._context = context or zmq.Context.instance()
         self._lock = threading.Lock()
         self._closed = False
         self._socket = self._connect()
@@ -155,12 +148,10 @@ class QuerySocket:
             self._closed = True
             self._socket.close(linger=0)
 
-    def __enter__(self) -> QuerySocket:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _ask_once(self, parts: Sequence[Buffer]) -> list[bytes] | None:
@@ -182,7 +173,7 @@ class QuerySocket:
                 self._socket = self._connect()
 
     def _connect(self) -> zmq.Socket[bytes]:
-        socket = self._context.socket(zmq.REQ)
+        socket = zmq.Context.instance().socket(zmq.REQ)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDTIMEO, int(self._timeout_s * 1000))
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_PART_BYTES)

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import errno
-import math
 import threading
 import time
 import uuid
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Literal, cast
+from typing import Literal, Self, cast
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
-from semantic_mapper.transport.codec import decode, read_envelope
+from semantic_mapper.transport.codec import Envelope, decode, read_envelope
 from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
 from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
 from semantic_mapper.transport.messages import (
@@ -41,7 +39,6 @@ _PUMP_PERIOD_S = 0.02
 _SEND_SLICE_MS = 100
 _LATE_S = 0.1  # subscriptions of one socket come in no order; an end must not arrive before what it ends
 _MAX_SUBSCRIPTIONS = 4096  # what an unknown client's subscriptions may cost us
-_MAX_EVENTS = 256  # heard at a time: an unknown client that subscribes without end must not hold up what is published
 _POLL_MS = 50
 # A machine that is gone is found out within 5 s; a process that is gone at once, by the kernel.
 _KEEPALIVE = ((zmq.TCP_KEEPALIVE_IDLE, 2), (zmq.TCP_KEEPALIVE_INTVL, 1), (zmq.TCP_KEEPALIVE_CNT, 3))
@@ -52,11 +49,6 @@ _EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_TRIES_AG
 
 
 log = get_logger(__name__)
-
-
-def max_bytes(topic: str) -> int:
-    """What a message of a topic, or of one that begins so, may take, all of its parts together."""
-    return _OF_TOPIC.get(topic.partition("/")[0], MAX_MESSAGE_BYTES)
 
 
 def receive_bounded(
@@ -106,7 +98,6 @@ class Publisher:
         hwm: int = 16,
         linger_ms: int = 2000,
         keys: Keys | None = None,
-        context: zmq.Context[zmq.Socket[bytes]] | None = None,
     ) -> None:
         check_bind(endpoint, keys)
         self._endpoint_lock = EndpointLock(endpoint)
@@ -116,8 +107,7 @@ class Publisher:
         self._late: dict[bytes, float] = {}  # latched ends that newcomers get yet, and when
         self._owed: list[Parts] = []  # answers to subscriptions that found a full queue
         self._closed = threading.Event()
-        self.published = 0
-        self._socket = (context or zmq.Context.instance()).socket(zmq.XPUB)
+        self._socket = zmq.Context.instance().socket(zmq.XPUB)
         self._socket.setsockopt(zmq.LINGER, linger_ms)
         self._socket.setsockopt(zmq.SNDHWM, hwm)
         self._socket.setsockopt(zmq.SNDTIMEO, _SEND_SLICE_MS)
@@ -146,7 +136,6 @@ class Publisher:
                 self._check_open()
                 self._drain()
                 if self._try_send(parts):
-                    self.published += 1
                     self._latch(topic, parts)
                     return
             self._closed.wait(0.001)  # let other threads have the socket
@@ -200,12 +189,10 @@ class Publisher:
             self._socket.close()
         self._endpoint_lock.release()
 
-    def __enter__(self) -> Publisher:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _check_open(self) -> None:
@@ -223,7 +210,7 @@ class Publisher:
         for parts in owed:
             self._answer(parts)
         self._answer_late()
-        for _ in range(_MAX_EVENTS):
+        while True:
             try:
                 event = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
@@ -276,9 +263,6 @@ class Publisher:
             self._socket.send_multipart(parts, flags, copy=False)
         except zmq.Again:
             return False
-        except BaseException:  # Ctrl-C between two parts: end the message, or the next one would be glued to it
-            self._socket.send(b"", zmq.NOBLOCK)
-            raise
         return True
 
 
@@ -287,29 +271,45 @@ def _row(topic: bytes) -> Topic | None:
 
 
 class _Subscriber:
-    """What both subscribers share: the socket, its subscriptions, the handshake, and the counting of bad messages."""
+    """A subscriber, as the two below are; any thread may call its methods.
+
+    A thread of its own takes messages off the socket as they come and checks their headers; images are decoded by the
+    caller of ``receive``. A bad message costs itself and nothing else: it is counted in ``rejected`` and passed over. A
+    publisher that was restarted hears of the subscriptions again.
+
+    Args:
+        endpoints: One publisher or several.
+        topics: "frame", or "frame/CAMERA" for one source.
+        identity: Of publishers that have keys.
+        hwm: Messages that wait in the socket's own queue.
+
+    Raises:
+        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
+            is not among the peers.
+    """
 
     def __init__(
-        self,
-        endpoints: str | Sequence[str],
-        topics: Sequence[str],
-        hwm: int,
-        identity: ServerIdentity | None,
-        context: zmq.Context[zmq.Socket[bytes]] | None,
+        self, endpoints: str | Sequence[str], topics: Sequence[str], *, hwm: int = 16, identity: ServerIdentity | None
     ) -> None:
         self.endpoints = (endpoints,) if isinstance(endpoints, str) else tuple(endpoints)
         self.topics = tuple(topics)
         self.rejected = 0
         self.last_error: CodecError | None = None
+        self._changed = threading.Condition()
+        # What waits to be read, in order: by topic where messages give way to newer ones, else by serial number. One
+        # that replaces another keeps its place, so that an end of stream cannot overtake a frame.
+        self._waiting: dict[bytes | int, list[bytes]] = {}
+        self._serial = 0
         self._received_at: float | None = None
         self._sync_topic = SYNC_PREFIX + uuid.uuid4().hex.encode() + b"/"
         self._synced = 0
         self._identity = identity
-        self._closed = threading.Event()
-        self._socket = (context or zmq.Context.instance()).socket(zmq.SUB)
+        self._closed = False
+        self._failure: zmq.ZMQError | None = None  # of the thread that takes messages off the socket
+        self._max_bytes = max(_OF_TOPIC.get(topic.partition("/")[0], MAX_MESSAGE_BYTES) for topic in self.topics)
+        self._socket = zmq.Context.instance().socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RCVHWM, hwm)
-        self._max_bytes = max(map(max_bytes, self.topics))
         self._socket.setsockopt(zmq.MAXMSGSIZE, min(MAX_PART_BYTES, self._max_bytes))
         self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 200)  # a node that was restarted is found at once
@@ -318,227 +318,23 @@ class _Subscriber:
         self._socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
         for option, seconds_or_probes in _KEEPALIVE:
             self._socket.setsockopt(option, seconds_or_probes)
-        self._connections = Connections(self._socket)
-
-    def _connect(self) -> None:
+        self._connections = _Connections(self._socket)
         try:
-            for endpoint in self.endpoints:
-                check_connect(endpoint, self._identity)
-            if self._identity is not None:
-                secure_client(self._socket, self._identity)
-            for topic in self.topics:
-                self._socket.subscribe(_prefix(topic))
-            # Last: publishers hear subscriptions in order, so an answer to this one proves that all others are heard.
-            self._socket.subscribe(self._sync_topic)
-            for endpoint in self.endpoints:
-                self._socket.connect(endpoint)
+            self._connect()
         except (zmq.ZMQError, CodecError, TransportError) as error:
-            self._connections.close()
-            self._socket.close(linger=0)
+            self._close_socket()
             raise TransportError(f"cannot subscribe to {self.endpoints}: {error}") from error
+        self._thread = threading.Thread(target=self._run, name=f"subscriber {self.endpoints}", daemon=True)
+        self._thread.start()
 
     @property
     def silent_s(self) -> float | None:
         """Seconds since the last good message; None before the first."""
         return None if self._received_at is None else time.monotonic() - self._received_at
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the socket."""
-        raise NotImplementedError
-
-    def _take_off(self) -> list[bytes] | None:
-        """The message that waits; None where it has too much in it."""
-        parts, trouble = receive_bounded(self._socket, max_bytes=self._max_bytes)
-        if trouble:
-            self._reject(CodecError(trouble))
-        return None if trouble else parts
-
-    def _is_sync(self, parts: Sequence[bytes]) -> bool:
-        if not parts[0].startswith(SYNC_PREFIX):
-            return False
-        self._synced += parts[0] == self._sync_topic
-        return True
-
-    def _reject(self, error: CodecError) -> None:
-        """A bad message costs itself and nothing else: count it, tell of it (each power of two), go on."""
-        self.rejected += 1
-        self.last_error = error
-        if is_power_of_two(self.rejected):
-            log.warning("message_rejected", endpoints=self.endpoints, rejected=self.rejected, error=str(error))
-
-    def _check_open(self) -> None:
-        if self._closed.is_set():
-            raise TransportError(f"{self.endpoints}: the subscriber is closed")
-
-    def _not_ready(self, timeout_s: float) -> TransportError:
-        return TransportError(
-            f"{self._synced} of {len(self.endpoints)} publishers at {', '.join(self.endpoints)} have answered within "
-            f"{timeout_s:g} s; is the other node running?"
-            + ("" if self._identity is None else " Does it know this machine's key, and is its own the one we have?")
-        )
-
-
-class LosslessSubscriber(_Subscriber):
-    """Gets every message, in order; with a ``Publisher`` of policy "block" none is lost. Any thread may call it.
-
-    A publisher that was restarted hears of the subscriptions again as soon as somebody waits in ``receive``.
-
-    Args:
-        endpoints: One publisher or several.
-        topics: "frame", or "frame/CAMERA" for one source.
-        identity: Of publishers that have keys.
-        hwm: Messages that wait here before the publisher is made to wait.
-
-    Raises:
-        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
-            is not among the peers.
-    """
-
-    def __init__(
-        self,
-        endpoints: str | Sequence[str],
-        topics: Sequence[str],
-        *,
-        hwm: int = 16,
-        identity: ServerIdentity | None = None,
-        context: zmq.Context[zmq.Socket[bytes]] | None = None,
-    ) -> None:
-        super().__init__(endpoints, topics, hwm, identity, context)
-        self._mutex = threading.Lock()
-        self._connect()
-        self._early: deque[list[bytes]] = deque()  # arrived during ``wait_until_heard``
-
-    def __enter__(self) -> LosslessSubscriber:
-        return self
-
-    def wait_until_heard(self, timeout_s: float = 10.0) -> None:
-        """Block until every publisher knows of our subscriptions; what it sends from then on arrives.
-
-        Raises:
-            TransportError: not within ``timeout_s``.
-        """
-        deadline = time.monotonic() + timeout_s
-        while self._synced < len(self.endpoints):
-            parts = self._receive_raw(_POLL_MS)
-            if parts is not None and not self._is_sync(parts):
-                self._early.append(parts)
-            if time.monotonic() > deadline:
-                raise self._not_ready(timeout_s)
-
     def connections(self) -> int:
-        """Publishers that are connected right now; falls at once when one dies.
-
-        Raises:
-            TransportError: closed.
-        """
-        with self._mutex:
-            self._check_open()
-            return self._connections.connected()
-
-    def receive_parts(self, timeout_s: float | None = None) -> list[bytes] | None:
-        """Next message as it came over the wire, its header checked; None when none came in time.
-
-        Bad ones are counted in ``rejected`` and passed over until the time is over: a flood of them holds nobody up.
-
-        Args:
-            timeout_s: None = wait for ever.
-
-        Raises:
-            TransportError: closed.
-        """
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        while True:
-            left_ms = _POLL_MS if deadline is None else max(0.0, deadline - time.monotonic()) * 1e3
-            parts = self._early.popleft() if self._early else self._receive_raw(min(_POLL_MS, left_ms))
-            if parts is not None and not self._is_sync(parts):
-                try:
-                    read_envelope(parts)
-                except CodecError as error:
-                    self._reject(error)
-                else:
-                    self._received_at = time.monotonic()
-                    return parts
-            if _is_over(deadline):
-                return None
-
-    def receive(self, timeout_s: float | None = None) -> Message | None:
-        """Next message, decoded; None when none came in time. Bad ones are passed over as in ``receive_parts``.
-
-        Raises:
-            TransportError: closed.
-        """
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        while True:
-            left = None if deadline is None else max(0.0, deadline - time.monotonic())
-            parts = self.receive_parts(left)
-            if parts is None:
-                return None
-            try:
-                return decode(parts)
-            except CodecError as error:
-                self._reject(error)
-            if _is_over(deadline):
-                return None
-
-    def close(self) -> None:
-        """Free the socket. Harmless when repeated."""
-        with self._mutex:
-            if self._closed.is_set():
-                return
-            self._closed.set()
-            self._connections.close()
-            self._socket.close(linger=0)
-
-    def _receive_raw(self, poll_ms: float) -> list[bytes] | None:
-        with self._mutex:
-            self._check_open()
-            self._connections.reconnect()
-            if not self._socket.poll(math.ceil(poll_ms)):
-                return None
-            return self._take_off()
-
-
-class NewestSubscriber(_Subscriber):
-    """Gets the newest message of each source: an unread one gives way to the next, and is counted.
-
-    A thread of its own takes messages off the socket as they come and checks their headers; images are decoded by
-    the caller of ``receive``. Messages whose topic is marked "all" in the table (info, end, ...) never give way.
-
-    Args:
-        endpoints: One publisher or several.
-        topics: "frame", or "frame/CAMERA" for one source.
-        identity: Of publishers that have keys.
-
-    Raises:
-        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
-            is not among the peers.
-    """
-
-    def __init__(
-        self,
-        endpoints: str | Sequence[str],
-        topics: Sequence[str],
-        *,
-        identity: ServerIdentity | None = None,
-        context: zmq.Context[zmq.Socket[bytes]] | None = None,
-    ) -> None:
-        super().__init__(endpoints, topics, 16, identity, context)
-        self._changed = threading.Condition()
-        self._slots: dict[tuple[bytes, int], list[bytes]] = {}  # (topic, 0), or (topic, serial) where none gives way
-        self._serial = 0
-        self.overwritten = 0
-        self._failure: zmq.ZMQError | None = None  # of the thread that takes messages off the socket
-        self._connect()
-        self._thread = threading.Thread(target=self._run, name=f"subscriber {self.endpoints}", daemon=True)
-        self._thread.start()
-
-    def __enter__(self) -> NewestSubscriber:
-        return self
+        """Publishers that are connected right now; falls at once when one dies."""
+        return self._connections.count
 
     def wait_until_heard(self, timeout_s: float = 10.0) -> None:
         """Block until every publisher knows of our subscriptions; what it sends from then on arrives.
@@ -550,12 +346,17 @@ class NewestSubscriber(_Subscriber):
             self._changed.wait_for(lambda: self._synced >= len(self.endpoints) or self._failure is not None, timeout_s)
             self._check_receiving()
             if self._synced < len(self.endpoints):
-                raise self._not_ready(timeout_s)
+                raise TransportError(
+                    f"{self._synced} of {len(self.endpoints)} publishers at {', '.join(self.endpoints)} have answered "
+                    f"within {timeout_s:g} s; is the other node running?"
+                    + (" Does it know this machine's key, and is its own the one we have?" if self._identity else "")
+                )
 
     def receive(self, timeout_s: float | None = None) -> Message | None:
-        """The newest message of the source that has waited longest; None when none came in time.
+        """The message that has waited longest, decoded; None when none came in time.
 
-        Bad messages are counted in ``rejected`` and passed over until the time is over.
+        Args:
+            timeout_s: None = wait for ever. Bad messages are passed over until then: a flood of them holds nobody up.
 
         Raises:
             TransportError: closed; or nothing can come any more, which says why.
@@ -569,7 +370,7 @@ class NewestSubscriber(_Subscriber):
                 return decode(parts)
             except CodecError as error:
                 self._reject(error)
-            if _is_over(deadline):
+            if deadline is not None and time.monotonic() >= deadline:
                 return None
 
     def receive_parts(self, timeout_s: float | None = None) -> list[bytes] | None:
@@ -579,36 +380,84 @@ class NewestSubscriber(_Subscriber):
             TransportError: see ``receive``.
         """
         with self._changed:
-            self._changed.wait_for(
-                lambda: bool(self._slots) or self._closed.is_set() or self._failure is not None, timeout_s
-            )
-            self._check_open()
-            if not self._slots:
+            self._changed.wait_for(lambda: bool(self._waiting) or self._closed or self._failure is not None, timeout_s)
+            if self._closed:
+                raise TransportError(f"{self.endpoints}: the subscriber is closed")
+            if not self._waiting:
                 self._check_receiving()
                 return None
-            # A message that replaced another keeps its place, so an end of stream cannot overtake a frame.
-            return self._slots.pop(next(iter(self._slots)))
+            parts = self._waiting.pop(next(iter(self._waiting)))
+            self._changed.notify_all()  # there is room again
+            return parts
 
     def close(self) -> None:
         """Stop the thread and free the socket. Harmless when repeated."""
         with self._changed:
-            self._closed.set()
+            self._closed = True
             self._changed.notify_all()
         self._thread.join()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _connect(self) -> None:
+        for endpoint in self.endpoints:
+            check_connect(endpoint, self._identity)
+        if self._identity is not None:
+            secure_client(self._socket, self._identity)
+        for topic in self.topics:
+            name, _, source = topic.partition("/")
+            if name not in TOPICS:
+                raise CodecError(f"no topic '{name}'; there are {', '.join(TOPICS)}")
+            self._socket.subscribe(subscription(name, source or None))
+        # Last: publishers hear subscriptions in order, so an answer to this one proves that all others are heard.
+        self._socket.subscribe(self._sync_topic)
+        for endpoint in self.endpoints:
+            self._socket.connect(endpoint)
+
     def _run(self) -> None:
         try:
-            while not self._closed.is_set():
-                self._connections.reconnect()
-                if self._socket.poll(_POLL_MS) and (parts := self._take_off()) is not None:
-                    self._take(parts)
+            while not self._closed:
+                self._connections.follow()
+                if self._socket.poll(_POLL_MS):
+                    self._take(*receive_bounded(self._socket, max_bytes=self._max_bytes))
         except zmq.ZMQError as error:
             with self._changed:
                 self._failure = error
                 self._changed.notify_all()
         finally:
-            self._connections.close()
-            self._socket.close(linger=0)  # by the thread that used it
+            self._close_socket()  # by the thread that used it
+
+    def _take(self, parts: list[bytes], trouble: str) -> None:
+        if parts[0].startswith(SYNC_PREFIX):
+            with self._changed:
+                self._synced += parts[0] == self._sync_topic
+                self._changed.notify_all()
+            return
+        try:
+            if trouble:
+                raise CodecError(trouble)
+            envelope = read_envelope(parts)
+        except CodecError as error:
+            self._reject(error)
+            return
+        with self._changed:
+            self._put(parts, envelope)
+            self._received_at = time.monotonic()
+            self._changed.notify_all()
+
+    def _put(self, parts: list[bytes], envelope: Envelope) -> None:
+        """Let a good message wait to be read; ``_changed`` is held."""
+        raise NotImplementedError
+
+    def _reject(self, error: CodecError) -> None:
+        self.rejected += 1
+        self.last_error = error
+        if is_power_of_two(self.rejected):
+            log.warning("message_rejected", endpoints=self.endpoints, rejected=self.rejected, error=str(error))
 
     def _check_receiving(self) -> None:
         if self._failure is not None:
@@ -616,43 +465,63 @@ class NewestSubscriber(_Subscriber):
                 f"{self.endpoints}: nothing is received any more: {self._failure}; subscribe again"
             ) from self._failure
 
-    def _take(self, parts: list[bytes]) -> None:
-        if parts[0].startswith(SYNC_PREFIX):
-            with self._changed:
-                self._is_sync(parts)
-                self._changed.notify_all()
+    def _close_socket(self) -> None:
+        self._connections.close()
+        self._socket.close(linger=0)
+
+
+class LosslessSubscriber(_Subscriber):
+    """Gets every message, in order; with a ``Publisher`` of policy "block" none is lost.
+
+    Args:
+        endpoints, topics, identity: See ``_Subscriber``.
+        hwm: Messages that wait here before the publisher is made to wait, and as many in the socket.
+    """
+
+    def __init__(
+        self,
+        endpoints: str | Sequence[str],
+        topics: Sequence[str],
+        *,
+        hwm: int = 16,
+        identity: ServerIdentity | None = None,
+    ) -> None:
+        self._room = hwm
+        super().__init__(endpoints, topics, hwm=hwm, identity=identity)
+
+    def _put(self, parts: list[bytes], envelope: Envelope) -> None:
+        self._changed.wait_for(lambda: len(self._waiting) < self._room or self._closed)
+        self._serial += 1
+        self._waiting[self._serial] = parts
+
+
+class NewestSubscriber(_Subscriber):
+    """Gets the newest message of each source: an unread one gives way to the next, and is counted in ``overwritten``.
+
+    Messages whose topic is marked "all" in the table (info, end, ...) never give way.
+
+    Args:
+        endpoints, topics, identity: See ``_Subscriber``.
+    """
+
+    def __init__(
+        self, endpoints: str | Sequence[str], topics: Sequence[str], *, identity: ServerIdentity | None = None
+    ) -> None:
+        self.overwritten = 0
+        super().__init__(endpoints, topics, identity=identity)
+
+    def _put(self, parts: list[bytes], envelope: Envelope) -> None:
+        self._serial += 1
+        key = parts[0] if TOPICS[envelope.topic].queue == "newest" else self._serial
+        if key not in self._waiting and len(self._waiting) >= _MAX_SLOTS:
+            self._reject(CodecError(f"{len(self._waiting)} sources wait to be read; no room for {parts[0]!r}"))
             return
-        try:
-            envelope = read_envelope(parts)
-        except CodecError as error:
-            self._reject(error)
-            return
-        with self._changed:
-            gives_way = TOPICS[envelope.topic].queue == "newest"
-            self._serial += not gives_way
-            key = (parts[0], 0 if gives_way else self._serial)
-            if key not in self._slots and len(self._slots) >= _MAX_SLOTS:
-                self._reject(CodecError(f"{len(self._slots)} sources wait to be read; no room for {parts[0]!r}"))
-                return
-            self.overwritten += key in self._slots
-            self._slots[key] = parts
-            self._received_at = time.monotonic()
-            self._changed.notify_all()
+        self.overwritten += key in self._waiting
+        self._waiting[key] = parts
 
 
-def _is_over(deadline: float | None) -> bool:
-    return deadline is not None and time.monotonic() >= deadline
-
-
-def _prefix(topic: str) -> bytes:
-    name, _, source = topic.partition("/")
-    if name not in TOPICS:
-        raise CodecError(f"no topic '{name}'; there are {', '.join(TOPICS)}")
-    return subscription(name, source or None)
-
-
-class Connections:
-    """Watches the connections that a socket makes. To be used by the thread that uses the socket.
+class _Connections:
+    """Counts the connections of a socket, and makes those again that ZeroMQ has given up; for the socket's thread.
 
     Args:
         socket: Not connected yet.
@@ -667,43 +536,35 @@ class Connections:
         self._monitor.setsockopt(zmq.RCVHWM, 0)  # ZeroMQ's own thread would wait for us
         self._monitor.connect(address)
         self._lost: dict[str, float] = {}  # connections that are not tried again, and since when
-        self._count = 0
-        self.renewed = 0
+        self.count = 0
+        self._renewed = 0
 
-    def connected(self) -> int:
-        """How many publishers are connected right now; falls at once when one dies."""
-        self._listen()
-        return max(0, self._count)
-
-    def reconnect(self) -> None:
-        """Make those again that ZeroMQ has given up; often called, costs nothing."""
-        self._listen()
+    def follow(self) -> None:
+        """Hear what has happened, and connect again where that is needed; often called, costs nothing."""
+        while self._monitor.poll(0):
+            report = recv_monitor_message(self._monitor)
+            event, endpoint = report["event"], report["endpoint"].decode(errors="replace")
+            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self.count += 1
+            elif event == zmq.EVENT_DISCONNECTED:
+                self.count = max(0, self.count - 1)
+                self._lost[endpoint] = time.monotonic()
+            else:
+                self._lost.pop(endpoint, None)
         now = time.monotonic()
         for endpoint in [e for e, since in self._lost.items() if now - since > _GIVEN_UP_S]:
             del self._lost[endpoint]
-            self.renewed += 1
+            self._renewed += 1
             try:
                 self._socket.disconnect(endpoint)
             except zmq.ZMQError as error:
                 if error.errno != errno.ENOENT:  # it knows nothing of that connection any more
                     raise
             self._socket.connect(endpoint)
-            if is_power_of_two(self.renewed):
-                log.warning("connection_renewed", endpoint=endpoint, renewed=self.renewed)
+            if is_power_of_two(self._renewed):
+                log.warning("connection_renewed", endpoint=endpoint, renewed=self._renewed)
 
     def close(self) -> None:
         """Before the socket is closed."""
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
-
-    def _listen(self) -> None:
-        while self._monitor.poll(0):
-            report = recv_monitor_message(self._monitor)
-            event, endpoint = report["event"], report["endpoint"].decode(errors="replace")
-            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                self._count += 1
-            elif event == zmq.EVENT_DISCONNECTED:
-                self._count -= 1
-                self._lost[endpoint] = time.monotonic()
-            else:
-                self._lost.pop(endpoint, None)

@@ -18,7 +18,7 @@ from semantic_mapper.types import Float64, PosedFrame
 
 from .rooms import INTRINSICS, truth, walk
 
-CONFIG = PoseRefinerConfig(sigma_m=0.02, corners=200)
+CONFIG = PoseRefinerConfig(sigma_m=0.02)
 
 
 @cache
@@ -81,7 +81,7 @@ def test_poses_are_aligned_by_the_mean_of_what_each_says(rng: np.random.Generato
 
 def test_the_scale_becomes_sure_as_the_camera_moves_and_given_poses_are_exact() -> None:
     def spreads(sigma_m: float) -> list[float]:
-        refiner = PoseRefiner(INTRINSICS, PoseRefinerConfig(sigma_m=sigma_m, corners=200))
+        refiner = PoseRefiner(INTRINSICS, PoseRefinerConfig(sigma_m=sigma_m))
         found = [refiner.scale_spread]
         for frame in walk():
             refiner.push(frame)

@@ -24,13 +24,19 @@ from unittest.mock import patch
 from semantic_mapper import errors
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
-from semantic_mapper.queries.questions import QUESTIONS, decode_question
+from semantic_mapper.queries.questions import (
+    QUESTIONS,
+    decode_answer,
+    decode_question,
+    encode_answer,
+    encode_error,
+    encode_request,
+)
 from semantic_mapper.testing import LogReplays
 from semantic_mapper.transport.codec import decode, encode
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import TOPICS
 from semantic_mapper.transport.pose_message import decode_pose
-from semantic_mapper.transport.query_messages import decode_answer, encode_answer, encode_error, encode_request
 from tests.contract import entry_points as api
 from tests.contract import golden, runs, samples
 from tests.contract.golden import FOLDER, LOG, MAP, MAP_COARSE, POINTS, STORED, WEIGHTS

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, MapPoints
-from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
-from semantic_mapper.queries.questions import Correction, InstanceArrays, MapInfo, Weights, WeightsEntry
-from semantic_mapper.queries.rays import RayHits
+from semantic_mapper.queries.questions import Correction, InstanceArrays, MapInfo, MapState, Weights, WeightsEntry
+from semantic_mapper.queries.surface import RayHits
 from semantic_mapper.transport.messages import (
     EndOfStream,
     FrameRefused,
@@ -25,7 +25,6 @@ from semantic_mapper.transport.messages import (
     WeightsUpdate,
 )
 from semantic_mapper.transport.pose_message import decode_pose, encode_pose
-from semantic_mapper.transport.query_messages import MapState
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 LENS = CameraIntrinsics(20.5, 21.0, 7.5, 5.5, 16, 12, (0.1, -0.05, 0.001, 0.002, 0.01))

@@ -14,10 +14,9 @@ import msgpack
 import pytest
 import zmq
 
-from semantic_mapper.queries.questions import QUESTIONS
+from semantic_mapper.queries.questions import QUESTIONS, decode_answer
 from semantic_mapper.transport.codec import decode
 from semantic_mapper.transport.messages import Status
-from semantic_mapper.transport.query_messages import decode_answer
 from semantic_mapper.types import MapUpdate
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, ROOM_SETTINGS, WEIGHTS, form, lacking, parts_of, read

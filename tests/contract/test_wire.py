@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.queries.questions import QUESTIONS, decode_question
+from semantic_mapper.queries.questions import QUESTIONS, decode_answer, decode_question, encode_answer, encode_request
 from semantic_mapper.transport.codec import decode, encode
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import TOPICS
 from semantic_mapper.transport.pose_message import decode_pose, encode_pose
-from semantic_mapper.transport.query_messages import decode_answer, encode_answer, encode_request
 from semantic_mapper.types import PosedFrame
 from tests.contract.golden import differences, meaning, parts_of, plain, read
 

@@ -42,12 +42,6 @@ def test_numbers_arrays_and_named_tuples_arrive_in_c() -> None:
     assert _sum_arguments(VALUES, WEIGHTS._replace(factor=np.float32(2)), np.bool_(0), np.int32(5), BYTES) == 72 + 5 + 1
 
 
-def test_arguments_may_be_named() -> None:
-    assert _sum_arguments(VALUES, WEIGHTS, other=FLOATS, bias=1, negate=True) == -18 + 1 + 4
-    with pytest.raises(TypeError, match="missing a required argument: 'bias'"):
-        _sum_arguments(VALUES, WEIGHTS, other=FLOATS, negate=True)  # type: ignore[call-arg]
-
-
 def test_a_kernel_that_returns_nothing_returns_none_and_writes_into_the_array() -> None:
     visits = np.zeros(3, np.int64)
     assert count_visits(visits) is None  # its range is empty
@@ -71,16 +65,6 @@ def test_arrays_that_do_not_fit_are_named(values: Any, match: str) -> None:
         _sum_arguments(values, WEIGHTS, False, 0, BYTES)
 
 
-def test_an_array_of_a_named_tuple_that_does_not_fit_is_named_with_it() -> None:
-    with pytest.raises(ShapeError, match="argument weights: expected an array of bool, got uint8"):
-        _sum_arguments(VALUES, WEIGHTS._replace(used=np.zeros(4, np.uint8)), False, 0, BYTES)  # type: ignore[arg-type]
-
-
-def test_any_array_must_be_contiguous_too() -> None:
-    with pytest.raises(ShapeError, match="argument other: expected a contiguous array"):
-        _sum_arguments(VALUES, WEIGHTS, False, 0, FLOATS[..., 0])
-
-
 def test_a_declaration_that_does_not_fit_the_library_is_refused() -> None:
     def sum_arguments(values: Int64, other: Float32) -> int: ...
 
@@ -97,14 +81,6 @@ def test_a_kernel_that_the_library_lacks_is_named() -> None:
         no_such_kernel()
 
 
-def test_a_type_that_c_does_not_know_is_refused() -> None:
-    def count_visits(visits: str) -> None: ...
-
-    count_visits.__annotations__ = {"visits": str, "return": None}
-    with pytest.raises(TypeError, match="a kernel cannot take a <class 'str'>"):
-        kernel(count_visits)("visits")
-
-
 def test_a_missing_library_is_named_and_how_to_get_it(tmp_path: Path) -> None:
     with pytest.raises(DependencyError, match=f"no compiled kernels for .* in {tmp_path}.*make setup"):
         binding.load_library(tmp_path)
@@ -116,16 +92,6 @@ def test_a_library_of_another_machine_is_named(tmp_path: Path) -> None:
     library.write_bytes(header.ljust(64, b"\0"))
     with pytest.raises(DependencyError, match=f"cannot load the compiled kernels {library}"):
         binding.load_library(tmp_path)
-
-
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="other machines have one library")
-@pytest.mark.parametrize(("capability", "first"), [("default", "kernels-x86_64"), ("avx2", "kernels-x86_64-avx2")])
-def test_the_library_is_of_the_processor_that_torch_is_told_of(
-    capability: str, first: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ATEN_CPU_CAPABILITY", capability)
-    assert binding._variants()[0] == first
-    assert binding._variants()[-1] == "kernels-x86_64"
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="other machines have one library")

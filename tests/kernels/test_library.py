@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 import semantic_mapper
-from semantic_mapper.kernels import binding, threads
+from semantic_mapper.kernels import binding
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ROOT / "semantic_mapper" / "kernels" / "src"
@@ -39,7 +39,7 @@ def declarations() -> dict[str, list[binding.Kernel]]:
         if module.name == "semantic_mapper.testing":  # a plugin of pytest, which wants to load it itself
             continue
         for value in vars(importlib.import_module(module.name)).values():
-            kernel = value._kernel if isinstance(value, threads.ParallelKernel) else value
+            kernel = value._kernel if isinstance(value, binding.ParallelKernel) else value
             if isinstance(kernel, binding.Kernel) and kernel.__module__ == module.name:
                 found.setdefault(kernel.name, []).append(kernel)
     return found

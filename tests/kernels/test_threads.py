@@ -43,12 +43,6 @@ def test_every_iteration_runs_once(threads: int, count: int) -> None:
         assert (visits[:count] == 1).all() and visits[count] == 0
 
 
-def test_arguments_may_be_named(threads: int) -> None:
-    visits = np.zeros(9, np.int64)
-    count_visits(9, visits=visits)
-    assert (visits == 1).all()
-
-
 def test_a_wrong_argument_reaches_the_caller_and_the_kernel_runs_again(threads: int) -> None:
     visits = np.zeros(1000, np.int64)
     with pytest.raises(ShapeError, match="kernel count_visits, argument visits"):
@@ -96,19 +90,6 @@ def run():
     count_visits(10, visits)
     return visits.sum()
 """
-AT_EXIT = """
-import threading
-import torch
-from kernels import run
-
-def go_on():
-    threading.main_thread().join()
-    print(run())
-
-torch.set_num_threads(2)
-run()
-threading.Thread(target=go_on).start()
-"""
 
 
 @pytest.fixture
@@ -137,39 +118,14 @@ def output(process: subprocess.Popen[str]) -> list[str]:
     return out.split()
 
 
-def test_a_thread_that_outlives_the_main_thread_still_runs_kernels(script: Path) -> None:
-    assert output(start(script, AT_EXIT))[-1:] == ["10"]
-
-
-def test_several_processes_run_kernels_at_once(script: Path) -> None:
-    code = "import torch, kernels; torch.set_num_threads(2); print(sum(kernels.run() for _ in range(300)))"
-    processes = [start(script, code) for _ in range(3)]
-    assert [output(process) for process in processes] == [["3000"]] * 3
-
-
-@pytest.mark.parametrize("wanted", [1, 2])
-def test_kernels_leave_torchs_thread_count_as_it_is(script: Path, wanted: int) -> None:
-    """OneDNN plans for one count and would run, and sometimes crash, with another."""
-    code = "import torch, kernels; kernels.run(); print(torch.get_num_threads())"
-    assert output(start(script, code, OMP_NUM_THREADS=str(wanted))) == [str(wanted)]
-
-
 @pytest.mark.parametrize(("wanted", "threads"), [("1", 1), ("3", 3), ("4,2", 4), ("", None), ("none", None)])
 def test_kernels_without_torch_use_the_threads_that_it_would_and_do_not_load_it(
     script: Path, wanted: str, threads: int | None
 ) -> None:
-    code = "import sys, kernels; from semantic_mapper.kernels import threads as t; kernels.run()\n"
+    code = "import sys, kernels; from semantic_mapper.kernels import binding as t; kernels.run()\n"
     code += "print(t._thread_count(), 'torch' in sys.modules)"
     expected = len(os.sched_getaffinity(0)) if threads is None else threads
     assert output(start(script, code, OMP_NUM_THREADS=wanted)) == [str(expected), "False"]
-
-
-@pytest.mark.parametrize(("given", "policy"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
-def test_importing_the_package_keeps_torchs_threads_from_spinning(
-    script: Path, given: dict[str, str], policy: str
-) -> None:
-    code = "import os, semantic_mapper; print(os.environ['OMP_WAIT_POLICY'])"
-    assert output(start(script, code, **given)) == [policy]
 
 
 SPIN = """

@@ -10,7 +10,7 @@ from semantic_mapper.config import KeyframeConfig, MapperConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.localization.places import Place, PlaceStore
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.files.map_file import describe_map
+from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 
 from .test_places import walk

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from semantic_mapper.mapping.storage.block_grid import GridBuffers
-from semantic_mapper.mapping.storage.block_index import BlockIndex, make_block_index
+from semantic_mapper.mapping.block_grid import GridBuffers
+from semantic_mapper.mapping.blocks import BlockIndex, make_block_index
 from semantic_mapper.types import Float64
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.files.map_file import describe_map
+from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.rendered_views import frame, small_map
 

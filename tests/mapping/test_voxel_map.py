@@ -13,8 +13,8 @@ from semantic_mapper.errors import ConfigError, FrameError, MapError, ShapeError
 from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.rays import cast_rays
+from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.queries.surface import cast_rays
 from semantic_mapper.types import CameraIntrinsics
 from tests.mapping.rendered_views import (
     INTRINSICS,

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.mapping.storage.block_index import pack_keys
-from semantic_mapper.mapping.storage.changes import UNOBSERVED, BlockChanges
+from semantic_mapper.mapping.blocks import pack_keys
+from semantic_mapper.mapping.changes import UNOBSERVED, BlockChanges
 from semantic_mapper.types import Float64
 
 LABELS = make_label_set("house", ("floor", "wall", "ceiling", "table", "door"))

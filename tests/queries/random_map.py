@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.mapping.storage.changes import UNOBSERVED, BlockChanges
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.mapping.changes import UNOBSERVED, BlockChanges
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from tests.queries.scene import LABELS
 
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from semantic_mapper.geometry import look_at
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.mapping.storage.block_index import pack_keys
-from semantic_mapper.mapping.storage.changes import UNOBSERVED, BlockChanges
+from semantic_mapper.mapping.blocks import pack_keys
+from semantic_mapper.mapping.changes import UNOBSERVED, BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Float32, Float64, UInt8
 from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, ray_directions, small_map, sphere_depth

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries import nearest, occupancy, rays, surface
+from semantic_mapper.queries import nearest, occupancy, surface
 from tests.queries.scene import whole
 
 NAN = float("nan")
@@ -70,7 +70,7 @@ def test_boxes_that_hold_too_much_or_nothing() -> None:
 def test_rays() -> None:
     def refused(match: str, *arguments: Any) -> None:
         with pytest.raises(MapError, match=match):
-            rays.cast_rays(whole(), *arguments)
+            surface.cast_rays(whole(), *arguments)
 
     refused("directions: .* above 0", (0, 0, 0), (0, 0, 0))
     refused("directions", (0, 0, 0), (0, NAN, 1))

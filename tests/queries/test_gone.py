@@ -9,13 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.mapping.storage import changes
-from semantic_mapper.mapping.storage.block_index import pack_keys
-from semantic_mapper.mapping.storage.changes import NONE_CLEARED, ClearedBlocks
-from semantic_mapper.queries import instances
+from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from tests.mapping.rendered_views import INTRINSICS, frame, small_map
 from tests.nodes.mapper.test_query_service import answering
@@ -89,32 +85,6 @@ def test_what_is_left_of_a_thing_that_went_is_another_one() -> None:
     assert rest.id > table.id and [thing.id for thing in stage.tracker.gone] == [table.id]
 
 
-def test_a_thing_that_goes_in_pieces_goes_as_a_whole() -> None:
-    stage = Stage()
-    stage.show(WHOLE, times=10)
-    (table,) = stage.look()
-    stage.show(np.r_[30:55, 85:115], times=4)
-    pieces = stage.look()
-    assert len(pieces) == 2 and max(len(thing.voxels) for thing in pieces) < 0.5 * len(table.voxels)
-    assert table.id in [thing.id for thing in pieces] and stage.tracker.gone == ()
-    stage.show(np.r_[30:34], times=3)
-    stage.look()
-    gone = {thing.id: thing for thing in stage.tracker.gone}
-    np.testing.assert_array_equal(gone[table.id].voxels, table.voxels)
-    stage.show(None, times=4)
-    assert stage.look() == ()
-
-
-def test_a_thing_that_moves_stays_the_same() -> None:
-    stage = Stage()
-    stage.show(slice(20, 60), times=5)
-    (table,) = stage.look()
-    for start in range(30, 90, 10):
-        stage.show(slice(start, start + 40), times=4)
-        assert [thing.id for thing in stage.look()] == [table.id]
-    assert stage.tracker.gone == ()
-
-
 @pytest.mark.parametrize("reason", ["another class", "nothing is cleared", "another map"])
 def test_what_is_only_not_found_has_not_gone(reason: str) -> None:
     stage = Stage(clear_free_space=reason != "nothing is cleared")
@@ -131,18 +101,6 @@ def test_what_is_only_not_found_has_not_gone(reason: str) -> None:
     things = stage.look()
     assert all(thing.class_id == CUP or thing.id == table.id for thing in things)
     assert len(things) == (reason != "another map") and stage.tracker.gone == ()
-
-
-def test_only_the_latest_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(instances, "MAX_GONE", 2)
-    stage = Stage()
-    ids = []
-    for _ in range(3):
-        stage.show(WHOLE, times=2)
-        ids += [thing.id for thing in stage.look()]
-        stage.show(None, times=4)
-        assert stage.look() == ()
-    assert len(set(ids)) == 3 and [thing.id for thing in stage.tracker.gone] == ids[1:]
 
 
 def test_changes_say_which_blocks_lost_surface_and_when() -> None:
@@ -164,16 +122,6 @@ def test_changes_say_which_blocks_lost_surface_and_when() -> None:
     for mine, theirs in zip(follower.snapshot().cleared, rows, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert len(follower.apply(dataclasses.replace(changes, since=0)).cleared.packed) == len(rows.packed)  # not twice
-
-
-def test_rows_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(changes, "MAX_ROWS", 5)
-    seen = NONE_CLEARED
-    for version in range(1, 9):
-        columns = np.array([0, 2]), np.array([1, version]), np.full(2, version), np.full(2, 1000 + version)
-        seen = seen.followed_by(ClearedBlocks(*columns))
-    assert seen.version.tolist() == [6, 7, 7, 8, 8]
-    assert seen.between(7, 8).voxels.tolist() == [1, 8] and len(seen.between(8, 8).packed) == 0
 
 
 def test_a_client_is_told_and_its_mirror_keeps_no_ghost(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries.graph import GraphTracker, SceneGraph, find_floors
-from semantic_mapper.queries.graph_picture import draw_graph
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.graph import GraphTracker, SceneGraph, draw_graph, find_floors
 from semantic_mapper.queries.rooms import find_walls, part_rooms
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Bool, Float64
 from tests.queries.house import AIR, LABELS, STOREY_M, TRUNCATION, UPRIGHT, VOXEL_M, Box, house_changes, two_rooms
 
@@ -110,17 +109,6 @@ def test_rooms_part_at_doors(gap: int, rooms: int) -> None:
     found = part_rooms(seen, wall, CELL_M)
     assert found.rooms == rooms and (found.room[~wall] >= 0).all() and (found.room[wall] == -1).all()
     assert [p.width_m for p in found.passages] == pytest.approx([gap * CELL_M] * (rooms - 1), abs=0.11)
-
-
-def test_two_doors_between_two_rooms_are_two() -> None:
-    seen, wall = plan([(0, 10, 60, 63), (24, 42, 60, 63), (56, 64, 60, 63)])
-    found = part_rooms(seen, wall, CELL_M)
-    assert found.rooms == 2 and sorted(p.cell[0] for p in found.passages) == pytest.approx([16.5, 48.5], abs=1.5)
-
-
-def test_a_corridor_no_wider_than_a_door_is_one_room() -> None:
-    seen, wall = plan([], (24, 204))  # 1 m wide
-    assert part_rooms(seen, wall, CELL_M).rooms == 1
 
 
 def test_what_is_hidden_behind_furniture_belongs_to_the_room() -> None:

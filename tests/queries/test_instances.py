@@ -2,42 +2,33 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.spatial import KDTree
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries import surface as class_surface_module
 from semantic_mapper.queries.instances import (
     Instance,
     InstanceTracker,
-    _Found,
-    _LabelledVoxels,
     find_components,
-    find_overlaps,
+    thing_voxels,
     upright_box,
 )
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.surface import class_surface, surface_voxels
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import UInt8
 from tests.mapping.rendered_views import small_map
-from tests.queries.random_map import random_changes, random_map, voxel_places
+from tests.queries.random_map import random_map, voxel_places
 from tests.queries.scene import (
     BALL,
     BOX,
     CUP,
-    FLOOR,
     HALF,
     LABELS,
     LAMP,
     TABLE,
-    YAW,
     box_axes,
     integrate,
     painted,
@@ -58,40 +49,6 @@ class Painting:
         version = self.mirror.version
         snapshot = self.mirror.apply(painted(plan, version, version + 1))
         return {tuple(thing.voxels[0][:2].tolist()): thing for thing in self.tracker.update(snapshot)}
-
-
-def test_of_equally_sure_things_the_larger_rank_higher_up_to_a_size() -> None:
-    plan = np.zeros((40, 40), np.uint8)
-    plan[2:5, 2:5], plan[8:20, 2:20], plan[22:40, 2:40] = TABLE, TABLE, TABLE
-    small, large, largest = sorted(Painting().paint(plan).values(), key=lambda thing: len(thing.voxels))
-    assert small.confidence == large.confidence == largest.confidence > 0
-    assert small.rank < large.rank == largest.rank == large.confidence
-
-
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), fraction=st.floats(0.1, 0.9), least=st.integers(1, 9))
-def test_components_are_those_of_scipy(seed: int, fraction: float, least: int) -> None:
-    rng = np.random.default_rng(seed)
-    plan = np.where(rng.random((32, 24)) < fraction, rng.choice([TABLE, CUP, FLOOR], (32, 24)), 0).astype(np.uint8)
-    mirror = MapMirror(0.02, 4.0, LABELS)
-    surface = class_surface(mirror.apply(painted(plan, 0, 1)), np.isin(np.arange(256), (TABLE, CUP)))
-    found = find_components(surface, least)
-    x, y = np.divmod(np.repeat(np.arange(12), np.diff(surface.start)), 3)
-    mine = np.full(plan.shape, -1)
-    mine[x * 8 + (surface.voxel & 7), y * 8 + ((surface.voxel >> 3) & 7)] = found.component
-    parts = np.split(found.order, found.ends)
-    assert len(parts.pop()) == 0
-    for number, part in enumerate(parts):
-        np.testing.assert_array_equal(part, np.flatnonzero(found.component == number))
-    pairs = set()
-    for class_id in (TABLE, CUP):
-        theirs, count = ndimage.label(plan == class_id, np.ones((3, 3)))
-        sizes = np.bincount(theirs.ravel(), minlength=count + 1)
-        large = (theirs > 0) & (sizes[theirs] >= least)
-        assert (large == ((mine >= 0) & (plan == class_id))).all()
-        pairs |= {(class_id, a, b) for a, b in zip(theirs[large], mine[large], strict=True)}
-    assert len(pairs) == len({p[:2] for p in pairs}) == len({p[2] for p in pairs})
-    assert sorted(p[2] for p in pairs) == list(range(len(pairs)))
 
 
 def test_table_and_cup_are_found_where_they_stand() -> None:
@@ -152,78 +109,6 @@ def test_a_merge_keeps_the_older_id_and_a_split_the_larger_parts() -> None:
     assert painting.paint(plan)[2, 2].id == 5
 
 
-def test_neighbours_that_trade_a_few_voxels_keep_their_ids() -> None:
-    painting, plan = Painting(), np.zeros((16, 16), np.uint8)
-    plan[:8], plan[8:] = TABLE, CUP
-    before = {thing.class_name: thing.id for thing in painting.paint(plan).values()}
-    for edge in (6, 9, 7, 8):
-        plan[:edge], plan[edge:] = TABLE, CUP
-        assert {thing.class_name: thing.id for thing in painting.paint(plan).values()} == before
-    plan[:] = CUP
-    assert [thing.id for thing in painting.paint(plan).values()] == [min(before.values())]
-
-
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), fraction=st.floats(0.3, 0.95))
-def test_what_did_not_change_is_not_computed_again_and_nothing_is_missed(seed: int, fraction: float) -> None:
-    """Maps grow in pieces, blocks change shape and class and go; all is as if it were computed again each time."""
-    rng = np.random.default_rng(seed)
-    mirror, tracker, again = MapMirror(0.02, 4.0, LABELS), InstanceTracker(min_voxels=3), InstanceTracker(min_voxels=3)
-    for version in range(6):
-        plan = np.where(rng.random((48, 24)) < fraction, rng.choice([TABLE, CUP, FLOOR]), 0).astype(np.uint8)
-        whole_plan = painted(plan, version, version + 1)
-        chosen = np.sort(rng.choice(18, rng.integers(0, 9), replace=False))
-        tsdf = whole_plan.tsdf[chosen]
-        tsdf[rng.random(tsdf.shape) < 0.05] = rng.integers(-128, 128)
-        changes = dataclasses.replace(
-            whole_plan,
-            epoch=int(version > 4),
-            tsdf=tsdf,
-            **{name: getattr(whole_plan, name)[chosen] for name in ("keys", "label", "confidence", "rgb")},
-        )
-        snapshot = mirror.apply(changes)
-        again._last = again._last and with_nothing_kept(again._last)
-        things, others = tracker.update(snapshot), again.update(snapshot)
-        assert_same_things(things, others)
-        assert_same_things(InstanceTracker(min_voxels=3).update(snapshot), sorted(others, key=first_voxel), ids=False)
-
-
-def test_a_thing_far_from_all_changes_is_the_same_object() -> None:
-    plan = np.zeros((64, 16), np.uint8)
-    plan[2:12, 2:12] = plan[50:60, 2:12] = TABLE
-    painting = Painting()
-    before = painting.paint(plan)
-    plan[2:4, 2:12] = 0
-    version, changed = painting.mirror.version, painted(plan, painting.mirror.version, painting.mirror.version + 1)
-    near = changed.keys[:, 0] < 2
-    arrays = {name: getattr(changed, name)[near] for name in ("keys", "tsdf", "label", "confidence", "rgb")}
-    painting.mirror.apply(dataclasses.replace(changed, **arrays))
-    one, two = painting.tracker.update(painting.mirror.snapshot())
-    assert painting.mirror.version == version + 1 and (len(one.voxels), len(two.voxels)) == (80, 100)
-    assert one.id == before[2, 2].id and two is before[50, 2]
-
-
-def assert_same_things(things: Sequence[Instance], others: Sequence[Instance], *, ids: bool = True) -> None:
-    assert len(things) == len(others)
-    for mine, other in zip(things, others, strict=True):
-        assert mine.id == other.id or not ids
-        assert (mine.class_id, mine.class_name, mine.confidence) == (other.class_id, other.class_name, other.confidence)
-        np.testing.assert_array_equal(mine.voxels, other.voxels)
-        np.testing.assert_array_equal(mine.centroid, other.centroid)
-        for name in ("center", "size", "R_world_box"):
-            np.testing.assert_array_equal(getattr(mine.box, name), getattr(other.box, name))
-
-
-def first_voxel(thing: Instance) -> tuple[list[int], list[int]]:
-    """Where it comes in the order of blocks and voxels."""
-    return (thing.voxels[0] >> 3).tolist(), (thing.voxels[0] & 7)[::-1].tolist()
-
-
-def with_nothing_kept(found: _Found) -> _Found:
-    """The last update as if every block had changed since."""
-    return found._replace(surface=found.surface._replace(serials=np.full_like(found.surface.serials, -1)))
-
-
 @settings(max_examples=50, deadline=None)
 @given(yaw=st.floats(-7, 7), seed=st.integers(0, 10**6))
 def test_the_box_of_a_turned_box_is_that_box(yaw: float, seed: int) -> None:
@@ -244,14 +129,6 @@ def test_the_box_of_a_turned_box_is_that_box(yaw: float, seed: int) -> None:
     assert np.linalg.det(box.R_world_box) == pytest.approx(1) and box.R_world_box[:, 2] == pytest.approx(up)
 
 
-def test_boxes_of_hardly_any_points() -> None:
-    up = np.array([0.0, 0.0, 1.0])
-    point = upright_box(np.array([[1.0, 2.0, 3.0]]), up)
-    np.testing.assert_allclose((point.center, point.size), ((1, 2, 3), (0, 0, 0)), atol=1e-7)
-    line = np.array([np.cos(YAW), np.sin(YAW), 0.0]) * np.linspace(0, 2, 9)[:, None]
-    np.testing.assert_allclose(upright_box(line, up).size, (2, 0, 0), atol=1e-5)
-
-
 def test_settings_that_mean_nothing_are_refused() -> None:
     with pytest.raises(MapError, match="min_voxels must be at least 1"):
         InstanceTracker(min_voxels=0)
@@ -263,47 +140,13 @@ def test_settings_that_mean_nothing_are_refused() -> None:
 WANTED = np.isin(np.arange(256), (TABLE, CUP))
 
 
-def block_rows(start: np.ndarray) -> np.ndarray:
-    """Row of the block of each voxel."""
-    return np.repeat(np.arange(len(start) - 1), np.diff(start))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_surface_of_some_classes_is_that_of_the_map_with_little_memory_too(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(class_surface_module, "_ROOM", 256)
-    snapshot = random_map(seed)
-    surface, every = class_surface(snapshot, WANTED), surface_voxels(snapshot)
-    slot = snapshot.slots[every.row]
-    mine = WANTED[snapshot.voxels.label[slot, every.voxel]]
-    assert len(surface.voxel) > 700  # the memory grew twice
-    np.testing.assert_array_equal(block_rows(surface.start), every.row[mine])
-    np.testing.assert_array_equal(surface.voxel, every.voxel[mine])
-    np.testing.assert_array_equal(surface.point, every.point[mine])
-    np.testing.assert_array_equal(surface.label, snapshot.voxels.label[slot, every.voxel][mine])
-    np.testing.assert_array_equal(surface.confidence, snapshot.voxels.confidence[slot, every.voxel][mine])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_surface_that_is_kept_from_state_to_state_is_that_of_the_last_state(seed: int) -> None:
-    mirror = MapMirror(0.02, 4.0, LABELS)
-    kept = None
-    for version in range(5):
-        snapshot = mirror.apply(random_changes(10 * seed + version, version, blocks=5))
-        kept, new = class_surface(snapshot, WANTED, kept), class_surface(snapshot, WANTED)
-        for name in set(kept._fields) - {"fresh"}:
-            np.testing.assert_array_equal(getattr(kept, name), getattr(new, name), err_msg=name)
-        assert new.fresh.all()
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("least", [1, 4])
 def test_components_of_random_blocks_are_those_of_a_graph_of_all_pairs(seed: int, least: int) -> None:
     snapshot = random_map(seed)
-    surface = class_surface(snapshot, WANTED)
+    surface = thing_voxels(snapshot, WANTED)
     found = find_components(surface, least)
-    places = voxel_places(snapshot, block_rows(surface.start), surface.voxel)
+    places = voxel_places(snapshot, surface.row, surface.voxel)
     pairs = KDTree(places).query_pairs(1, np.inf, output_type="ndarray")
     a, b = pairs[surface.label[pairs[:, 0]] == surface.label[pairs[:, 1]]].T
     count = len(places)
@@ -317,38 +160,3 @@ def test_components_of_random_blocks_are_those_of_a_graph_of_all_pairs(seed: int
         np.testing.assert_array_equal(part, expected_part)
         assert (found.component[part] == number).all()
     assert (found.component >= 0).sum() == sum(map(len, large))
-
-
-def test_no_surface_has_no_components() -> None:
-    snapshot = MapMirror(0.02, 4.0, LABELS).snapshot()
-    found = find_components(class_surface(snapshot, WANTED), 1)
-    assert [len(values) for values in found] == [0, 0, 0]
-
-
-def random_voxels(rng: np.random.Generator) -> _LabelledVoxels:
-    packed = np.sort(rng.choice(10, 7, replace=False))
-    parts = [np.sort(rng.choice(30, rng.choice([0, 10, 25]), replace=False)).astype(np.int32) for _ in packed]
-    start = np.cumsum([0, *map(len, parts)])
-    return _LabelledVoxels(packed, start, np.concatenate(parts), rng.integers(-1, 5, start[-1]))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_overlaps_are_the_voxels_that_both_states_have(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    old, new = random_voxels(rng), random_voxels(rng)
-    pairs = np.empty(len(new.voxel), np.int64)
-    count = find_overlaps(old, new, 5, pairs)
-    components = {
-        (key, voxel): component
-        for key, voxel, component in zip(
-            old.packed[block_rows(old.start)].tolist(), old.voxel.tolist(), old.component.tolist(), strict=True
-        )
-    }
-    expected = []
-    for key, voxel, now in zip(new.packed[block_rows(new.start)], new.voxel, new.component, strict=True):
-        before = components.get((int(key), int(voxel)), -1)
-        if before >= 0 and now >= 0:
-            expected.append(before * 5 + now)
-    assert pairs[:count].tolist() == expected and count > 0
-    none = _LabelledVoxels(pairs[:0], np.zeros(1, np.int64), np.empty(0, np.int32), pairs[:0])
-    assert find_overlaps(none, new, 5, pairs) == find_overlaps(new, none, 5, pairs) == 0

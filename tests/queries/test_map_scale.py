@@ -9,12 +9,10 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
-from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import points_in_box
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.surface import cast_rays, points_in_box
 from tests.mapping.rendered_views import small_map
 from tests.queries.scene import LABELS, integrate, poses, whole
 

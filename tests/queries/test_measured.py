@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from functools import cache
 
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import at, nearest
-from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.queries.surface import points_in_box
+from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.queries.surface import cast_rays, points_in_box
 from tests.mapping.rendered_views import frame, small_map
 from tests.queries.scene import BALL, BOX, CUP, HALF, LABELS, TABLE, poses, seen, whole
 
@@ -70,16 +67,3 @@ def test_things_have_the_fraction_that_was_measured(snapshot) -> None:
     fraction = {thing.class_name: thing.measured for thing in InstanceTracker().update(snapshot)}
     assert fraction["cup"] > 0.9 and fraction["table"] < 0.1
     assert all(thing.measured == 1 for thing in InstanceTracker().update(whole()))
-
-
-def test_a_mapper_that_does_not_say_it_counts_as_measured() -> None:
-    changes = dataclasses.replace(part_measured().changes(0), computed=None)
-    points = points_in_box(MapMirror(0.02, 4.0, LABELS).apply(changes), LOW, HIGH)
-    assert points.measured is not None and points.measured.all()
-
-
-def test_a_damaged_mask_is_refused() -> None:
-    changes = part_measured().changes(0)
-    bad = dataclasses.replace(changes, computed=np.zeros((len(changes.keys), 4), np.uint8))
-    with pytest.raises(MapError, match="computed must be uint8"):
-        MapMirror(0.02, 4.0, LABELS).apply(bad)

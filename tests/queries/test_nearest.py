@@ -49,17 +49,6 @@ def test_known_places_of_the_scene() -> None:
     assert occupancy(whole(), deep).tolist() == [State.UNKNOWN] * 2, "nobody has looked there"
 
 
-def test_occupancy_of_all_observed_voxels_follows_their_distance() -> None:
-    snapshot = whole()
-    within = np.stack((np.arange(512) & 7, (np.arange(512) >> 3) & 7, np.arange(512) >> 6), axis=1)
-    centers = ((snapshot.keys[:, None] * 8 + within) * 0.02).reshape(-1, 3)
-    seen = snapshot.voxels.weight[snapshot.slots].ravel() > 0
-    inside = snapshot.voxels.tsdf[snapshot.slots].ravel() * 4.0 / 127 <= 0.5
-    expected = np.where(seen, np.where(inside, State.OCCUPIED, State.FREE), State.UNKNOWN)
-    jitter = np.random.default_rng(0).uniform(-0.0099, 0.0099, centers.shape)
-    np.testing.assert_array_equal(occupancy(snapshot, centers + jitter), expected)
-
-
 @settings(max_examples=60, deadline=None)
 @given(point=POINT, name=st.sampled_from(["floor", "table", "cup"]), quantile=st.sampled_from([None, 0.5, 0.9]))
 def test_nearest_is_the_nearest_of_all(point: tuple[float, float, float], name: str, quantile: float | None) -> None:

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from semantic_mapper.queries.occupancy import State, distance_field, occupancy
 from tests.queries.random_map import random_map
-from tests.queries.scene import BALL, RADIUS, whole
+from tests.queries.scene import whole
 from tests.queries.test_surface import dense
 
 LOWER, UPPER = (-0.05, -0.35, -0.1), (1.23, 0.41, 0.57)
@@ -30,21 +30,6 @@ def test_distance_is_to_the_nearest_obstacle(unknown_is_occupied: bool) -> None:
     np.testing.assert_allclose(field.distance_m.ravel(), expected, atol=1e-6)
 
 
-def test_distance_from_the_ball_is_what_geometry_says() -> None:
-    field = distance_field(whole(), BALL - np.array([0.25, 0.2, 0.0]), BALL + np.array([0.25, 0.2, 0.4]))
-    centers = field.origin_m + np.indices(field.state.shape).reshape(3, -1).T * 0.02
-    truth = np.linalg.norm(centers - BALL, axis=1) - RADIUS
-    outside = (truth > 0.02) & (centers[:, 2] > BALL[2] + 0.1)  # nearer to the ball than to the floor
-    assert outside.sum() > 1000
-    assert np.abs(field.distance_m.ravel()[outside] - truth[outside]).max() < 0.03  # a voxel is occupied or not
-
-
-def test_a_box_without_obstacles_is_infinitely_free() -> None:
-    field = distance_field(whole(), (5, 5, 5), (5.1, 5.1, 5.1))
-    assert np.isinf(field.distance_m).all() and not field.state.any()
-    assert not distance_field(whole(), (5, 5, 5), (5.1, 5.1, 5.1), unknown_is_occupied=True).distance_m.any()
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_states_of_random_blocks_are_those_of_their_voxels(seed: int) -> None:
     snapshot = random_map(seed)
@@ -54,10 +39,6 @@ def test_states_of_random_blocks_are_those_of_their_voxels(seed: int) -> None:
     np.testing.assert_array_equal(distance_field(snapshot, first * 0.02, last * 0.02).state, expected)
     centers = (first + np.indices(tsdf.shape).reshape(3, -1).T) * 0.02
     np.testing.assert_array_equal(occupancy(snapshot, centers), expected.ravel())
-
-
-def test_no_points_have_no_state() -> None:
-    assert occupancy(random_map(0), np.zeros((0, 3))).shape == (0,)
 
 
 def test_what_moves_is_an_obstacle_for_now() -> None:

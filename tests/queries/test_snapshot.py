@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror
 from tests.mapping.rendered_views import small_map
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses
 from tests.queries.test_mirror import assert_same, empty_mirror
@@ -19,22 +19,6 @@ def follow(mirror: MapMirror, source: MapMirror, limit: int) -> int:
         mirror.apply(source.snapshot().changes(mirror.version, limit))
         parts += 1
     return parts
-
-
-def test_it_passes_a_growing_map_on_to_those_who_come_early_and_late() -> None:
-    voxel_map, source, early, late = small_map(LABELS), empty_mirror(), empty_mirror(), empty_mirror()
-    for seq, pose in enumerate(poses(8)):
-        integrate(voxel_map, pose, seq)
-        source.apply(voxel_map.changes(source.snapshot().version, limit=150))
-        if seq % 3 == 0:
-            follow(early, source, 100)
-    while source.snapshot().version < voxel_map.version:
-        source.apply(voxel_map.changes(source.snapshot().version, limit=150))
-    follow(early, source, 0)
-    assert follow(late, source, 100) > 1
-    whole = MapMirror.of(voxel_map).snapshot()
-    assert_same(early.snapshot(), whole)
-    assert_same(late.snapshot(), whole)
 
 
 def test_after_a_new_epoch_nothing_of_the_old_one_is_left() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -44,25 +42,6 @@ def brute_force(snapshot: MapSnapshot) -> tuple[np.ndarray, np.ndarray]:
     return voxels, sums / counts[:, None]
 
 
-def test_every_surface_voxel_is_found_with_its_point() -> None:
-    snapshot = whole()
-    surface, (voxels, points) = surface_voxels(snapshot), brute_force(snapshot)
-    within = np.stack((surface.voxel & 7, (surface.voxel >> 3) & 7, surface.voxel >> 6), axis=1)
-    mine = snapshot.keys[surface.row] * 8 + within
-    order = np.lexsort(mine.T[::-1])
-    assert len(voxels) > 4000
-    np.testing.assert_array_equal(mine[order], voxels)
-    np.testing.assert_allclose(surface.point[order], points, atol=1e-10)
-
-
-def test_surface_points_of_some_blocks_are_those_of_all() -> None:
-    snapshot = whole()
-    surface, rows = surface_voxels(snapshot), np.arange(3, snapshot.block_count, 5)
-    part, there = surface_voxels(snapshot, rows), np.isin(surface.row, rows)
-    for a, b in zip(part, surface, strict=True):
-        np.testing.assert_array_equal(a, b[there])
-
-
 def test_points_lie_on_the_shape_of_their_class() -> None:
     xyz, label, confidence = surface_of(whole())
     distance = np.abs(truth_distance(xyz))
@@ -73,11 +52,6 @@ def test_points_lie_on_the_shape_of_their_class() -> None:
         clear = mine & (others > 0.08) & (distance.min(axis=1) < 0.01)
         assert clear.sum() > 300
         assert (distance[clear, column] < 0.01).mean() > 0.99 and (confidence[clear] > 100).mean() > 0.95
-
-
-def test_nothing_has_no_surface() -> None:
-    surface = surface_voxels(whole(), np.empty(0, np.int64))
-    assert [len(part) for part in surface] == list(itertools.repeat(0, 3))
 
 
 @pytest.mark.parametrize("seed", range(3))

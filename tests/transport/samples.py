@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import msgpack
 import numpy as np
 
+from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import NYU40
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.images import CodecOptions, depth_from_uint16
@@ -27,7 +28,15 @@ INTRINSICS = CameraIntrinsics(20.5, 21.0, 11.5, 8.5, 24, 18)
 CAMERA = "front"
 
 
-def make_frame(seq: int = 3, *, depth: bool = True, label: bool = True, camera_id: str = CAMERA) -> PosedFrame:
+def make_frame(
+    seq: int = 3,
+    *,
+    depth: bool = True,
+    label: bool = True,
+    camera_id: str = CAMERA,
+    size: tuple[int, int] = (INTRINSICS.width, INTRINSICS.height),
+) -> PosedFrame:
+    shape = size[::-1]
     rng = np.random.default_rng(seq)
     T_world_camera = np.eye(4)
     T_world_camera[:3, 3] = rng.normal(size=3)
@@ -35,10 +44,10 @@ def make_frame(seq: int = 3, *, depth: bool = True, label: bool = True, camera_i
         stamp_ns=10**18 + seq,
         seq=seq,
         camera_id=camera_id,
-        rgb=rng.integers(0, 256, (18, 24, 3), np.uint8),
-        depth_m=depth_from_uint16(rng.integers(0, 5000, (18, 24)).astype(np.uint16), 1000) if depth else None,
-        label=rng.integers(0, 41, (18, 24)).astype(np.uint8) if label else None,
-        intrinsics=INTRINSICS,
+        rgb=rng.integers(0, 256, (*shape, 3), np.uint8),
+        depth_m=depth_from_uint16(rng.integers(0, 5000, shape).astype(np.uint16), 1000) if depth else None,
+        label=rng.integers(0, 41, shape).astype(np.uint8) if label else None,
+        intrinsics=scale_intrinsics(INTRINSICS, *size),
         T_world_camera=T_world_camera,
         pose_source="odometry",
         pose_sigma=0.01,

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import structlog
-import zmq
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.codec import encode
@@ -160,12 +159,3 @@ def test_bad_keys_and_names_are_refused(tmp_path: Path, robot: Keys) -> None:
     (robot.folder / "peers" / "broken.key").write_text("nothing in here", encoding="utf-8")
     with pytest.raises(TransportError, match=r"broken\.key"):
         robot.peers()
-
-
-def test_the_authenticator_is_shared_by_all_servers_of_a_context(robot: Keys, desk: Keys) -> None:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    before = set(threading.enumerate())
-    servers = [QueryServer("tcp://127.0.0.1:*", keys=robot, context=context) for _ in range(3)]
-    assert len(set(threading.enumerate()) - before) == 1
-    for one in servers:
-        one.close()

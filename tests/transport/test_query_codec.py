@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError, WeightsError
+from semantic_mapper.errors import CodecError
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.nearest import PointAnswers
-from semantic_mapper.queries.questions import AtRequest, InstanceArrays, decode_question
-from semantic_mapper.transport.query_messages import (
+from semantic_mapper.queries.questions import (
+    AtRequest,
+    InstanceArrays,
     MapState,
     decode_answer,
+    decode_question,
     encode_answer,
-    encode_error,
     encode_request,
 )
 from semantic_mapper.types import UInt8
@@ -38,42 +38,6 @@ def with_points(**changes: object) -> list[bytes]:
     """A question whose array is said to be otherwise."""
     spec = msgpack.unpackb(at_request()[1])["points"]
     return with_header(at_request(), points={**spec, **changes})
-
-
-def test_a_question_arrives_as_it_was_sent() -> None:
-    for points in (POINTS[::2], np.empty((0, 3))):
-        request = decode_question(at_request(points))
-        assert isinstance(request, AtRequest) and request.radius_m == 0.1
-        np.testing.assert_array_equal(request.points, points)
-        request.points[:] = 0  # its own memory
-
-
-def test_an_answer_arrives_as_it_was_given(rng: np.random.Generator) -> None:
-    changes = BlockChanges(
-        since=3,
-        version=7,
-        newest=9,
-        epoch=1,
-        keys=rng.integers(-9, 9, (4, 3), np.int32),
-        tsdf=rng.integers(-128, 127, (4, 512), np.int8),
-        label=rng.integers(0, 255, (4, 512), np.uint8),
-        confidence=np.zeros((4, 512), np.uint8),
-        rgb=rng.integers(0, 255, (4, 512, 3), np.uint8),
-    )
-    state, answer = decode_answer("changes", BlockChanges, encode_answer("changes", STATE, changes))
-    assert state == STATE and (answer.since, answer.version, answer.newest, answer.computed) == (3, 7, 9, None)
-    for name in ("keys", "tsdf", "label", "confidence", "rgb"):
-        np.testing.assert_array_equal(getattr(answer, name), getattr(changes, name))
-        assert getattr(answer, name).dtype == getattr(changes, name).dtype
-    assert all(len(column) == 0 for column in answer.cleared)
-
-
-@pytest.mark.parametrize("error", [MapError("the box is empty"), LabelError("no class"), CodecError("é" * 9000)])
-def test_an_error_is_raised_on_the_other_side(error: Exception) -> None:
-    with pytest.raises(type(error), match=str(error)[:100]):
-        decode_answer("at", PointAnswers, encode_error(error))  # type: ignore[arg-type]
-    with pytest.raises(TransportError, match="no weights"):  # one that no query raises
-        decode_answer("at", PointAnswers, encode_error(WeightsError("no weights")))
 
 
 @pytest.mark.parametrize(

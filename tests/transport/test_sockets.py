@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import random
 import subprocess
 import sys
@@ -16,10 +15,9 @@ import zmq
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import (
-    MAX_KEYFRAME_BYTES,
     EndOfStream,
-    LabelledKeyframe,
     Status,
     StreamInfo,
 )
@@ -29,7 +27,6 @@ from semantic_mapper.transport.sockets import (
     LosslessSubscriber,
     NewestSubscriber,
     Publisher,
-    receive_bounded,
 )
 from semantic_mapper.types import PosedFrame
 
@@ -91,10 +88,10 @@ def test_nothing_is_lost_between_a_blocking_publisher_and_a_slow_lossless_subscr
 
 
 def test_a_blocking_publisher_names_a_subscriber_that_hangs(endpoint: str) -> None:
-    big = [*encode(EndOfStream("front", "end", 0)), bytes(2**20)]  # fills the kernel's buffers soon
+    big = encode_frame(samples.make_frame(size=(960, 720)), CodecOptions(rgb="raw"))  # fills the kernel's buffers soon
     with (
         Publisher(endpoint, policy="block", hwm=1, linger_ms=0) as publisher,
-        LosslessSubscriber(endpoint, ["end"], hwm=1) as subscriber,
+        LosslessSubscriber(endpoint, ["frame"], hwm=1) as subscriber,
     ):
         subscriber.wait_until_heard(WAIT_S)
 
@@ -192,37 +189,6 @@ def test_a_publisher_that_comes_back_is_heard_again(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [NewestSubscriber, LosslessSubscriber])
-def test_thousands_of_bad_messages_do_not_harm_a_living_subscriber(endpoint: str, kind) -> None:
-    rng = random.Random(1)
-    good = [parts for name, parts in samples.all_messages().items() if name in ("frame", "map")]
-    other = zmq.Context.instance().socket(zmq.XPUB)
-    other.setsockopt(zmq.SNDHWM, 0)
-    other.bind(endpoint)
-    with other, kind(endpoint, ["frame", "map", "end"]) as subscriber:
-        for _ in range(4):  # three topics and the handshake, which an unknown client does not answer
-            assert other.poll(WAIT_S * 1e3)
-            other.recv()
-        sent = 0
-        while sent < 3_000:
-            if rng.random() < 0.2:
-                parts = [b"frame/front/", *(rng.randbytes(rng.randrange(200)) for _ in range(rng.randrange(6)))]
-            else:
-                parts = samples.mutate(rng.choice(good), rng)
-            if not parts or not parts[0].startswith((b"frame/", b"map/")):
-                continue  # zmq itself filters what was not subscribed to
-            other.send_multipart(parts)
-            sent += 1
-        other.send_multipart(encode_frame(samples.make_frame(4242)))
-        other.send_multipart(encode(EndOfStream("player", "end", sent)))
-        last_frame = None
-        while not isinstance(message := subscriber.receive(WAIT_S), EndOfStream):
-            assert message is not None, "the good messages did not arrive"
-            last_frame = message if isinstance(message, PosedFrame) else last_frame
-        assert last_frame is not None and last_frame.seq == 4242
-        assert subscriber.rejected > 1_500 and subscriber.last_error is not None
-
-
-@pytest.mark.parametrize("kind", [NewestSubscriber, LosslessSubscriber])
 def test_after_a_part_of_absurd_size_the_publisher_is_heard_again(endpoint: str, kind) -> None:
     with zmq.Context.instance().socket(zmq.XPUB) as other, kind(endpoint, ["frame"]) as subscriber:
         other.setsockopt(zmq.LINGER, 0)
@@ -286,28 +252,6 @@ def test_a_subscription_to_an_unknown_topic_or_address_is_refused(endpoint: str)
             NewestSubscriber(address, topics)
 
 
-def test_many_threads_may_publish_at_once(endpoint: str) -> None:
-    with Publisher(endpoint, policy="block") as publisher, LosslessSubscriber(endpoint, ["frame"]) as subscriber:
-        subscriber.wait_until_heard(WAIT_S)
-
-        def send(camera_id: str) -> None:
-            for seq in range(25):
-                publisher.publish(encode_frame(samples.make_frame(seq, camera_id=camera_id)))
-
-        threads = [threading.Thread(target=send, args=(f"camera{i}",)) for i in range(4)]
-        for thread in threads:
-            thread.start()
-        seen: dict[str, list[int]] = {}
-        for _ in range(100):
-            frame = subscriber.receive(WAIT_S)
-            assert isinstance(frame, PosedFrame)
-            seen.setdefault(frame.camera_id, []).append(frame.seq)
-        for thread in threads:
-            thread.join()
-    assert seen == {f"camera{i}": list(range(25)) for i in range(4)}
-    assert subscriber.rejected == 0
-
-
 def test_closed_sockets_say_so(endpoint: str) -> None:
     publisher = Publisher(endpoint)
     lossless, newest = LosslessSubscriber(endpoint, ["end"]), NewestSubscriber(endpoint, ["end"])
@@ -339,10 +283,8 @@ def test_closing_wakes_a_receiver_that_waits(endpoint: str) -> None:
 FLOOD = 200
 
 
-@pytest.mark.parametrize(
-    ("kind", "place"), [(LosslessSubscriber, "header"), (LosslessSubscriber, "pixels"), (NewestSubscriber, "pixels")]
-)
-def test_a_reader_without_time_takes_no_more_of_a_flood_than_one(endpoint: str, kind, place: str) -> None:
+@pytest.mark.parametrize("kind", [NewestSubscriber, LosslessSubscriber])
+def test_a_reader_without_time_takes_no_more_of_a_flood_than_one(endpoint: str, kind) -> None:
     with zmq.Context.instance().socket(zmq.XPUB) as other, kind(endpoint, ["frame"]) as subscriber:
         other.setsockopt(zmq.LINGER, 0)
         other.setsockopt(zmq.SNDHWM, 0)
@@ -352,46 +294,12 @@ def test_a_reader_without_time_takes_no_more_of_a_flood_than_one(endpoint: str, 
             other.recv()
         for number in range(FLOOD):
             topic, header, *buffers = encode_frame(samples.make_frame(1, camera_id=f"camera{number}"))
-            if place == "header":
-                header = b"\x80"
             other.send_multipart([topic, header, *(b"\xff" * len(buffer) for buffer in buffers)])
-        if kind is NewestSubscriber:
-            eventually(lambda: len(subscriber._slots) == FLOOD)
-        else:
-            time.sleep(0.3)  # so that many wait
+        eventually(lambda: subscriber.silent_s is not None)
         assert subscriber.receive(0.0) is None and subscriber.rejected <= 1
         other.send_multipart(encode_frame(samples.make_frame(5)))
         frame = subscriber.receive(WAIT_S)
         assert isinstance(frame, PosedFrame) and frame.seq == 5 and subscriber.rejected == FLOOD
-
-
-def test_a_publisher_hears_a_flood_of_subscriptions_little_by_little(endpoint: str) -> None:
-    with Publisher(endpoint) as publisher, zmq.Context.instance().socket(zmq.SUB) as other:
-        other.setsockopt(zmq.LINGER, 0)
-        other.connect(endpoint)
-        with publisher._mutex:  # as in a ``publish`` that has begun: nobody else hears them
-            for number in range(1000):
-                other.subscribe(f"frame/{number}/".encode())
-            time.sleep(0.3)
-            publisher._drain()
-            assert 0 < len(publisher._counts) < 500
-        eventually(lambda: publisher.subscribers("frame", "999") == 1)  # all of them in the end, in order
-        assert len(publisher._counts) == 1000
-
-
-def test_a_reader_whose_thread_has_failed_says_why(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails() -> None:
-        raise zmq.ZMQError(errno.EMFILE)
-
-    with Publisher(endpoint) as publisher, NewestSubscriber(endpoint, ["frame"]) as subscriber:
-        subscriber.wait_until_heard(WAIT_S)
-        publisher.publish(encode_frame(samples.make_frame(5)))
-        eventually(lambda: subscriber.silent_s is not None)
-        monkeypatch.setattr(subscriber._connections, "reconnect", fails)
-        assert isinstance(subscriber.receive(WAIT_S), PosedFrame), "what had come before"
-        for use in (subscriber.receive, subscriber.wait_until_heard):
-            with pytest.raises(TransportError, match="Too many open files"):
-                use(WAIT_S)
 
 
 @pytest.mark.parametrize("kind", [NewestSubscriber, LosslessSubscriber])
@@ -409,37 +317,6 @@ def test_a_message_of_too_many_parts_or_too_much_in_them_costs_itself_only(endpo
         frame = subscriber.receive(WAIT_S)
         assert isinstance(frame, PosedFrame) and frame.seq == 5
         assert subscriber.rejected == 2 and "5 parts of 33" in str(subscriber.last_error)
-
-
-@pytest.mark.parametrize("kind", [NewestSubscriber, LosslessSubscriber])
-def test_a_keyframe_that_is_too_large_as_a_whole_costs_itself_only(endpoint: str, kind) -> None:
-    good = samples.all_messages()["keyframe"]
-    with zmq.Context.instance().socket(zmq.XPUB) as other, kind(endpoint, ["keyframe"]) as subscriber:
-        other.setsockopt(zmq.LINGER, 0)
-        other.bind(endpoint)
-        for _ in range(2):  # the topic and the handshake
-            assert other.poll(WAIT_S * 1e3)
-            other.recv()
-        half = bytes(MAX_KEYFRAME_BYTES // 2)  # neither part is too large
-        other.send_multipart([*good[:2], half, half], copy=False)
-        other.send_multipart([*good[:2], *[b"x"] * 1000])
-        other.send_multipart(good)
-        keyframe = subscriber.receive(WAIT_S)
-        assert isinstance(keyframe, LabelledKeyframe) and keyframe.teacher == "a person"
-        assert subscriber.rejected == 2 and "1002 parts of" in str(subscriber.last_error)
-
-
-def test_of_a_message_beyond_the_limits_no_more_than_they_allow_is_kept() -> None:
-    context = zmq.Context.instance()
-    with context.socket(zmq.PAIR) as left, context.socket(zmq.PAIR) as right:
-        left.connect(f"tcp://127.0.0.1:{right.bind_to_random_port('tcp://127.0.0.1')}")
-        for sent, kept in (([b"abc"] * 4, 4), ([b"abc"] * 9, 4), ([b"abc", bytes(8)], 1), ([b"abc", bytes(7)], 2)):
-            left.send_multipart(sent)
-            parts, trouble = receive_bounded(right, max_parts=4, max_bytes=12 if len(sent) > 2 else 10)
-            assert parts == sent[:kept] and bool(trouble) == (kept < len(sent))
-        assert trouble == "" and not right.poll(0), "each was taken off as a whole"
-        with pytest.raises(zmq.Again):
-            receive_bounded(right, flags=zmq.NOBLOCK)
 
 
 def test_an_answer_of_too_many_parts_is_an_error_and_the_next_one_is_not() -> None:

@@ -13,8 +13,8 @@ import research.bench.walk as bench_walk_module
 from research.bench.plots import draw_walk
 from research.bench.walk import WalkPlan, bench_walk
 from research.plots import Panel
+from semantic_mapper.mapping.block_grid import LEAST_RESIDENT
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.nodes.support import write_weights

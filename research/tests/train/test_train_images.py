@@ -93,7 +93,7 @@ def test_every_kind_with_a_classifier_learns_from_images_and_the_others_say_so()
             optimiser.step()
             losses.append(float(loss.detach()))
         assert losses[-1] < 0.7 * losses[0], (kind, losses)
-    for kind in ("mvsnerf", "semantic_nerf"):
+    for kind in ("semantic_nerf",):
         with pytest.raises(ConfigError, match=f"kind '{kind}' does not classify single images"):
             images_loss(build_field(kind, {}, ROOMS), batch, config)
 
@@ -129,7 +129,7 @@ def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_
         "steps": 1,
     }
     source = {"encoder_from": str(tmp_path / "first" / IMAGES_FILE)}
-    peer = {"kind": "mvsnerf", "field": {"feature_dim": 16, "planes": 8, "volume_channels": 4, "width": 16}}
+    peer = {"kind": "neuray", "field": {"feature_dim": 16}}
     shape = {"channels": [8, 16], "blocks": [1, 1], "depth": True}
     trained = train(small_run(**still, **source, **{**peer, "field": {**peer["field"], "encoder": shape}}))
     (origin,) = trained.recipe["origins"]

@@ -1,4 +1,4 @@
-/* Blocks that the rays of a depth image cross near their depth; see mapping/fusion/allocation.py. */
+/* Blocks that the rays of a depth image cross near their depth; see mapping/allocation.py. */
 #include <stdlib.h>
 #include <string.h>
 

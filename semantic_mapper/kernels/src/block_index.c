@@ -1,4 +1,4 @@
-/* The table of mapping/storage/block_index.py. */
+/* The table of mapping/blocks.py. */
 #include "block_index.h"
 
 typedef struct {

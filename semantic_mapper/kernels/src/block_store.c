@@ -1,4 +1,4 @@
-/* Packing of blocks; see mapping/storage/block_store.py. */
+/* Packing of blocks; see mapping/blocks.py. */
 #include "packed_blocks.h"
 
 typedef struct {

@@ -1,4 +1,4 @@
-/* A pinhole camera; see mapping/fusion/allocation.py. */
+/* A pinhole camera; see mapping/allocation.py. */
 #pragma once
 
 #include "kernels.h"

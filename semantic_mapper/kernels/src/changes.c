@@ -1,4 +1,4 @@
-/* What changed in a map, in few bytes; see mapping/storage/changes.py. */
+/* What changed in a map, in few bytes; see mapping/changes.py. */
 #include "packed_blocks.h"
 #include "readout.h"
 

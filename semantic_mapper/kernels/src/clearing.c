@@ -1,4 +1,4 @@
-/* Blocks that a frame sees through; see mapping/fusion/clearing.py. */
+/* Blocks that a frame sees through; see mapping/clearing.py. */
 #include <string.h>
 
 #include "see_through.h"

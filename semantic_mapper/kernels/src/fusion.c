@@ -1,10 +1,10 @@
-/* Fusion of one frame: TSDF, color and class evidence in one pass; see mapping/fusion/fuse.py. */
+/* Fusion of one frame: TSDF, color and class evidence in one pass; see mapping/fusion.py. */
 #include <string.h>
 
 #include "see_through.h"
 
-#define PROBABILITY_FLOOR 1e-4f /* of mapping/fusion/fuse.py */
-#define FULL_TRUST_RANGE_M 2.0f /* of mapping/fusion/fuse.py, as the next */
+#define PROBABILITY_FLOOR 1e-4f /* of mapping/fusion.py */
+#define FULL_TRUST_RANGE_M 2.0f /* of mapping/fusion.py, as the next */
 #define LEAST_COSINE 0.2f
 
 typedef struct {

@@ -1,4 +1,4 @@
-/* The memory of the voxel grid; see mapping/storage/block_grid.py. */
+/* The memory of the voxel grid; see mapping/block_grid.py. */
 #pragma once
 
 #include "block_index.h"
@@ -8,7 +8,7 @@
 #define MAX_CLASSES 256   /* class ids are bytes */
 #define LARGEST_STEP 0.95 /* of the TSDF: two neighbours that differ by more straddle a depth edge, not a surface */
 
-/* Weights of mapping/fusion/fuse.py: from the first on a surface was measured, up to the second computed. */
+/* Weights of mapping/fusion.py: from the first on a surface was measured, up to the second computed. */
 #define MEASURED 1.0f
 #define COMPUTED_CAP (31.0f / 32.0f)
 

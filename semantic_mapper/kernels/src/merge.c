@@ -1,4 +1,4 @@
-/* Adding the voxels of one map to another, resampled where they do not coincide; see mapping/files/merge.py. */
+/* Adding the voxels of one map to another, resampled where they do not coincide; see mapping/merge.py. */
 #include "evidence.h"
 #include "packed_blocks.h"
 

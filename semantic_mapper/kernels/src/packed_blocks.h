@@ -1,4 +1,4 @@
-/* Blocks without the voxels that hold nothing, one behind the other; see PackedBlocks of mapping/storage/block_store.py. */
+/* Blocks without the voxels that hold nothing, one behind the other; see PackedBlocks of mapping/blocks.py. */
 #pragma once
 
 #include <string.h>
@@ -8,7 +8,7 @@
 #define MASK_BYTES (BLOCK_VOXELS / 8)
 #define MASK_FLOATS (2 * MASK_BYTES / 4) /* both masks, in units of float32 */
 
-/* The voxels of B blocks: BlockValues of mapping/storage/block_store.py. */
+/* The voxels of B blocks: BlockValues of mapping/blocks.py. */
 typedef struct {
     F32 tsdf, weight;  /* (B, 512) */
     F32 color;         /* (B, 512, 3) */

@@ -1,4 +1,4 @@
-/* Reading the map at any point: interpolation over the eight voxels around it; see mapping/views/readout.py. */
+/* Reading the map at any point: interpolation over the eight voxels around it; see mapping/surface.py. */
 #pragma once
 
 #include "evidence.h"

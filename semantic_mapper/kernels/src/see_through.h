@@ -1,11 +1,11 @@
-/* Which voxels of a surface a frame sees through, and what becomes of them; see mapping/fusion/clearing.py. */
+/* Which voxels of a surface a frame sees through, and what becomes of them; see mapping/clearing.py. */
 #pragma once
 
 #include <string.h>
 
 #include "voxel_lookup.h"
 
-#define LARGEST_CLEARED_TSDF 0.5f /* of a voxel that is part of a surface; of mapping/fusion/clearing.py, as the next */
+#define LARGEST_CLEARED_TSDF 0.5f /* of a voxel that is part of a surface; of mapping/clearing.py, as the next */
 #define MARGIN_VOXELS 2.0f
 #define MARGIN_PER_M 0.015f
 #define ASIDE_VOXELS 1.4f
@@ -13,7 +13,7 @@
 #define MOST_HOLES 2
 #define MOST_KEPT 3.5f
 
-/* Least and greatest depths of a frame: DepthBounds of mapping/fusion/clearing.py. */
+/* Least and greatest depths of a frame: DepthBounds of mapping/clearing.py. */
 typedef struct {
     F32 nearest;  /* (levels, h, w) metres, of 2^level x 2^level cells from each one on; inf = no depth */
     F32 farthest; /* (h / 8, w / 8), rounded up: of 8 x 8 cells */

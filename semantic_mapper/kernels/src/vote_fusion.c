@@ -1,4 +1,4 @@
-/* Class votes without a measurement; see mapping/fusion/fuse.py. */
+/* Class votes without a measurement; see mapping/fusion.py. */
 #include "voxel_lookup.h"
 
 typedef struct {

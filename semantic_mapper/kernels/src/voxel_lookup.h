@@ -4,12 +4,12 @@
 #include "camera.h"
 #include "evidence.h"
 
-/* Lengths in metres, and the cap of weights and votes: FusionLimits of mapping/fusion/fuse.py. */
+/* Lengths in metres, and the cap of weights and votes: FusionLimits of mapping/fusion.py. */
 typedef struct {
     double voxel_size, truncation, depth_max, vote_band, max_weight;
 } FusionLimits;
 
-/* What a frame says of classes: Votes of mapping/fusion/fuse.py. */
+/* What a frame says of classes: Votes of mapping/fusion.py. */
 typedef struct {
     F32 log_p;   /* (K, L) floored log probabilities */
     I32 rows;    /* (H, W) which of them a pixel takes, where its weight is > 0 */

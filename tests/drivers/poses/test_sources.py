@@ -11,7 +11,7 @@ import pytest
 from semantic_mapper.drivers.poses.board import BoardPoseSource
 from semantic_mapper.drivers.poses.config import IDENTITY
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
-from semantic_mapper.drivers.poses.sources import DevicePoseSource, FixedPoseSource, open_poses, read_pose_config
+from semantic_mapper.drivers.poses.sources import DevicePoseSource, FixedPoseSource, make_poses, read_pose_config
 from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import ConfigError
 
@@ -27,7 +27,7 @@ from semantic_mapper.errors import ConfigError
     ],
 )
 def test_a_section_of_a_launch_file_becomes_a_pose_source(text: str, kind: type) -> None:
-    source = open_poses(tomllib.loads(text))
+    source = make_poses(read_pose_config(tomllib.loads(text)))
     assert isinstance(source, kind)
     assert source.warnings == () and not source.counters
 
@@ -70,9 +70,9 @@ def test_matrices_must_be_rigid(kind: str, name: str) -> None:
 def test_no_pose_source_loads_open3d() -> None:
     program = (
         "import sys\n"
-        "from semantic_mapper.drivers.poses.sources import open_poses\n"
+        "from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config\n"
         "for kind in ('fixed', 'board', 'device', 'rgbd'):\n"
-        "    open_poses({'kind': kind})\n"
+        "    make_poses(read_pose_config({'kind': kind}))\n"
         "print('open3d' in sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

@@ -8,7 +8,7 @@ import pytest
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.mounts import Mount
 from semantic_mapper.drivers.poses.config import VisualPoses, begins_world
-from semantic_mapper.drivers.poses.sources import open_poses
+from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 from semantic_mapper.drivers.poses.visual import VisualPoseSource, two_views
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
@@ -153,8 +153,10 @@ def test_another_camera_in_between_is_refused() -> None:
 
 
 def test_settings_make_the_source_and_what_its_scale_comes_from() -> None:
-    assert isinstance(open_poses({"kind": "visual"}), VisualPoseSource) and begins_world(VisualPoses())
-    source = open_poses({"kind": "visual", "scale": {"kind": "board", "columns": 5}})
+    assert isinstance(make_poses(read_pose_config({"kind": "visual"})), VisualPoseSource) and begins_world(
+        VisualPoses()
+    )
+    source = make_poses(read_pose_config({"kind": "visual", "scale": {"kind": "board", "columns": 5}}))
     assert isinstance(source, VisualPoseSource) and source.scale == "awaited"
     for wrong, message in (
         ({"scale": {"kind": "fixed"}}, 'must be "topic" or "board"'),
@@ -162,4 +164,4 @@ def test_settings_make_the_source_and_what_its_scale_comes_from() -> None:
         ({"scale": {"kind": "board"}, "distance_m": 2.0}, "one of scale, distance_m and camera_height_m"),
     ):
         with pytest.raises(ConfigError, match=message):
-            open_poses({"kind": "visual", **wrong})
+            read_pose_config({"kind": "visual", **wrong})

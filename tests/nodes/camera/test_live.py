@@ -19,7 +19,6 @@ import pytest
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.mounts import Mount
-from semantic_mapper.drivers.poses import sources
 from semantic_mapper.drivers.poses.config import PoseChecks
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
@@ -49,7 +48,7 @@ class Walk(PoseSource):
 
 
 def walking(camera: Camera) -> PosedCamera:
-    return PosedCamera(camera, Walk(), PoseChecks(max_speed_m_s=1e6, init_consensus=1))
+    return PosedCamera(camera, Walk(), PoseChecks(max_speed_m_s=1e6))
 
 
 @dataclass
@@ -269,7 +268,6 @@ def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
     writer.release()
     config = {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")}
     poses = {"kind": "device"}  # a video gives no pose of its own
-    monkeypatch.setattr(sources, "PATIENCE_S", 0.1)
     monkeypatch.setattr(live_camera, "check_world", lambda *_: None)
     with running({"camera": {"kind": "opencv", "config": config, "poses": poses}}, restartable=restartable) as node:
         node.until(lambda m: isinstance(m, EndOfStream) or (isinstance(m, Status) and m.state == "ended"))

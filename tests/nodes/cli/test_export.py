@@ -11,8 +11,8 @@ from semantic_mapper.errors import ConfigError, PoseError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.exporters.map_files import parse_transform
 from semantic_mapper.replay.run_folder import map_path, refuse_overwriting
-from tests.mapping.files.test_formats import read_glb
 from tests.mapping.rendered_views import small_map
+from tests.mapping.test_formats import read_glb
 from tests.mapping.test_voxel_map import fuse_sphere
 from tests.nodes.support import error_line, run
 

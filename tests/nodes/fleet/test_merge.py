@@ -25,8 +25,8 @@ from semantic_mapper.nodes.fleet import merge
 from semantic_mapper.nodes.fleet.merge import MergeReport, find_maps, merge_maps, read_poses
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.types import Float64
-from tests.mapping.files.test_merge import fuse_views, turned
 from tests.mapping.rendered_views import small_map
+from tests.mapping.test_merge import fuse_views, turned
 from tests.mapping.test_voxel_map import same
 from tests.nodes.fleet.made_up import made_up, store_of
 from tests.nodes.support import run_here

@@ -21,7 +21,6 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
-from research.experiments.foxglove_client import FoxgloveClient, Received
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.foxglove.node import run_foxglove
 from semantic_mapper.nodes.foxglove.server import BACKLOG, FoxgloveServer
@@ -30,6 +29,7 @@ from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.transport.keys import allow, make_keys
+from tests.nodes.foxglove.client import FoxgloveClient, Received
 from tests.nodes.foxglove.robot import REFRESH_S, WARM_S, Robot, big_frame, bridged_robot
 from tests.nodes.support import eventually, free_port
 from tests.queries.scene import LABELS, whole

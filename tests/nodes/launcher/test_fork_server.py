@@ -70,11 +70,3 @@ def test_a_frozen_server_is_replaced(tmp_path: Path, server: ForkServer, monkeyp
         start(tmp_path, server)
     assert not psutil.pid_exists(before)
     start(tmp_path, server).close()
-
-
-@pytest.mark.slow
-def test_a_forked_node_says_why_it_fails(tmp_path: Path, server: ForkServer) -> None:
-    node = NodeProcess("mapper", job(tmp_path, weights=str(tmp_path / "none.safetensors")), server)
-    assert node.wait(60) and node.exit_code() == 1
-    assert "none.safetensors" in node.describe_end()
-    node.close()

@@ -18,7 +18,6 @@ from semantic_mapper.nodes.launcher.liveness import (
     RUNNING,
     STARTING,
     TURN,
-    HangDetector,
     HeartbeatMonitor,
     ProgressLimit,
     is_active,
@@ -34,7 +33,7 @@ def test_launcher_knows_from_the_pipe_how_far_a_node_is(monkeypatch: pytest.Monk
     now_s = [100.0]
     monkeypatch.setattr(liveness, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     read, write = os.pipe()
-    monitor = HeartbeatMonitor(read)
+    monitor = HeartbeatMonitor(read, os.getpid(), 30.0)
     monitor.poll()
     os.write(write, STARTING)
     monitor.poll()
@@ -69,16 +68,15 @@ def test_a_frozen_process_is_told_from_a_busy_one(
     if hangs:
         assert eventually(lambda: not is_active(process.pid), 30)
     read, write = os.pipe()
-    monitor = HeartbeatMonitor(read)
+    monitor = HeartbeatMonitor(read, process.pid, 0.2)
     os.write(write, RUNNING)
-    detector = HangDetector(process.pid, monitor, 0.2)
-    assert not detector.find_hang(stopping=False)
+    assert not monitor.find_hang(stopping=False)
     now_s[0] += 0.15
-    assert not detector.find_hang(stopping=False), "it is not silent for long enough"
+    assert not monitor.find_hang(stopping=False), "it is not silent for long enough"
     now_s[0] += 0.2
-    assert bool(detector.find_hang(stopping=False)) == hangs
+    assert bool(monitor.find_hang(stopping=False)) == hangs
     os.write(write, RUNNING)
-    assert not detector.find_hang(stopping=False), "it lives"
+    assert not monitor.find_hang(stopping=False), "it lives"
     process.kill()
     process.wait()
     os.close(write)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import socket
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -40,31 +38,6 @@ def test_what_is_told_is_what_systemd_expects(tmp_path: Path) -> None:
     notifier.stopping(2.5)
     assert manager.hear() == ["STATUS=one"]  # once
     assert manager.hear() == ["STOPPING=1", "EXTEND_TIMEOUT_USEC=2500000"]
-
-
-def test_watchdog_is_fed_three_times_a_period_and_only_for_this_process(tmp_path: Path) -> None:
-    manager = Manager(str(tmp_path / "notify"))
-    given = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
-    Notifier.from_environment({**given, "WATCHDOG_PID": str(os.getpid() + 1)}).alive()
-    Notifier.from_environment({"NOTIFY_SOCKET": given["NOTIFY_SOCKET"]}).alive()
-    notifier = Notifier.from_environment({**given, "WATCHDOG_PID": str(os.getpid())})
-    began = time.monotonic()
-    for _ in range(2):
-        assert manager_hears_after(notifier, manager) == ["WATCHDOG=1"]
-    assert time.monotonic() - began >= 0.1  # the second one not before its time
-    manager.socket.setblocking(False)
-    with pytest.raises(BlockingIOError):  # nothing came of the other two
-        manager.hear()
-
-
-def manager_hears_after(notifier: Notifier, manager: Manager) -> list[str]:
-    manager.socket.settimeout(0.01)
-    while True:
-        notifier.alive()
-        try:
-            return manager.hear()
-        except TimeoutError:
-            continue
 
 
 def test_without_systemd_nothing_is_sent_and_a_socket_that_is_gone_is_told_once(tmp_path: Path) -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.mapping.files import map_file
-from semantic_mapper.mapping.files.map_file import CHUNK_BLOCKS, describe_map
+from semantic_mapper.mapping import map_file
+from semantic_mapper.mapping.map_file import CHUNK_BLOCKS, describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.mapper.autosave import Autosave
+from semantic_mapper.nodes.mapper.saved_map import Autosave
 from tests.mapping.rendered_views import small_map
-from tests.mapping.storage.test_paging import walk
+from tests.mapping.test_paging import walk
 from tests.mapping.test_voxel_map import same
 from tests.nodes.support import REPLAY_LAUNCH, Running, eventually, repeated_frames, run, write_config, write_log
 
@@ -106,18 +106,6 @@ def test_at_the_end_a_save_under_way_is_given_up(tmp_path: Path, slow_writing: t
     slow_writing.release(100)
     voxel_map.save(path)
     assert describe_map(path).frames == 3
-
-
-def test_a_save_that_fails_is_told_and_tried_again_though_nothing_has_changed(tmp_path: Path) -> None:
-    voxel_map, path = small_map(voxel_size_m=0.02), tmp_path / "gone" / "map.npz"
-    autosave = Autosave(voxel_map, path, ALWAYS)
-    walk(voxel_map, 1)
-    autosave.follow()
-    assert eventually(lambda: "cannot write the map" in autosave.failure)
-    path.parent.mkdir()
-    assert eventually(lambda: autosave.follow() or autosave.saves == 1) and not autosave.failure
-    assert describe_map(path).frames == 1
-    autosave.close()
 
 
 def test_a_save_that_dies_is_reported_and_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,6 @@ from semantic_mapper.drivers.base import CorrectedWorld
 from semantic_mapper.errors import CodecError, MapError, PoseError, ShapeError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.correction import ALWAYS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.corrections import CorrectionSender
@@ -32,13 +31,12 @@ from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.queries.questions import CorrectPosesRequest
+from semantic_mapper.queries.questions import CorrectPosesRequest, encode_request
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
-from semantic_mapper.transport.query_messages import encode_request
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
-from semantic_mapper.types import Float64, MapUpdate, PosedFrame
+from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.mapping.test_correction import drift, drifted, true_poses
 from tests.nodes.mapper.test_query_service import RawClient, a_folder
 from tests.nodes.support import CONFIG, eventually, run
@@ -148,13 +146,6 @@ def ideal_map(bundle_of, frames: tuple[PosedFrame, ...]) -> VoxelMap:
     return pipeline.voxel_map
 
 
-def surface_distance(a: VoxelMap, b: VoxelMap) -> float:
-    """95th percentile of the distance of points of ``a`` to those of ``b``, metres."""
-    from scipy.spatial import cKDTree
-
-    return float(np.percentile(cKDTree(b.points().xyz).query(a.points().xyz)[0], 95))
-
-
 def settle(client: MapClient) -> None:
     assert eventually(lambda: not client.correction().running)
 
@@ -211,26 +202,6 @@ def test_a_map_that_keeps_no_frames_says_what_to_set_to_the_camera(weights, tmp_
             assert eventually(lambda: bool(sender.warnings))
         assert "does not follow closed loops" in sender.warnings[0] and "history.max_frames" in sender.warnings[0]
         robot.end(1)
-
-
-def test_where_odometry_goes_on_frames_to_come_move_too_and_the_end_waits_for_the_correction(
-    weights, bundle_of, tmp_path
-):
-    frames = tiny_frames(14)
-    late = drifted(frames)
-    drift: Float64 = late[7].T_world_camera @ np.linalg.inv(frames[7].T_world_camera)
-    odometry = [dataclasses.replace(f, T_world_camera=drift @ f.T_world_camera) for f in frames[8:]]
-    with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:
-        robot.send(late[:8])
-        assert robot.fused(8)
-        client.correct_poses(true_poses(frames[:8], 2), until_ns=ALWAYS)
-        robot.send(odometry)
-        summary = robot.end(14)
-    saved, ideal = VoxelMap.load(tmp_path / "out" / "map.npz"), ideal_map(bundle_of, frames)
-    uncorrected = ideal_map(bundle_of, (*late[:8], *odometry))
-    assert saved.frames == 14 and summary["map"]["corrected_poses"] == 5
-    assert surface_distance(saved, ideal) < 0.01 < 0.03 < surface_distance(uncorrected, ideal)
-    assert summary["metrics"]["map_miou"] is not None
 
 
 @pytest.mark.slow

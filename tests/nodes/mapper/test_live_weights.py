@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -211,12 +210,3 @@ def test_a_mapper_without_a_learner_says_so(weights, tmp_path):
             client.weights()
         robot.send(list(FRAMES[:1]))
         assert json.loads(json.dumps(robot.end(1)))["weights"]["learned"] is None
-
-
-def test_weights_that_cannot_be_noted_for_a_restart_are_in_use_all_the_same(learned, tmp_path):
-    (notes := tmp_path / "notes").mkdir()
-    with learning_robot(learned, tmp_path / "out", notes=notes) as learner:
-        shutil.rmtree(notes)
-        said = learner.offer(better(learned), 1)
-        assert (said.version, said.accepted, said.reason) == (1, True, "")
-        assert learner.robot.end(6)["weights"]["learned"]["in_use"] == 1  # type: ignore[index]

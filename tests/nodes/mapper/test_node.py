@@ -11,7 +11,7 @@ from structlog.testing import capture_logs
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.mapper.resume import resume_map
+from semantic_mapper.nodes.mapper.saved_map import resume_map
 from tests.mapping.test_correction import true_poses
 from tests.nodes.mapper.test_live_correction import running_robot
 from tests.nodes.mapper.test_resume import context

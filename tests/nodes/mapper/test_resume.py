@@ -16,15 +16,12 @@ from semantic_mapper.labels import CAMVID11, ROOMS
 from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import make_place
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.camera.node import Playback
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.mapper.resume import (
+from semantic_mapper.nodes.mapper.saved_map import (
     continue_map,
     forbid,
     keep_earlier,
-    note_sessions,
-    noted_sessions,
     resume_map,
     stored_settings,
 )
@@ -118,14 +115,6 @@ def test_a_saved_map_is_gone_on_in_where_it_can_be_found_again(tmp_path: Path) -
         continue_map(VoxelMap(CONFIG, CAMVID11), again, "a.npz")
 
 
-def test_where_worlds_lie_is_noted_for_the_mapper_after_this_one(tmp_path: Path) -> None:
-    T = np.diag([-1.0, -1.0, 1.0, 1.0])
-    assert noted_sessions(context(tmp_path / "notes", 0)) == {}
-    note_sessions(context(tmp_path / "notes", 0), {0: np.eye(4), 2**60: T})
-    noted = noted_sessions(context(tmp_path / "notes", 1))
-    assert set(noted) == {0, 2**60} and np.array_equal(noted[2**60], T)
-
-
 @pytest.mark.parametrize("case", ["corrected", "damaged", "other settings"])
 def test_map_that_cannot_be_gone_on_with_is_put_aside(tmp_path: Path, case: str) -> None:
     path, folder = tmp_path / "map.npz", tmp_path / "notes"
@@ -179,26 +168,6 @@ def test_results_of_earlier_launches_are_kept_each_in_a_folder(tmp_path: Path) -
     assert path.read_bytes() == contents[2]
 
 
-def test_earlier_map_is_kept_also_where_the_first_mapper_was_killed_at_once(tmp_path: Path) -> None:
-    path, folder = tmp_path / "map.npz", tmp_path / "notes"
-    some_map(2).save(path)
-    before = path.read_bytes()
-    resume_map(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))  # and no stream began
-    assert "none had been saved" in begin(folder, path, 1)
-    (kept,) = tmp_path.glob("earlier-*")
-    assert (kept / "map.npz").read_bytes() == before and not path.exists()
-    assert "none had been saved" in begin(folder, path, 2)
-
-
-def test_no_map_that_was_put_aside_is_replaced(tmp_path: Path) -> None:
-    path, folder = tmp_path / "map.npz", tmp_path / "notes"
-    (tmp_path / "map-before-restart-1.npz").write_text("of an earlier launch")
-    begin(folder, path, 0)
-    path.write_text("damaged")
-    assert "map-before-restart-1-1.npz" in begin(folder, path, 1)
-    assert (tmp_path / "map-before-restart-1.npz").read_text() == "of an earlier launch"
-
-
 def map_stream(options: MapperOptions) -> None:
     """A mapper from the beginning of a stream to its end."""
     with tempfile.TemporaryDirectory(prefix="sm-") as folder:
@@ -228,14 +197,3 @@ def test_live_launch_into_the_same_folder_keeps_the_map_and_a_replay_replaces_it
     assert {p.name for p in kept.iterdir()} == results == {p.name for p in tmp_path.iterdir() if p.is_file()}
     map_stream(MapperOptions(out=str(tmp_path), weights=str(weights), config=str(config), query="", delivery="all"))
     assert list(tmp_path.glob("earlier-*")) == [kept]
-
-
-def test_where_no_note_can_be_written_nodes_continue_map(tmp_path: Path) -> None:
-    gone = context(tmp_path / "notes", 0)
-    (tmp_path / "notes").rmdir()
-    assert not forbid(gone, "poses had been corrected")
-    began = Playback(gone, 1.0)
-    began.note_frame(5)
-    began.note_frame(6)
-    assert 5 <= began.due_stamp_ns() < 5 + 60e9
-    assert forbid(context(tmp_path / "notes", 0), "poses had been corrected")

@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 import pytest
 import rerun.chunk
+from rerun import RecordingStream
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.cli.options import Remote
@@ -29,12 +30,13 @@ from semantic_mapper.nodes.cli.view import _find_live
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.viewer import server
 from semantic_mapper.nodes.viewer.mapped_log import show_log
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
-from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.snapshot import BlockAges
+from semantic_mapper.queries.snapshot import BlockAges, MapMirror
 from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file, recording_server
+from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
@@ -108,6 +110,16 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
         assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
 
 
+def test_a_viewer_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "rerun"
+    locked = 'if sys.argv[1] != "analytics": sys.exit("the door is locked")'
+    program.write_text(f"#!{sys.executable} -I\nimport sys\n{locked}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(server, "_find_program", lambda: str(program))
+    with pytest.raises(TransportError, match=r"has not started.* the door is locked"), WebViewer(0, 0):
+        pass
+
+
 def test_a_viewer_that_is_killed_leaves_no_server() -> None:
     program = (
         "import time\nfrom semantic_mapper.nodes.viewer.server import WebViewer\n"
@@ -123,18 +135,19 @@ def test_a_viewer_that_is_killed_leaves_no_server() -> None:
 
 
 def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path, tmp_path: Path) -> None:
-    done: list[int] = []
-    show_log(
-        log,
-        weights,
-        tiny_config(),
-        5,
-        lambda: recording_file(tmp_path / "log.rrd"),
-        0.0,
-        going=lambda: len(done) < 4,
-        on_start=done.append,
-        on_frame=done.append,
-    )
+    done: list[int | None] = []
+
+    class Monitor(JobMonitor):
+        def start(self, total: int | None) -> None:
+            done.append(total)
+
+        def set(self, frames: int, note: str = "") -> None:
+            done.append(frames)
+
+    def begin() -> RecordingStream:
+        return recording_file(tmp_path / "log.rrd")
+
+    show_log(log, weights, tiny_config(), 5, begin, 0.0, lambda: len(done) < 4, Monitor())
     assert done == [5, 1, 2, 3], "asked to end after the third frame"
     rows = logged(tmp_path / "log.rrd")
     camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"

@@ -1,4 +1,4 @@
-"""Films for tests: rendered walks, and mp4 files changed as phones write them."""
+"""Films for tests: walks through a drawn room, and mp4 files changed as phones write them."""
 
 from __future__ import annotations
 
@@ -7,19 +7,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
-import numpy as np
 
-from research.scenes.camera import camera_path
-from research.scenes.config import CameraPathConfig, NoiseConfig
-from research.scenes.render import render_view
-from research.scenes.room import make_room
-from research.scenes.shots import sequence_shots
-from semantic_mapper.geometry import interpolate_pose
-from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
+from semantic_mapper.types import CameraIntrinsics, PosedFrame, UInt8
+from tests.drawn_room import walk_frames
 
 W, H, HZ = 320, 240, 15.0
 CAMERA = CameraIntrinsics(272.0, 272.0, (W - 1) / 2, (H - 1) / 2, W, H)
-SEED = 100_003  # of a room and a path without people
+SEED = 3
 
 
 def write_film(path: Path, pictures: Iterable[UInt8], hz: float = HZ) -> Path:
@@ -34,28 +28,13 @@ def write_film(path: Path, pictures: Iterable[UInt8], hz: float = HZ) -> Path:
     return path
 
 
-def walk(count: int, seed: int = SEED, step_m: float = 0.05) -> Float64:
-    """Poses (N, 4, 4) of a hand-held walk."""
-    return camera_path(make_room(seed), count, seed, CameraPathConfig(step_m=step_m))
+def walk(count: int, seed: int = SEED, step_m: float = 0.05) -> tuple[PosedFrame, ...]:
+    """Frames of a walk with their true poses and depth."""
+    return walk_frames(seed, count, CAMERA, step_m=step_m)
 
 
-def take(poses: Float64, seed: int = SEED, shutter: float = 0.0, bands: int = 6) -> list[UInt8]:
-    """Pictures at poses, with noise and auto exposure; with a rolling shutter rows follow the way to the next pose."""
-    scene, config = make_room(seed), NoiseConfig(depth="none")
-    shots = sequence_shots(poses, seed, config)
-
-    def at(n: int, fraction: float) -> UInt8:
-        pose = interpolate_pose(poses[n], poses[min(n + 1, len(poses) - 1)], fraction)
-        return render_view(scene, CAMERA, pose, noise=seed + n, noise_config=config, shot=shots[n]).rgb
-
-    if not shutter:
-        return [at(n, 0.0) for n in range(len(poses))]
-    edges = np.linspace(0, H, bands + 1).astype(int)
-    pictures: list[UInt8] = []
-    for n in range(len(poses)):
-        rows = [at(n, shutter * (b + 0.5) / bands)[edges[b] : edges[b + 1]] for b in range(bands)]
-        pictures.append(np.concatenate(rows))
-    return pictures
+def pictures(frames: Iterable[PosedFrame]) -> list[UInt8]:
+    return [frame.rgb for frame in frames]
 
 
 def box(data: bytes, *path: bytes) -> tuple[int, int]:

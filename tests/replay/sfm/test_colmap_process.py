@@ -8,16 +8,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from research.scenes.daylight import pose_of
 from semantic_mapper.evaluation.trajectory import align_similar
-from semantic_mapper.geometry import transform
+from semantic_mapper.geometry import look_at, transform
 from semantic_mapper.replay.sfm import colmap_process as colmap
 from semantic_mapper.replay.sfm.colmap_model import read_model
 from semantic_mapper.types import Float64
 
 W, H, FOCAL, FRAMES = 640, 360, 400.0, 10
-AHEAD = np.stack([pose_of(np.array([0.6 * n, 0.0, 1.5]), 0.0, 0.0) for n in range(FRAMES)])  # no sway at all
-TURN = np.stack([pose_of(np.array([0.0, 0.0, 1.5]), yaw, 0.0) for yaw in np.linspace(0.0, 0.6, FRAMES)])
+UP = np.eye(3)[2]
+EYES = np.array([(0.6 * n, 0.0, 1.5) for n in range(FRAMES)])
+AHEAD = np.stack([look_at(eye, eye + np.eye(3)[0], UP) for eye in EYES])  # no sway at all
+YAWS = np.linspace(0.0, 0.6, FRAMES)
+TURN = np.stack([look_at(EYES[0], EYES[0] + (np.cos(yaw), np.sin(yaw), 0.0), UP) for yaw in YAWS])
 
 
 def street(rng: np.random.Generator) -> Float64:

@@ -14,7 +14,6 @@ from semantic_mapper.replay.sfm.scale import (
     BoardScale,
     Mark,
     MarkedDistance,
-    ScaleHint,
     fit_to_scene,
     marked_place,
     parse_distance,
@@ -36,13 +35,6 @@ def test_marked_distances_are_read() -> None:
     for text in ("", "3:1,2 0.9", "3:1,2 4:1,2 0", "3:1,2 4:1,2 -1", "a:1,2 4:1,2 1"):
         with pytest.raises(ConfigError, match="marks no distance"):
             parse_distance(text)
-
-
-def test_the_scale_comes_from_one_source() -> None:
-    with pytest.raises(ConfigError, match="one source"):
-        ScaleHint(factor=2.0, camera_height_m=1.5)
-    with pytest.raises(ConfigError, match="above 0"):
-        ScaleHint(factor=-1.0)
 
 
 def test_a_place_is_found_where_rays_meet_and_only_from_two_sides() -> None:

@@ -1,0 +1,191 @@
+"""What changed in a map since a version, small enough to be sent: 3.1 KB a block instead of 12 KB and 2 KB a class.
+
+The TSDF is rounded to 1/127 of the truncation (0.6 mm at 2 cm voxels) without ever changing its sign, so that the
+surface stays between the same voxels. Class evidence is decided where it lies: one class and its probability a voxel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.kernels import kernel
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.block_grid import BlockGrid
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, PackedBlocks
+from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8
+
+TSDF_STEPS = 127  # of the quantised TSDF, a truncation
+UNOBSERVED = -128  # in the quantised TSDF
+CONFIDENCE_STEPS = 255
+_READ_AT_ONCE = 512  # blocks copied at a time
+MAX_ROWS = 1 << 16  # that a map and a mirror keep: 2 MB
+
+
+class ClearedBlocks(NamedTuple):
+    """N times that a frame cleared voxels of a block, oldest frame first; all (N,) int64."""
+
+    packed: Int64  # key of the block
+    voxels: Int64  # how many of its voxels were part of a surface, or behind one, and are free now
+    version: Int64  # of the map, with that frame
+    stamp_ns: Int64  # of the frame
+
+    def between(self, after: int, up_to: int) -> ClearedBlocks:
+        """The rows of versions above ``after``, up to ``up_to``."""
+        chosen = (self.version > after) & (self.version <= up_to)
+        return ClearedBlocks(*(column[chosen] for column in self))
+
+    def followed_by(self, later: ClearedBlocks) -> ClearedBlocks:
+        """The latest ``MAX_ROWS`` of both."""
+        if not len(later.packed):
+            return self
+        return ClearedBlocks(*(np.concatenate(pair)[-MAX_ROWS:] for pair in zip(self, later, strict=True)))
+
+
+NONE_CLEARED = ClearedBlocks(*(np.empty(0, np.int64) for _ in range(4)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockChanges:
+    """Blocks of a map that changed after one version, as they are now; voxels in the order [z][y][x].
+
+    Args:
+        since: Who has all up to this version
+        version: has, with these blocks, all up to this one.
+        newest: Version of the map: where it is ``version``, nothing is missing.
+        epoch: Of the map. Where it is another than before, blocks of before are gone: those of the new epoch come all.
+        keys: (B, 3) int32 block coordinates in lexicographic order.
+        tsdf: (B, 512) int8 signed distance over truncation, times 127; -128 where not observed.
+        label: (B, 512) uint8 class ids, the ignore id where nothing voted, or the map is too unsure.
+        confidence: (B, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
+        rgb: (B, 512, 3) uint8.
+        scale_known: Whether lengths of the map are metres.
+        computed: (B, 512) uint8, 1 where no sensor measured what was observed; None = it did everywhere.
+        cleared: Which of these blocks lost surface that frames saw through after ``since``, and when; the latest.
+    """
+
+    since: int
+    version: int
+    newest: int
+    epoch: int
+    keys: Int32
+    tsdf: NDArray[np.int8]
+    label: UInt8
+    confidence: UInt8
+    rgb: UInt8
+    scale_known: bool = True
+    computed: UInt8 | None = None
+    cleared: ClearedBlocks = NONE_CLEARED
+
+    @property
+    def observed(self) -> Bool:
+        """(B, 512) whether enough depth measurements saw the voxel."""
+        return self.tsdf != UNOBSERVED
+
+
+class Decision(NamedTuple):
+    """How class evidence is read: see ``surface``. Voxels of less than ``min_weight`` are not observed."""
+
+    label_set: LabelSet
+    vote_discount: float
+    unknown_below: float
+    min_weight: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CopiedChanges:
+    """Blocks of a map as they were, not compact yet: what a thread that must not be held up hands to another one.
+
+    Args:
+        since, version, newest, epoch, keys, scale_known, cleared: Of the result.
+        decision: How it is read.
+        parts: Rows of the result, and the blocks there.
+    """
+
+    since: int
+    version: int
+    newest: int
+    epoch: int
+    keys: Int32
+    decision: Decision
+    parts: Iterable[tuple[Int64, PackedBlocks]]
+    scale_known: bool = True
+    cleared: ClearedBlocks = NONE_CLEARED
+
+    def compact(self) -> BlockChanges:
+        """The blocks as they were; any thread may call it, without the map."""
+        flat = (len(self.keys), BLOCK_VOXELS)
+        tsdf = np.empty(flat, np.int8)
+        label, confidence, computed = (np.empty(flat, np.uint8) for _ in range(3))
+        rgb = np.empty((*flat, 3), np.uint8)
+        labels, vote_discount, unknown_below, min_weight = self.decision
+        ids = np.array((*labels.ids, labels.ignore_id), np.uint8)
+        for rows, blocks in self.parts:
+            _compact_blocks(
+                blocks.data,
+                blocks.ends,
+                np.ascontiguousarray(rows),
+                ids,
+                vote_discount,
+                unknown_below,
+                min_weight,
+                tsdf,
+                label,
+                confidence,
+                rgb,
+                computed,
+            )
+            del blocks  # while the next ones are read
+        since, version, newest, epoch = self.since, self.version, self.newest, self.epoch
+        read = self.keys, tsdf, label, confidence, rgb
+        return BlockChanges(since, version, newest, epoch, *read, self.scale_known, computed, self.cleared)
+
+
+def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, PackedBlocks]]:
+    """Existing blocks (B,), wherever they are; those on disk stay there."""
+    for start in range(0, len(packed), _READ_AT_ONCE):
+        for rows, blocks in grid.pack(packed[start : start + _READ_AT_ONCE]):
+            yield rows + start, blocks
+
+
+def oldest_first(versions: Int64, limit: int, newest: int) -> tuple[Int64, int]:
+    """Which of the changed blocks come first: whole versions, at least one, and else at most ``limit`` blocks.
+
+    Args:
+        versions: (B,) when each block last changed.
+        limit: 0 = all.
+        newest: Version of the map.
+
+    Returns:
+        Positions of the blocks in ``versions``, ascending, and the version that they complete.
+    """
+    if not limit or len(versions) <= limit:
+        return np.arange(len(versions)), newest
+    distinct, counts = np.unique(versions, return_counts=True)
+    whole = max(1, int(np.searchsorted(np.cumsum(counts), limit, side="right")))
+    version = int(distinct[whole - 1])
+    return np.flatnonzero(versions <= version), version
+
+
+# Serial: it runs next to the mapper, which needs the other threads.
+@kernel
+def _compact_blocks(
+    data: Float32,
+    ends: Int64,
+    rows: Int64,
+    ids: UInt8,
+    vote_discount: float,
+    unknown_below: float,
+    min_weight: float,
+    tsdf: NDArray[np.int8],
+    label: UInt8,
+    confidence: UInt8,
+    rgb: UInt8,
+    computed: UInt8,
+) -> None:
+    """Write packed blocks (B,) to ``rows`` (B,) of the output; ``ids`` (L + 1,) of the classes, and the ignore id."""
+    ...

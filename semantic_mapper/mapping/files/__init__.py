@@ -1,1 +1,0 @@
-"""Maps in files: saved, merged, exported."""

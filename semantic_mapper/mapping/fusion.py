@@ -1,0 +1,260 @@
+"""Fusion of one frame in one compiled pass over the blocks it touches: TSDF, colour and class evidence together.
+
+TSDF and colour are the running means of Open3D's ``integrate``. Class evidence is the sum over frames of
+``w * log p`` at the pixel a voxel projects to: one vote a voxel a frame, only near the surface, where the field
+knows. ``w`` (0..1) trusts near and frontal looks more; see ``make_votes``.
+
+Depth of a sensor weighs ``MEASURED`` in the TSDF. Computed depth (from the pictures, or rendered by a field) weighs at
+most ``COMPUTED_LOOK``, and all of it together at most ``COMPUTED_CAP``: so one measurement outweighs it, and the weight
+of a voxel says whether its surface was measured (from ``MEASURED`` on) or computed. Computed depth never changes what
+was measured.
+
+The kernels (``fusion.c``) depend on no order among threads, so a frame gives the same bits every time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.errors import ConfigError, FrameError, ShapeError
+from semantic_mapper.geometry import expect_shape
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.mapping.allocation import Camera
+from semantic_mapper.mapping.block_grid import GridBuffers
+from semantic_mapper.mapping.clearing import NO_BOUNDS, DepthBounds, FusionLimits
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, Int64, UInt8
+
+MEASURED = 1.0
+COMPUTED_LOOK = 1 / 32
+COMPUTED_CAP = 31 / 32
+SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surface: four sure looks, or more unsure ones
+FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
+LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
+PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
+ProbabilityTable = tuple[Float32, Int32]  # probabilities (K, L), row of each pixel (H, W), -1 = unknown
+
+_BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
+    "voxel_size_m": (1e-4, 10.0),
+    "depth_max_m": (1e-3, 1000.0),
+    "max_blocks": (1, 1 << 27),
+}
+
+
+def make_limits(config: VoxelMapConfig) -> FusionLimits:
+    """Limits of a map.
+
+    Raises:
+        ConfigError: a value that no map can be built with.
+    """
+    for name, (least, most) in _BOUNDS.items():
+        value = getattr(config, name)
+        if not least <= value <= most:  # NaN, too
+            raise ConfigError(f"voxel_map.{name} must be from {least:g} to {most:g}, got {value}")
+    return FusionLimits(
+        voxel_size=config.voxel_size_m,
+        truncation=config.truncation_voxels * config.voxel_size_m,
+        depth_max=config.depth_max_m,
+        vote_band=config.vote_band_voxels * config.voxel_size_m,
+        max_weight=config.max_weight,
+    )
+
+
+class Votes(NamedTuple):
+    """What a frame says of classes."""
+
+    log_p: Float32  # (K, L) log probabilities, floored
+    rows: Int32  # (H, W) which row each pixel takes; looked at only where ``weights`` > 0
+    weights: Float32  # (H, W) in 0..1
+
+
+def make_votes(
+    probabilities: Float32, rows: Int32, depth: Float32, camera: Camera, depth_max: float
+) -> tuple[Votes, int]:
+    """Votes of a frame, each of weight ``max(cos, 0.2) * min(1, (2 m / z)^2)``, 0 where none is due.
+
+    Args:
+        probabilities: (K, L) float32, each row that is referred to summing to 1.
+        rows: (H, W) int32 row of each pixel, -1 = unknown.
+        depth: (H, W) float32 metres.
+
+    Returns:
+        The votes, and how many known pixels hold probabilities that are not finite, negative or do not sum to 1.
+    """
+    log_p, proper = np.empty_like(probabilities), np.empty(len(probabilities), np.bool_)
+    _log_probability_rows(len(probabilities), probabilities, log_p, proper)
+    weights, bad = np.empty(depth.shape, np.float32), np.empty(len(depth), np.int64)
+    _vote_weights(len(depth), depth, rows, proper, camera, depth_max, weights, bad)
+    return Votes(log_p, rows, weights), int(bad.sum())
+
+
+def checked_depth(
+    depth_m: Float32, trust: Float32 | None, intrinsics: CameraIntrinsics, where: str
+) -> tuple[Float32, Float32]:
+    """Depth (H, W) as one piece of memory, without what is not trusted, and its weights as ``fuse_blocks`` takes them.
+
+    Raises:
+        ShapeError: depth or weights do not fit the intrinsics, are not float32, or weights are not in 0..1.
+    """
+    size = f"{intrinsics.height} {intrinsics.width}"
+    _expect(depth_m, size, np.float32, f"{where}: depth_m")
+    if trust is None:
+        return np.ascontiguousarray(depth_m), np.empty((0, 0), np.float32)
+    _expect(trust, size, np.float32, f"{where}: trust")
+    if not ((trust >= 0) & (trust <= 1)).all():
+        raise ShapeError(f"{where}: trust must be 0 ... 1 everywhere")
+    return np.where(trust > 0, depth_m, np.float32(0)), np.ascontiguousarray(trust)
+
+
+def probability_table(
+    depth: Float32,
+    probabilities: Float32,
+    known: Bool | None,
+    rows: Int32 | None,
+    classes: int,
+    where: str,
+) -> ProbabilityTable:
+    """Class probabilities and the row of each pixel, however they were given; see ``VoxelMap.integrate``.
+
+    Raises:
+        ShapeError: something does not fit the depth (H, W), or is of another dtype.
+    """
+    size = f"{depth.shape[0]} {depth.shape[1]}"
+    if rows is None:
+        _expect(probabilities, f"{size} {classes}", np.float32, f"{where}: probabilities")
+        rows = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
+        if known is not None:
+            _expect(known, size, np.bool_, f"{where}: known")
+            rows[~known] = -1
+    else:
+        _expect(probabilities, f"K {classes}", np.float32, f"{where}: probabilities")
+        _expect(rows, size, np.int32, f"{where}: rows")
+        if known is not None or rows.min() < -1 or rows.max() >= len(probabilities):
+            raise ShapeError(f"{where}: rows must be -1 ... {len(probabilities) - 1}, and known None")
+    return np.ascontiguousarray(probabilities).reshape(-1, classes), np.ascontiguousarray(rows)
+
+
+def frame_votes(
+    depth: Float32,
+    table: ProbabilityTable | None,
+    camera: Camera,
+    depth_max_m: float,
+    classes: int,
+    where: str,
+    trust: Float32 | None = None,
+) -> Votes:
+    """Votes of a frame, none without a table; each weighs what the depth under it does, where ``trust`` says so.
+
+    Raises:
+        FrameError: invalid probabilities.
+    """
+    if table is None:
+        return Votes(np.zeros((1, classes), np.float32), np.zeros(depth.shape, np.int32), np.zeros_like(depth))
+    votes, bad = make_votes(*table, depth, camera, depth_max_m)
+    if bad:
+        raise FrameError(
+            f"{where}: {bad} known pixels hold class probabilities that are NaN, negative or do not sum to 1; "
+            "give a softmax, or mark the pixels as not known"
+        )
+    return votes if trust is None or not trust.size else votes._replace(weights=votes.weights * trust)
+
+
+def _expect(array: NDArray[np.generic], shape: str, dtype: type[np.generic], name: str) -> None:
+    expect_shape(array, shape, name)
+    if array.dtype != dtype:
+        raise ShapeError(f"{name}: expected dtype {np.dtype(dtype).name}, got {array.dtype.name}")
+
+
+def fuse_blocks(
+    indices: Int32,
+    buffers: GridBuffers,
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    rgb: UInt8,
+    trust: Float32,
+    votes: Votes,
+    *,
+    measured: bool = True,
+    bounds: DepthBounds = NO_BOUNDS,
+) -> Int64:
+    """Fuse one frame into blocks, in place.
+
+    Args:
+        indices: (B,) buffer indices of the blocks, each once.
+        buffers, camera, limits: Of the grid, the frame and the map.
+        depth, rgb: (H, W) float32 metres and (H, W, 3) uint8.
+        trust: (H, W) float32 fraction of its full weight that each depth counts, or (0, 0): 1.
+        votes: Of the frame.
+        measured: Whether a sensor measured the depth.
+        bounds: Of the depth, where what the frame sees through is to be cleared; see ``clearing``.
+
+    Returns:
+        (B,) voxels of a surface that were cleared.
+    """
+    cleared = np.empty(len(indices), np.int64)
+    look, cap = (MEASURED, limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
+    args = (indices, buffers, camera, limits, depth, rgb, trust, votes, look, cap)
+    _fuse_frame_into_blocks(len(indices), *args, bounds, cleared)
+    return cleared
+
+
+@parallel_kernel()
+def _log_probability_rows(count: int, probabilities: Float32, logs: Float32, proper: Bool) -> None:
+    """Floored log of rows (K, L), and whether each (K,) is of numbers that are not negative and sum to 1."""
+    ...
+
+
+@parallel_kernel()
+def _vote_weights(
+    height: int,
+    depth: Float32,
+    rows: Int32,
+    proper: Bool,
+    camera: Camera,
+    depth_max: float,
+    weights: Float32,
+    bad: Int64,
+) -> None:
+    """Weigh votes (H, W): |cos| of the angle between ray and surface normal, from four neighbours, times nearness.
+
+    ``proper`` (K,) is of ``_log_probability_rows``; ``bad`` (H,) is filled with the known pixels of each row of the
+    image whose probabilities are not proper.
+    """
+    ...
+
+
+@parallel_kernel(chunks_per_thread=4)
+def _fuse_frame_into_blocks(
+    count: int,
+    indices: Int32,
+    buffers: GridBuffers,
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    rgb: UInt8,
+    trust: Float32,
+    votes: Votes,
+    look: float,
+    weight_cap: float,
+    bounds: DepthBounds,
+    cleared: Int64,
+) -> None: ...
+
+
+@parallel_kernel()
+def vote_into_blocks(
+    count: int,
+    indices: Int32,
+    buffers: GridBuffers,
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    votes: Votes,
+    max_votes: float,
+) -> None:
+    """Vote as ``fuse_blocks`` does, at measured voxels with fewer than ``max_votes``, and change nothing else."""
+    ...

@@ -1,1 +1,0 @@
-"""Fusion of frames and votes into voxel blocks."""

@@ -1,0 +1,189 @@
+"""Adding the voxels of one map to another: sums of what both have measured, resampled where their voxels differ.
+
+Two maps with the same voxels add up: weights, evidence and votes are sums, TSDF and colour are means by weight; the
+caps are those of fusion, except that where votes pass theirs, old and new fade alike, since neither map is the older.
+Maps whose voxels do not coincide are interpolated first, between the eight voxels around each new one (trilinear), over
+those of them that were observed and only where these outweigh the others. Across a depth edge, where free space meets
+the back of something, the nearest voxel is taken: in between there would be a surface that nobody saw.
+
+Works on some blocks at a time: what is in memory at once does not grow with the maps. No order among threads matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.errors import MapError
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid, GridBuffers
+from semantic_mapper.mapping.blocks import BlockIndex, BlockValues, empty_blocks, pack_keys, unpack_keys
+from semantic_mapper.types import Float64, Int32, Int64
+
+MERGED_AT_ONCE = 128  # blocks
+SNAP_VOXELS = 1e-6  # a shift nearer than this to whole voxels is one: metres have been rounded on their way here
+SNAP_ROTATION = 1e-9  # likewise for rotations by quarter turns
+
+
+class VoxelTransform(NamedTuple):
+    """Points of map b to map a, in voxels: ``a = R @ b + t``."""
+
+    R: Float64
+    t: Float64
+
+
+def voxel_transform(T_a_b: Float64, voxel_size_m: float) -> VoxelTransform:
+    """In units of voxels, and exact where it maps voxels onto voxels."""
+    R, t = T_a_b[:3, :3], T_a_b[:3, 3] / voxel_size_m
+    if np.abs(R - np.rint(R)).max() < SNAP_ROTATION:
+        R = np.rint(R)
+        if np.abs(t - np.rint(t)).max() < SNAP_VOXELS:
+            t = np.rint(t)
+    return VoxelTransform(np.ascontiguousarray(R), np.ascontiguousarray(t))
+
+
+def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapConfig, labels_b: LabelSet) -> None:
+    """Refuse maps whose voxels mean different things.
+
+    Raises:
+        MapError: another voxel size, or other classes (their colours and the set's name do not matter).
+    """
+    if config_a.voxel_size_m != config_b.voxel_size_m:
+        raise MapError(
+            f"maps of different voxel_map.voxel_size_m ({config_a.voxel_size_m:g} and {config_b.voxel_size_m:g}) "
+            "cannot be merged; make one of them again from its log with the setting of the other"
+        )
+    a, b = (set(zip(labels.ids, labels.names, strict=True)) for labels in (labels_a, labels_b))
+    if a != b or labels_a.ids != labels_b.ids or labels_a.ignore_id != labels_b.ignore_id:
+        differing = ", ".join(f"{i} {name}" for i, name in sorted(a ^ b)) or "their order, or the ignore id"
+        raise MapError(
+            f"maps with different classes cannot be merged: label sets '{labels_a.name}' ({len(labels_a)} classes) and "
+            f"'{labels_b.name}' ({len(labels_b)}) differ in {differing}; make both with the same weights"
+        )
+
+
+def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTransform, cap: float, version: int) -> None:
+    """Add all that ``source`` holds to ``target``; blocks without a measurement are left out.
+
+    Args:
+        target, source: Grids of the same voxel size and classes.
+        T_target_source: Where the source lies.
+        cap: Of weights and of votes.
+        version: That the blocks are marked as changed at.
+
+    Raises:
+        MapError: the target has no room.
+    """
+    pairs = overlaps(source.all_packed(), T_target_source)
+    for packed, added in moved_blocks(source, T_target_source, pairs):
+        add_values(target, packed, added, cap, version)
+
+
+def moved_blocks(
+    source: BlockGrid, T_target_source: VoxelTransform, pairs: Int64
+) -> Iterator[tuple[Int64, BlockValues]]:
+    """Blocks of a target with what a source says of them; those without a measurement are left out.
+
+    Args:
+        source: Is read.
+        T_target_source: Where the source lies.
+        pairs: (P, 2) of ``overlaps``: all, or all pairs of some target blocks.
+
+    Yields:
+        Packed keys (B,), sorted, and their values; at most ``MERGED_AT_ONCE`` at a time.
+    """
+    R_source_target = np.ascontiguousarray(T_target_source.R.T)
+    for wanted, needed in _parts(pairs):
+        grid = source.holding(needed)
+        moved = empty_blocks(len(wanted), source.classes)
+        _resample_blocks(
+            len(wanted), unpack_keys(wanted), R_source_target, T_target_source.t, grid.index, grid.buffers(), moved
+        )
+        holds = (moved.weight > 0).any(axis=1)  # votes come with weight
+        if holds.any():
+            yield wanted[holds], BlockValues(*(part[holds] for part in moved))
+
+
+def add_values(target: BlockGrid, packed: Int64, added: BlockValues, cap: float, version: int) -> None:
+    """Add blocks (B,) of ``moved_blocks`` to a grid; see ``add_blocks``.
+
+    Raises:
+        MapError: the target has no room.
+    """
+    blocks = target.activate(packed)
+    _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
+    target.mark_changed(blocks, version)
+
+
+def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
+    """Make ``target``, which is empty, hold what ``source`` has measured.
+
+    Args:
+        target, source: Grids of the same classes.
+        version: That the blocks are marked as changed at.
+
+    Raises:
+        MapError: the target has no room.
+    """
+    packed = source.all_packed()
+    for start in range(0, len(packed), MERGED_AT_ONCE):
+        part = packed[start : start + MERGED_AT_ONCE]
+        values = source.read(part)
+        holds = (values.weight > 0).any(axis=1)
+        part, values = part[holds], BlockValues(*(array[holds] for array in values))
+        target.mark_changed(target.fill(part, values), version)
+
+
+def count_empty(source: BlockGrid) -> int:
+    """Blocks of a grid that hold no measurement: the band of truncation touched them, and no depth fell into it."""
+    empty = 0
+    for _, blocks, grid in source.tiles():
+        weight = grid.buffers().weight
+        for start in range(0, len(blocks), MERGED_AT_ONCE):
+            empty += int((weight[blocks[start : start + MERGED_AT_ONCE]] == 0).all(axis=1).sum())
+    return empty
+
+
+def overlaps(sources: Int64, T_target_source: VoxelTransform) -> Int64:
+    """Pairs (P, 2) of packed keys, sorted: a block of the target and a source block that may say something of it."""
+    corners = np.array([[x, y, z] for x in (-1, BLOCK_SIDE) for y in (-1, BLOCK_SIDE) for z in (-1, BLOCK_SIDE)])
+    ends = (unpack_keys(sources)[:, None] * BLOCK_SIDE + corners) @ T_target_source.R.T + T_target_source.t
+    # A source block speaks for what lies strictly between: less than a voxel outside of its own voxels 0..7.
+    first = np.floor((np.floor(ends.min(axis=1)) + 1) / BLOCK_SIDE).astype(np.int64)
+    last = np.floor((np.ceil(ends.max(axis=1)) - 1) / BLOCK_SIDE).astype(np.int64)
+    most = int((last - first).max(initial=0)) + 1
+    pairs: list[Int64] = []
+    for step in np.ndindex(most, most, most):
+        inside = (first + step <= last).all(axis=1)
+        keys = (first[inside] + step).astype(np.int32)
+        pairs.append(np.stack((pack_keys(keys), sources[inside]), axis=1))
+    joined = np.concatenate(pairs)
+    return joined[np.lexsort((joined[:, 1], joined[:, 0]))]
+
+
+def _parts(pairs: Int64) -> Iterator[tuple[Int64, Int64]]:
+    """The blocks of the target, some at a time, each time with the source blocks that they need."""
+    wanted, starts = np.unique(pairs[:, 0], return_index=True)
+    ends = np.append(starts[1:], len(pairs))
+    for start in range(0, len(wanted), MERGED_AT_ONCE):
+        stop = min(start + MERGED_AT_ONCE, len(wanted))
+        yield wanted[start:stop], np.unique(pairs[starts[start] : ends[stop - 1], 1])
+
+
+@parallel_kernel()
+def _resample_blocks(
+    count: int, keys: Int32, R: Float64, t: Float64, index: BlockIndex, buffers: GridBuffers, moved: BlockValues
+) -> None:
+    """Interpolate a source at the voxels of other blocks (B, 3), whose point p is the source's ``R @ (p - t)`` in
+    voxels."""
+    ...
+
+
+@parallel_kernel()
+def _add_block_values(count: int, blocks: Int32, buffers: GridBuffers, added: BlockValues, cap: float) -> None:
+    """Add blocks ``added`` to those with buffer indices ``blocks`` (B,), in place."""
+    ...

@@ -1,1 +1,0 @@
-"""Voxel blocks in memory and on disk."""
