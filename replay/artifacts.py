@@ -339,11 +339,7 @@ def versions() -> dict[str, str]:
 
 
 def _write_report(session: MapSession, points: MapPoints, summary: Mapping[str, Any], out: Path) -> None:
-    """Write ``report.html`` to the folder of a replay, with what is there already.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
+    """Write ``report.html`` to the folder of a replay, with what is there already."""
     label_set = session.pipeline.label_set
     overview = out / OVERVIEW_NAME, "Frames, what was rendered for them, and the map from above and aside"
     strips = [

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import msgspec
@@ -81,16 +81,9 @@ class AutolabelRequest:
     instances: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class AutolabelReport:
-    """What was written.
-
-    Args:
-        files: The new log, or its parts.
-        note: Who has labelled it, and the figures.
-        unlabelled: Frames that could not be rendered, with the reason; they are in the new log, without a label.
-        damage: What could not be read, and is not in the new log.
-    """
+class AutolabelReport(NamedTuple):
+    """What was written: the new log or its parts, who has labelled it with which figures, frames that could not be
+    rendered (they are there without a label) with the reason, and what could not be read (and is not there)."""
 
     files: tuple[Path, ...]
     note: AutolabelNote
@@ -161,11 +154,7 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
 
 
 def _load(request: AutolabelRequest, log: Log) -> Mapper:
-    """Weights and the pipeline that renders them, of a field of the scene at least ``SCENE_RAYS`` of a frame.
-
-    Raises:
-        WeightsError: missing, damaged, or they tell no classes apart.
-    """
+    """Weights and the pipeline that renders them, of a field of the scene at least ``SCENE_RAYS`` of a frame."""
     bundle = Mapper.load(request.weights, request.config)
     model = bundle.checkpoint.model
     if not model.knows_classes or len(bundle.label_set) < 2:
@@ -187,11 +176,7 @@ def _load(request: AutolabelRequest, log: Log) -> Mapper:
 
 
 def _label_set(log: Log, weights: LabelSet, request: AutolabelRequest) -> LabelSet:
-    """Classes of the new log: the weights', or the log's where labels of it stay.
-
-    Raises:
-        LabelError: labels stay, and have other classes.
-    """
+    """Classes of the new log: the weights', or the log's where labels of it stay."""
     there = log.info.label_set
     if there is None or request.overwrite_labels:
         return weights
@@ -279,12 +264,7 @@ class _Labeller:
             self.instances = InstanceImages(request.instances, model)
 
     def push(self, message: _Message) -> None:
-        """Take a message.
-
-        Raises:
-            LogError: the disk is full.
-            MapError: the map that depth is rendered from is full.
-        """
+        """Take a message."""
         self._queue.append(message)
         if message.envelope.topic == "frame":
             message.number = self.frames
@@ -293,11 +273,7 @@ class _Labeller:
         self._write_ready()
 
     def finish(self) -> None:
-        """Write what still waits.
-
-        Raises:
-            LogError, MapError: as ``push``.
-        """
+        """Write what still waits."""
         for frame in self._pipeline.prepare_rest():
             self._render(frame)
         self._write_ready()

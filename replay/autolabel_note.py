@@ -13,41 +13,25 @@ AUTOLABEL_ATTACHMENT = "autolabel.json"
 
 
 class AutolabelNote(msgspec.Struct, frozen=True):
-    """How ``autolabel`` has made a log. Nothing in it tells when or where, so that the same run gives the same bytes.
+    """How ``autolabel`` has made a log; not when or where, so that the same run gives the same bytes."""
 
-    Args:
-        weights, digest, kind: Name of the weights file, its SHA-256, and the kind of its field.
-        classes: Of the weights.
-        min_confidence, overwrite_labels, depth, max_frames: What was requested.
-        frames: Looked at.
-        labelled: With a pseudo label.
-        kept: With a label that was there and is no pseudo label.
-        replaced: Labels, not pseudo labels, that gave way to pseudo labels or none.
-        unlabelled: With no label: refused, or nothing of it is sure.
-        depth_written: Frames that got computed or rendered depth.
-        mean_confidence: Of the pixels with a pseudo label; None without one.
-        labelled_pixels: Fraction of the pixels of frames without a label of their own that have got one; None without
-            such frames.
-        train_stamps_ns: Frames whose labels the weights have learned from: what learns from these labels has, too.
-    """
-
-    weights: str
-    digest: str
-    kind: str
-    classes: tuple[str, ...]
-    min_confidence: float
+    weights: str  # name of the file
+    digest: str  # its SHA-256
+    kind: str  # of its field
+    classes: tuple[str, ...]  # of the weights
+    min_confidence: float  # what was requested, as the next three
     overwrite_labels: bool
     depth: bool
     max_frames: int
-    frames: int
-    labelled: int
-    kept: int
-    replaced: int
-    unlabelled: int
-    depth_written: int
-    mean_confidence: float | None
-    train_stamps_ns: tuple[int, ...]
-    labelled_pixels: float | None
+    frames: int  # looked at
+    labelled: int  # with a pseudo label
+    kept: int  # with a label that was there and is no pseudo label
+    replaced: int  # labels, not pseudo labels, that gave way to pseudo labels or none
+    unlabelled: int  # with no label: refused, or nothing of it is sure
+    depth_written: int  # frames that got computed depth
+    mean_confidence: float | None  # of the pixels with a pseudo label; None without one
+    train_stamps_ns: tuple[int, ...]  # that the weights have learned from: what learns from these labels has, too
+    labelled_pixels: float | None  # fraction of the pixels of frames without a label of their own; None without such
 
     def attachment(self) -> LogAttachment:
         """As it stands in the log."""

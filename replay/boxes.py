@@ -204,11 +204,7 @@ def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]
 
 
 def _metres(value: Any, name: str) -> Float64:
-    """Lengths or places as an array.
-
-    Raises:
-        ConfigError: one is not within the 100 km that a map may cover.
-    """
+    """Lengths or places as an array."""
     array = np.array(value, np.float64)
     if not (np.abs(array) <= MAX_TRANSLATION_M).all():
         raise ConfigError(f"{name} must be metres within {MAX_TRANSLATION_M / 1000:g} km")
@@ -216,12 +212,7 @@ def _metres(value: Any, name: str) -> Float64:
 
 
 def _box_of(box: Primitive) -> Primitive:
-    """A primitive whose outline or mesh is one, with the origin of its axes in its middle.
-
-    Raises:
-        ConfigError: it is thin, open, or crosses itself, or its id cannot be one.
-        PoseError: a pose is invalid.
-    """
+    """A primitive whose outline or mesh is one, with the origin of its axes in its middle."""
     if not 1 <= box.id <= MAX_ID:
         raise ConfigError(f"id must be a whole number from 1 to {MAX_ID}, got {box.id}")
     if not (box.size >= MIN_SIZE_M).all():
@@ -376,11 +367,7 @@ def _read_xml(text: bytes, path: Path) -> BoxFile:
 
     Each has ``label``, ``index``, ``transform`` (4x4, may scale), ``vertices``, ``faces``, ``instanceId`` and
     ``timestamp``. One that moves is there many times, each with the number of a frame of the drive as its timestamp,
-    and becomes one box with its poses by frame; -1 says that it stands still.
-
-    Raises:
-        ConfigError: no XML, or no objects in it.
-    """
+    and becomes one box with its poses by frame; -1 says that it stands still."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from semantic_mapper.config import AtLeastZero, Config
 from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.run_folder import map_path
 from semantic_mapper.replay.summary import SUMMARY_FILE, dig, read_summary
 
-MAP_FILE = "map.npz"
 COUNTS = ("published", "fused", "dropped", "refused", "labels_refused", "scored")  # below ``frames`` of a summary
 SCORES = (
     "metrics.miou",
@@ -39,34 +39,22 @@ class Tolerances(Config, frozen=True):
     labels: AtLeastZero = 0.01  # fraction of the surface that both have whose nearest point has another class
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Run:
-    """One run of a log.
-
-    Args:
-        name: For people.
-        voxel_map: Its map.
-        summary: Its ``summary.json``; None where only the map is known.
-    """
+class Run(NamedTuple):
+    """One run of a log: its name for people, its map, and its summary, None where only the map is known."""
 
     name: str
     voxel_map: VoxelMap
     summary: Mapping[str, Any] | None
 
 
-def map_file(path: Path) -> Path:
-    """The map of a run's folder; a saved map is its own."""
-    return path / MAP_FILE if path.is_dir() else path
-
-
 def read_run(path: Path) -> Run:
     """Read the folder that a replay or a mapper node has left, or a saved map alone.
 
     Raises:
-        ConfigError: a folder with a damaged summary.
-        MapError: no map there, or a damaged one.
+        ConfigError: no map there, a log, or a folder with a damaged summary.
+        MapError: a damaged map.
     """
-    voxel_map = VoxelMap.load(map_file(path))
+    voxel_map = VoxelMap.load(map_path(path))
     # A mapper saves its map before its summary.
     summary = read_summary(path) if (path / SUMMARY_FILE).exists() else None
     return Run(str(path), voxel_map, summary)
@@ -74,14 +62,7 @@ def read_run(path: Path) -> Run:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One figure of two runs.
-
-    Args:
-        name: Of the figure.
-        a, b: Of each run; None where it has none.
-        difference: Between them; None where only one of them has the figure, or only one of the maps a surface.
-        allowed: The largest that is no difference.
-    """
+    """One figure of two runs, None where one has none; the distance of both, and the largest that is no difference."""
 
     name: str
     a: float | None
@@ -102,12 +83,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two runs, compared.
-
-    Args:
-        figures: That were compared.
-        notes: What else differs, and what could not be compared.
-    """
+    """Two runs, compared: figures, what else differs, and what could not be compared."""
 
     figures: list[Difference]
     notes: list[str]

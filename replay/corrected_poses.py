@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,15 +27,8 @@ _PORTION = 8  # frames
 _log = get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Corrected poses in order of time.
-
-    Args:
-        path: Where they come from.
-        stamps_ns: (N,).
-        poses: (N, 4, 4) T_world_camera.
-    """
+class Trajectory(NamedTuple):
+    """Corrected poses in order of time, stamps (N,) and T_world_camera (N, 4, 4), and where they come from."""
 
     path: Path
     stamps_ns: NDArray[np.int64]

@@ -193,11 +193,7 @@ def _fit(
     request: FinetuneRequest,
     monitor: JobMonitor,
 ) -> Checkpoint:
-    """Fit, with progress.
-
-    Raises:
-        KeyboardInterrupt: a stop request came before anything was learned: no reason to touch the file.
-    """
+    """Fit, with progress."""
     monitor.start(100)
 
     def on_progress(progress: FitProgress) -> None:
@@ -220,11 +216,7 @@ def _fit(
 
 
 def _check_options(request: FinetuneRequest, kind: str) -> None:
-    """Refuse options that go with other weights.
-
-    Raises:
-        ConfigError: which.
-    """
+    """Refuse options that go with other weights."""
     if request.unlabelled is not None and kind not in FITTERS:
         raise ConfigError(f"--unlabelled: weights of kind '{kind}' learn from labelled frames alone; leave it out")
     if request.config.irt.variant is not None and kind != IRT.kind:
@@ -232,11 +224,7 @@ def _check_options(request: FinetuneRequest, kind: str) -> None:
 
 
 def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[FrameKey, ComputedFrame]:
-    """What ``config`` asks to compute; nothing of a log whose first frame has depth, unless it says "computed".
-
-    Raises:
-        KeyboardInterrupt: a stop request came.
-    """
+    """What ``config`` asks to compute; nothing of a log whose first frame has depth, unless it says "computed"."""
     if config.source not in ("auto", "computed"):
         return {}
     if config.source == "auto" and next(iter(log)).depth_m is not None:
@@ -301,11 +289,7 @@ def _no_hint(frame: PosedFrame, intrinsics: CameraIntrinsics) -> tuple[Float32, 
 
 
 def _go_on(monitor: JobMonitor, done: int, note: str) -> None:
-    """Report progress.
-
-    Raises:
-        KeyboardInterrupt: a stop request came.
-    """
+    """Report progress."""
     monitor.set(done, note)
     if monitor.stopped_by:
         raise KeyboardInterrupt

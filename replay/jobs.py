@@ -227,11 +227,7 @@ def evaluate_log(
 
 
 def _check_scorable(log: Log) -> None:
-    """Make sure that not all labels of a log were rendered by weights.
-
-    Raises:
-        LabelError: they were.
-    """
+    """Make sure that not all labels of a log were rendered by weights."""
     pseudo = 0
     for envelope, _ in log.frame_parts():
         if envelope.has_label and not envelope.has_pseudo_label:

@@ -30,17 +30,11 @@ MAX_CLASSES_BYTES = 1 << 16  # of a text file of names
 
 
 class LogIdentity(msgspec.Struct, frozen=True):
-    """Which log label images are of.
+    """Which log label images are of."""
 
-    Args:
-        name: Of its file, for people; a log may be renamed.
-        frames: How many it has.
-        digest: Of the stamps, cameras and poses of its first, middle and last frame.
-    """
-
-    name: str
+    name: str  # of its file, for people; a log may be renamed
     frames: int
-    digest: str
+    digest: str  # of the stamps, cameras and poses of its first, middle and last frame
 
 
 class _NamedLog(msgspec.Struct):
@@ -63,12 +57,7 @@ def log_identity(log: Log) -> LogIdentity:
 
 @dataclass(frozen=True, slots=True)
 class LabelFolder:
-    """A folder of label images of one log.
-
-    Args:
-        path: Of the folder.
-        label_set: Their classes.
-    """
+    """A folder of label images of one log, and their classes."""
 
     path: Path
     label_set: LabelSet
@@ -78,24 +67,12 @@ class LabelFolder:
         return sorted(self._files())
 
     def labelled(self, frame: PosedFrame, number: int) -> PosedFrame:
-        """A frame with its label image in place of its own.
-
-        Args:
-            frame: Of the log.
-            number: Of it in the log.
-
-        Raises:
-            LogError: as ``read``.
-        """
+        """A frame, by its number in the log, with its label image in place of its own; errors as of ``read``."""
         label = self.read(number, (frame.intrinsics.height, frame.intrinsics.width))
         return replace(frame, label=label, label_is_pseudo=False)
 
     def read(self, number: int, size: tuple[int, int]) -> UInt8:
-        """Label image (H, W) of a frame.
-
-        Args:
-            number: Of the frame.
-            size: (height, width) of the frame.
+        """Label image (H, W) of a frame of that size.
 
         Raises:
             LogError: it is missing or damaged, of another size, or names other classes.

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,8 +33,7 @@ MAX_VIEW_POINTS = 300_000  # 10 bytes each
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
+class Picture(NamedTuple):
     """A picture with its source, a ``data:`` URL."""
 
     source: str
@@ -140,16 +139,15 @@ def point_view(points: MapPoints, label_set: LabelSet, up: Float64 | None) -> di
     middle = np.percentile(xyz, (1, 99), axis=0)  # few stray points are no part of the first look
     table = np.full((256, 4), (*UNKNOWN, 255), np.uint8)
     table[list(label_set.ids), :3] = label_set.colors
-    rows = class_rows(points.label, label_set)
-    ids = dict(zip(label_set.names, label_set.ids, strict=True))
+    ids = dict(zip(label_set.names, label_set.ids, strict=True)) | {"unknown": label_set.ignore_id}
     classes = [
         {
-            "id": label_set.ignore_id if color is UNKNOWN else ids[name],
+            "id": ids[name],
             "name": name,
             "color": "rgb({},{},{})".format(*color),
+            "share": f"{100 * (fraction or 0):.1f} %",
         }
-        | {"share": f"{100 * (fraction or 0):.1f} %"}
-        for name, color, fraction in rows
+        for name, color, fraction in class_rows(points.label, label_set)
     ]
     data = {
         "count": count,

@@ -119,14 +119,11 @@ def map_path(path: Path) -> Path:
 
 def _instead_of_map(folder: Path) -> str:
     """What to do about a folder without a map, from what is in it."""
-    maps = sorted(file.name for file in folder.glob(f"*{MAP_SUFFIX}"))
     if (folder / STORE_MARK).is_file():
         return "a fleet's store: `fleet merge` fuses its maps; or name one of them in files/"
+    maps = [*sorted(folder.glob(f"*{MAP_SUFFIX}")), *sorted(folder.glob(f"*/{MAP_NAME}"))]
     if maps:
-        return f"name the map itself, such as {folder / maps[0]}"
-    results = sorted(file.parent.name for file in folder.glob(f"*/{MAP_NAME}"))
-    if results:
-        return f"there is one in {folder / results[0]}"
+        return f"name the map itself, such as {maps[0]}"
     if is_log(folder):
         return f"its logs hold frames: `semantic-mapper replay {folder} --out FOLDER` makes a map of them"
     return "give a saved map or a folder that `replay` has written"

@@ -18,8 +18,9 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.nearest import NearestSurface, at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.replay.compare import MAP_FILE, Comparison, Run, Tolerances, compare_runs, read_run
+from semantic_mapper.replay.compare import Comparison, Run, Tolerances, compare_runs, read_run
 from semantic_mapper.replay.jobs import replay_log
+from semantic_mapper.replay.run_folder import MAP_NAME
 from semantic_mapper.replay.summary import SUMMARY_FILE
 
 UPDATE_OPTION = "--update-runs"
@@ -67,17 +68,12 @@ class ReplayedMap:
         """The surface of a class that is nearest to a point: ``xyz``, ``distance_m``, ``confidence``; None = nowhere.
 
         Raises:
-            LabelError: no such class; lists those there are.
-            MapError: not a point.
+            LabelError, MapError: no such class; not a point.
         """
         return nearest(self.snapshot, class_name, point, min_confidence)
 
     def is_free(self, point: ArrayLike) -> bool:
-        """Whether a point is known to be free: neither occupied nor unknown.
-
-        Raises:
-            MapError: not a point.
-        """
+        """Whether a point is known to be free: neither occupied nor unknown."""
         return int(occupancy(self.snapshot, np.asarray(point)[None])[0]) == State.FREE
 
     @property
@@ -97,20 +93,12 @@ class ReplayedMap:
 
     @property
     def miou(self) -> float:
-        """Of the rendered views against the labels of the log, 0..1.
-
-        Raises:
-            LogError: no frame of the log has labels that count.
-        """
+        """Of the rendered views against the labels of the log, 0..1; ``LogError`` without labels that count."""
         return self._score("miou")
 
     @property
     def map_miou(self) -> float:
-        """Of the map's surface against the labels of the log, 0..1.
-
-        Raises:
-            LogError: no frame of the log has labels that count.
-        """
+        """Of the map's surface against the labels of the log, 0..1; ``LogError`` without labels that count."""
         return self._score("map_miou")
 
     def compare(self, stored: Path | str, **tolerances: float) -> Comparison:
@@ -129,23 +117,16 @@ class ReplayedMap:
         return compare_runs(earlier, Run(str(self.folder), self.voxel_map, self.summary), allowed)
 
     def store(self, target: Path | str) -> None:
-        """Write what ``compare`` needs of this run to a folder, made if missing.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write what ``compare`` needs of this run to a folder, made if missing."""
         folder = self.root / target
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (MAP_FILE, SUMMARY_FILE):
+        for name in (MAP_NAME, SUMMARY_FILE):
             shutil.copyfile(self.folder / name, folder / name)
 
     def assert_like(self, stored: Path | str, **tolerances: float) -> None:
         """Fail where this run is not as an earlier one within tolerances; see ``compare``.
 
         ``pytest --update-runs`` stores this run there instead. A failure names what differs.
-
-        Raises:
-            AssertionError: it differs, or no run is stored there.
         """
         target = self.root / stored
         if self.update:
@@ -206,21 +187,15 @@ class LogReplays:
         """
         log = self._root / log
         weights = None if weights is None else self._root / weights
-        mapper = self._read_config(config, quality)
-        key = repr((log, weights, mapper, max_frames))
-        if key not in self._done:
-            self._done[key] = self._replay(log, weights, mapper, max_frames)
-        return self._done[key]
-
-    def _read_config(self, config: Settings, quality: Quality) -> MapperConfig:
-        data = dict(config) if isinstance(config, Mapping) else read_toml(self._root / config) if config else {}
         where = "config of the replay" if isinstance(config, Mapping) else str(config)
+        data = dict(config) if isinstance(config, Mapping) else read_toml(self._root / config) if config else {}
         data |= {} if quality is None else {"quality": quality}
         mapper = convert_config(data, MapperConfig, where)
         check_quality(data, mapper.quality, where)
-        return mapper
-
-    def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
-        folder = self._make_folder(path.stem)
-        result = replay_log(path, folder, weights, config, max_frames)
-        return ReplayedMap(folder, result.session.pipeline.voxel_map, result.summary, self._root, self._update)
+        key = repr((log, weights, mapper, max_frames))
+        if key not in self._done:
+            folder = self._make_folder(log.stem)
+            result = replay_log(log, folder, weights, mapper, max_frames)
+            session, summary = result.session, result.summary
+            self._done[key] = ReplayedMap(folder, session.pipeline.voxel_map, summary, self._root, self._update)
+        return self._done[key]

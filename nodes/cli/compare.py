@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.errors import ConfigError, SemanticMapperError
+from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.nodes.cli.verb import show_error, verb
 from semantic_mapper.nodes.console import Output
-from semantic_mapper.replay.compare import Difference, Tolerances, compare_runs, map_file, read_run
-from semantic_mapper.replay.run_folder import is_log
+from semantic_mapper.replay.compare import Difference, Tolerances, compare_runs, read_run
+from semantic_mapper.replay.run_folder import map_path
 
 EXIT_DIFFERS = 1
 EXIT_TROUBLE = 2
@@ -48,15 +48,9 @@ def compare(
     given = {"score": score, "surface_m": surface_m, "labels": labels}
     tolerances = Tolerances(**{name: value for name, value in given.items() if value is not None})
     try:
-        for path in (a, b):
-            if path.exists() and is_log(path):
-                raise ConfigError(
-                    f"{path}: is a log, and `compare` takes maps or results of runs: `semantic-mapper replay {path} "
-                    "--out FOLDER` makes one, to be named here as FOLDER"
-                )
         comparison = compare_runs(read_run(a), read_run(b), tolerances)
         if exact:
-            other = 0 if filecmp.cmp(map_file(a), map_file(b), shallow=False) else 1
+            other = 0 if filecmp.cmp(map_path(a), map_path(b), shallow=False) else 1
             comparison.figures.append(Difference("other bytes", None, None, other))
     except SemanticMapperError as error:
         show_error(str(error))

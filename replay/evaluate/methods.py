@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, Segments, confusion_of
 from semantic_mapper.evaluation.panoptic import PanopticImage
@@ -31,14 +31,9 @@ from semantic_mapper.types import Float32, PosedFrame, UInt8
 _log = get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Opinion:
-    """What a method says of a frame.
-
-    Args:
-        label: (H, W) uint8 ids; the ignore id = unknown.
-        confidence: (H, W) float32 probability of ``label``; None where the method has none.
-    """
+class Opinion(NamedTuple):
+    """What a method says of a frame: ids (H, W) uint8, the ignore id = unknown, and their probability (H, W) float32;
+    None where the method has none."""
 
     label: UInt8
     confidence: Float32 | None = None
@@ -78,7 +73,9 @@ class Evaluation:
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
     """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one), and what its
     encoder says of the frame alone, where it has an opinion of single images."""
-    novel = _with_current_view(bundle.pipeline.config, False)
+    config = bundle.pipeline.config
+    keyframes = msgspec.structs.replace(config.keyframes, use_current_view=False)
+    novel = msgspec.structs.replace(config, keyframes=keyframes)
     pipeline = MappingPipeline(
         novel, make_field(bundle.checkpoint.model, novel), bundle.pipeline.label_set, anchors=bundle.checkpoint.anchors
     )
@@ -225,9 +222,3 @@ def _of_confidence(scores: ConfidenceScores) -> dict[str, float | None]:
     sure, right = scores.above(SURE)
     auroc = scores.open_set_auroc
     return {"ece": scores.calibration_error, "sure": sure, "sure_right": right, "open_set_auroc": auroc}
-
-
-def _with_current_view(config: MapperConfig, use: bool) -> MapperConfig:
-    plain = to_plain(config)
-    plain["keyframes"]["use_current_view"] = use
-    return convert_config(plain, MapperConfig, "mapper config")

@@ -236,11 +236,7 @@ class _OneCamera:
         return ["lens distortion is not in the files: undistort the images with the log's own"] if bent else []
 
     def check(self, frame: PosedFrame) -> None:
-        """Take the first frame's.
-
-        Raises:
-            LeftOut: a later frame has others.
-        """
+        """Take the first frame's."""
         self.value = self.value or frame.intrinsics
         if frame.intrinsics != self.value:
             raise LeftOut("its camera has other intrinsics than the first frame's, and the layout has but one")

@@ -26,7 +26,7 @@ from semantic_mapper.mapping.formats import (
     write_ply,
 )
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
-from semantic_mapper.mapping.map_types import MapMesh, require_metres
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.types import Float64
@@ -115,9 +115,8 @@ def parse_transform(text: str) -> Float64:
         ConfigError: neither of these.
         PoseError: the file holds something else than a rigid transform.
     """
-    words = text.replace(",", " ").split()
     try:
-        numbers = [float(word) for word in words]
+        numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         return _read_transform(Path(text))
     if len(numbers) != 4 or not np.isfinite(numbers).all():
@@ -197,26 +196,21 @@ def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> E
 
 
 def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
-    labels = voxel_map.label_set
+    labels, scale_known = voxel_map.label_set, voxel_map.scale_known
     mesh = sure_faces(voxel_map.mesh(request.min_weight), request.min_confidence)
     if not len(mesh.faces):
         raise MapError("the map has no surface to mesh, or none that is measured so often and so sure")
     color = request.color or "rgb"
     mesh, files, found = colored(mesh, labels, color), (path,), ()
     if request.format == "ply-mesh":
-        write_ply(path, mesh, labels, scale_known=voxel_map.scale_known)
+        write_ply(path, mesh, labels, scale_known=scale_known)
     elif request.format == "obj":
-        scale_known = voxel_map.scale_known
         files = write_obj(path, mesh, labels, class_materials=color == "class", scale_known=scale_known)
     else:
-        found = _write_glb(voxel_map, path, mesh, request)
+        up = request.up if request.up is not None else find_up(voxel_map.points(request.min_weight), labels)
+        write_glb(path, mesh, labels, up, scale_known=scale_known)
+        found = _found_up(request, up)
     return ExportReport(files, f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces", found)
-
-
-def _write_glb(voxel_map: VoxelMap, path: Path, mesh: MapMesh, request: ExportRequest) -> tuple[str, ...]:
-    up = request.up if request.up is not None else find_up(voxel_map.points(request.min_weight), voxel_map.label_set)
-    write_glb(path, mesh, voxel_map.label_set, up, scale_known=voxel_map.scale_known)
-    return _found_up(request, up)
 
 
 def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:

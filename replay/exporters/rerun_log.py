@@ -119,7 +119,7 @@ class RerunLog:
         stream.log("/", rr.AnnotationContext(infos), static=True)
 
     def note_scale(self, known: bool) -> None:
-        """Whether lengths are metres; where not, the recording says so (entity ``scale``)."""
+        """Where lengths are no metres, the recording says so (entity ``scale``)."""
         if not known:
             self.note("scale", "unknown; lengths are not metres")
 
@@ -309,48 +309,44 @@ class RerunExporter:
     def __init__(self, path: Path, info: StreamInfo) -> None:
         self.notices: list[str] = []
         self._label_set = info.label_set or make_label_set("none", ["no class"])
-        self._noted_pseudo = self._noted_computed = False
+        self._noted: set[str] = set()
         self._log = RerunLog(recording_file(path), self._label_set)
         self._log.note_scale(info.scale_known)
 
     def add(self, item: ExportFrame) -> None:
-        """Draw one frame."""
-        if item.frame.label_is_pseudo and not self._noted_pseudo:
-            self._noted_pseudo = True
-            self._log.note("labels", "pseudo labels, which weights have rendered: no truth")
-            self.notices.append("labels are pseudo labels, at least of some frames; the entity `labels` says so")
-        if item.frame.depth_sigma_m is not None and not self._noted_computed:
-            self._noted_computed = True
-            self._log.note("depth", "computed, not a sensor's, at least of some frames")
-            self.notices.append("depth is computed, at least of some frames; the entity `depth` says so")
-        self._log.log_step(item.frame, self._as_update(item.frame))
-
-    def finish(self) -> None:
-        """Close the file."""
-        nothing = MapPoints(
-            np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8), np.zeros(0, np.float32)
-        )
-        self._log.finish(nothing)
-
-    def _as_update(self, frame: PosedFrame) -> MapUpdate:
-        """What the log itself says of a frame, where a session has what was rendered."""
+        """Draw one frame: what the log itself says of it, where a session has what was rendered."""
+        frame = item.frame
+        if frame.label_is_pseudo:
+            self._note("labels", "pseudo labels, which weights have rendered: no truth")
+        if frame.depth_sigma_m is not None:
+            self._note("depth", "computed, not a sensor's")
         size = (frame.intrinsics.height, frame.intrinsics.width)
-        label = frame.label if frame.label is not None else np.full(size, self._label_set.ignore_id, np.uint8)
-        depth = frame.depth_m if frame.depth_m is not None else np.zeros(size, np.float32)
-        return MapUpdate(
+        update = MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
             camera_id=frame.camera_id,
             fused=False,
             is_keyframe=False,
             source_seqs=(),
-            label=label,
+            label=np.full(size, self._label_set.ignore_id, np.uint8) if frame.label is None else frame.label,
             confidence=np.zeros(size, np.float32),
-            depth_m=depth,
+            depth_m=np.zeros(size, np.float32) if frame.depth_m is None else frame.depth_m,
             blocks=0,
             blocks_touched=0,
             stage_ms={},
         )
+        self._log.log_step(frame, update)
+
+    def _note(self, name: str, text: str) -> None:
+        if name not in self._noted:
+            self._noted.add(name)
+            self._log.note(name, f"{text}, at least of some frames")
+            self.notices.append(f"{name}: {text}, at least of some frames; the entity `{name}` says so")
+
+    def finish(self) -> None:
+        """Draw the way of each camera, and close the file."""
+        nothing = np.zeros((0, 3), np.float32)
+        self._log.finish(MapPoints(nothing, nothing.astype(np.uint8), np.zeros(0, np.uint8), np.zeros(0, np.float32)))
 
 
 class Eye(NamedTuple):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import atomic_folder, atomic_path, write_bytes
@@ -34,15 +33,8 @@ _FOLDERS = ("tum", "folder")
 _ONE_CAMERA = ("trajectory", "tum", "folder")
 
 
-@dataclass(frozen=True, slots=True)
-class LogExportReport:
-    """What was written.
-
-    Args:
-        frames: Written.
-        left_out: Frames that could not be, with the reason.
-        notices: Sentences on what the format could not hold.
-    """
+class LogExportReport(NamedTuple):
+    """What was written: how many frames, those that could not be with the reason, and what the format cannot hold."""
 
     frames: int
     left_out: tuple[str, ...]
@@ -141,11 +133,7 @@ def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
 
 
 def _choose_camera(log: Log, camera: str, name: LogFormat) -> str:
-    """The camera to write, empty = all.
-
-    Raises:
-        ConfigError: it is not in the log, or has to be named.
-    """
+    """The camera to write, empty = all."""
     if not camera and name not in _ONE_CAMERA:
         return ""
     there = sorted({envelope.source for envelope, _ in log.frame_parts()})
@@ -157,11 +145,7 @@ def _choose_camera(log: Log, camera: str, name: LogFormat) -> str:
 
 
 def _unpacked(envelope: Envelope, parts: list[bytes]) -> ExportFrame:
-    """Decode a frame.
-
-    Raises:
-        CodecError: it is damaged.
-    """
+    """Decode a frame."""
     frame = decode_as(PosedFrame, parts)
     if envelope.rgb_encoding == "raw":
         return ExportFrame(frame, encoded(frame.rgb), envelope.depth_scale)

@@ -164,11 +164,7 @@ def read_payloads(fd: int, offset: int, length: int, most: int | None = None) ->
 
 
 def _unpack_chunk(record: bytes) -> bytes:
-    """The records of a chunk.
-
-    Raises:
-        ValueError, RuntimeError, ZstdError: damaged, or larger than a chunk may be.
-    """
+    """The records of a chunk."""
     _, _, unpacked, crc, name_bytes = _CHUNK.unpack_from(record, _RECORD.size)
     at = _RECORD.size + _CHUNK.size
     name = record[at : at + name_bytes]
@@ -192,11 +188,7 @@ def _unpack_chunk(record: bytes) -> bytes:
 
 
 def _messages(read: Callable[[int, int], bytes], size: int, most: int | None) -> Iterator[tuple[int, int]]:
-    """First byte and end of the data, at ``most`` so much of it, of each message in the records of a chunk.
-
-    Raises:
-        ValueError, struct.error: these are no records, or more than a chunk may hold.
-    """
+    """First byte and end of the data, at ``most`` so much of it, of each message in the records of a chunk."""
     at = 0
     for _ in range(MAX_CHUNK_RECORDS):
         if at >= size:

@@ -13,19 +13,10 @@ LONG_INTERVAL = 2.5  # times the median interval; one dropped frame makes 2
 
 
 def find_missing_frames(seqs: Sequence[int], stamps_ns: Sequence[int]) -> dict[str, Any]:
-    """Frames that are missing from those of one camera.
+    """Frames that are missing from those of one camera, by its sequence numbers and times of capture; plain data.
 
-    A camera that is recorded every n-th frame misses none: n is the median step of its sequence numbers.
-
-    Args:
-        seqs: Sequence numbers in the order of the log.
-        stamps_ns: Times of capture, as many.
-
-    Returns:
-        Plain data: ``frames_missing``, in ``sequence_gap_count`` places; ``time_gap_count`` intervals longer
-        than ``LONG_INTERVAL`` times ``interval_s``, the median (null below two frames); of both the
-        largest and the sequence number before it; ``counter_restarts``, where numbers begin again;
-        ``stamps_not_increasing``.
+    A camera that is recorded every n-th frame misses none: n is the median step of its sequence numbers. Intervals
+    count from ``LONG_INTERVAL`` times ``interval_s`` on, the median (null below two frames).
     """
     steps = np.diff(np.asarray(seqs, np.int64))
     onward = steps > 0

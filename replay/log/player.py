@@ -142,12 +142,7 @@ class _Run:
         self.errors: list[LogError] = []
 
     def frames(self, total: int) -> Iterator[Envelope]:
-        """Send frame after frame.
-
-        Raises:
-            NodeError: lockstep, and the mapper has gone, or has not answered in time.
-            TransportError: a subscriber does not take the frame.
-        """
+        """Send frame after frame."""
         for envelope, parts in self._log.frame_parts():
             if envelope.stamp_ns < self._options.from_stamp_ns:
                 continue

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 import msgspec
 
@@ -23,23 +23,15 @@ HEAD_BYTES = 128  # of a message, which tell its topic
 MAX_INFOS = 1024  # messages that describe a stream; a recording has one a camera and restart
 
 
-@dataclass(frozen=True, slots=True)
-class LogAttachment:
-    """A file that is kept in a log.
-
-    Args:
-        name: Of the file ("calibration.json").
-        media_type: What it is ("application/json").
-        data: Its bytes.
-    """
+class LogAttachment(NamedTuple):
+    """A file that is kept in a log: its name ("calibration.json"), its kind ("application/json"), and its bytes."""
 
     name: str
     media_type: str
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
+class _Entry(NamedTuple):
     """Where a message stands: the chunk's place in the file, and the message's place in the chunk."""
 
     number: int
@@ -186,35 +178,23 @@ class LogReader:
 
     def _read_info(self, found: Scan) -> StreamInfo:
         """What the stream is; of several cameras, each tells of itself when it begins."""
-        first = self._read_first_info(found)
-        cameras, sources = dict(first.cameras), [first.source]
-        infos = (entry for entry in self._index if entry.topic == "info")
-        for entry in islice(infos, MAX_INFOS):
+        first = self._info_attached(found)
+        cameras, sources = ({}, []) if first is None else (dict(first.cameras), [first.source])
+        for entry in islice((entry for entry in self._index if entry.topic == "info"), MAX_INFOS):
             try:
                 info = decode_as(StreamInfo, self._read(entry))
-            except (LogError, CodecError):  # reported when its turn comes
+            except (LogError, CodecError) as error:
+                if first is None:  # else reported when its turn comes
+                    self._report(LogError(f"{self._where(entry)}: {error}"))
                 continue
-            if not set(info.cameras) <= set(cameras):
+            first = first or info
+            if not sources or not set(info.cameras) <= set(cameras):
                 cameras |= info.cameras
                 sources.append(info.source)
-        if len(sources) == 1:
-            return first
-        return msgspec.structs.replace(first, source=" + ".join(sources), cameras=cameras, frame_count=None)
-
-    def _read_first_info(self, found: Scan) -> StreamInfo:
-        for offset, length in found.attachments:
-            attachment = read_attachment(self._file.fileno(), offset, length)
-            if attachment is not None and attachment.name == INFO_ATTACHMENT:
-                try:
-                    return decode_as(StreamInfo, unpack_parts(attachment.data))
-                except CodecError as error:
-                    self._report(LogError(f"{self.path}: stream information at byte {offset}: {error}"))
-        infos = (entry for entry in self._index if entry.topic == "info")
-        for entry in islice(infos, MAX_INFOS):
-            try:
-                return decode_as(StreamInfo, self._read(entry))
-            except (LogError, CodecError) as error:
-                self._report(LogError(f"{self._where(entry)}: {error}"))
+        if first is not None:
+            if len(sources) == 1:
+                return first
+            return msgspec.structs.replace(first, source=" + ".join(sources), cameras=cameras, frame_count=None)
         if self.errors:
             raise LogError(
                 f"{self.path}: its stream information (cameras and classes) cannot be used: {self.errors[0]}; record "
@@ -224,6 +204,16 @@ class LogReader:
             f"{self.path}: says nothing of its cameras and classes: not a log of semantic-mapper (what `export` writes "
             f"for Foxglove is not one either: use the log it was made of), or cut off before its first frame"
         )
+
+    def _info_attached(self, found: Scan) -> StreamInfo | None:
+        for offset, length in found.attachments:
+            attachment = read_attachment(self._file.fileno(), offset, length)
+            if attachment is not None and attachment.name == INFO_ATTACHMENT:
+                try:
+                    return decode_as(StreamInfo, unpack_parts(attachment.data))
+                except CodecError as error:
+                    self._report(LogError(f"{self.path}: stream information at byte {offset}: {error}"))
+        return None
 
     def _report_damages(self, found: Scan) -> None:
         if found.damaged_from is not None:

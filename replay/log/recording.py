@@ -60,10 +60,9 @@ class Recording:
 
     Args:
         path: Of the first part; the folder has to be there.
-        info: What the stream is; stands in each part.
+        info: What the stream is; stands in each part, as ``attachments`` do.
         rules: See ``RecordingRules``.
         recording: Name of the recording, the same for all that is part of it.
-        attachments: Kept in each part.
         overwrite: Replace a recording that is there, its numbered parts included.
         goes_on: A recording was interrupted: go on in the part after the last one that is there. Of the parts that are
             there, those of the same ``recording`` may be deleted.
@@ -197,11 +196,7 @@ class Recording:
         return bool(too_large) or bool(rules.split_s and self._clock() - self._began >= rules.split_s)
 
     def _begin_part(self) -> None:
-        """Open the next part.
-
-        Raises:
-            LogError: it cannot be written.
-        """
+        """Open the next part."""
         self._part = self._open(self._number + 1)
         self._number += 1
         self._began = self._clock()

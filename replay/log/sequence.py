@@ -33,16 +33,7 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class LogSequence:
-    """The parts of one recording, open for reading; gives what ``LogReader`` gives of one.
-
-    Args:
-        paths: Of the parts, in any order.
-        on_error: Called with each error as it is found.
-        allow_empty: Open parts without a single frame too.
-
-    Attributes:
-        path: Of the first part.
-        info: Of the first part.
+    """The parts of one recording (in any order), open for reading; gives what ``LogReader`` gives of one.
 
     Raises:
         LogError: a part cannot be opened, or they are no parts of one recording.
@@ -225,11 +216,7 @@ def parts_on_disk(first: Path) -> dict[int, Path]:
 
 
 def _missing_parts(opened: Sequence[tuple[int, LogReader]]) -> list[str]:
-    """What is missing of a recording, for people.
-
-    Raises:
-        LogError: a part is named twice.
-    """
+    """What is missing of a recording, for people."""
     notices: list[str] = []
     first, log = opened[0]
     if first:

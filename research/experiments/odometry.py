@@ -9,7 +9,7 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,7 @@ def report(run: Run) -> dict[str, Any]:
     at_end = float(np.linalg.norm(e[-1, :3, 3] - g[-1, :3, 3]))
     sigma = np.array(run.sigma_m)[known]
     off = np.linalg.norm(e[:, :3, 3] - g[:, :3, 3], axis=1)
-    absolute = asdict(absolute_trajectory_error(e, g))
+    absolute = absolute_trajectory_error(e, g)._asdict()
     return {
         "frames": len(given),
         "path_m": path,
@@ -94,8 +94,8 @@ def report(run: Run) -> dict[str, Any]:
         "corrections": run.corrections,
         "end_without_alignment_m": at_end,
         "off_by_at_most_3_sigma_share": float((off[1:] <= 3 * sigma[1:]).mean()),
-        "rpe_frame": asdict(relative_pose_error(e, g, 1)),
-        "rpe_20_frames": asdict(relative_pose_error(e, g, 20)) if len(e) > 20 else None,
+        "rpe_frame": relative_pose_error(e, g, 1)._asdict(),
+        "rpe_20_frames": relative_pose_error(e, g, 20)._asdict() if len(e) > 20 else None,
         "clock_ms": {"p50": float(np.median(run.clock_ms)), "p95": float(np.percentile(run.clock_ms, 95))},
         "processor_ms": {"p50": float(np.median(run.processor_ms)), "p95": float(np.percentile(run.processor_ms, 95))},
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,14 +11,8 @@ from semantic_mapper.geometry import expect_shape, invert_pose
 from semantic_mapper.types import Float64
 
 
-@dataclass(frozen=True, slots=True)
-class TrajectoryError:
-    """Distances in metres (``absolute_trajectory_error``) or of a motion (``relative_pose_error``).
-
-    Args:
-        rmse_m, median_m, max_m: Of positions.
-        rmse_deg: Of rotations; 0 for the absolute error, which is about positions alone.
-    """
+class TrajectoryError(NamedTuple):
+    """Distances of positions in metres, and of rotations in degrees (0 for the absolute error)."""
 
     rmse_m: float
     median_m: float

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.compare import COUNTS, SCORES, Comparison, Run, Tolerances, compare_runs, read_run
@@ -61,7 +61,7 @@ def test_each_figure_of_the_summary_is_compared_by_itself(run: Run, path: str) -
     summary = copy.deepcopy(dict(run.summary))
     section, key = path.split(".")
     summary[section][key] += 2 if section == "frames" else 0.05
-    other = replace(run, summary=summary)
+    other = run._replace(summary=summary)
     assert differing(compare_runs(run, other, Tolerances())) == {path}
     assert compare_runs(run, other, Tolerances(score=0.06)).equal == (section != "frames")
     summary[section][key] = None
@@ -71,7 +71,7 @@ def test_each_figure_of_the_summary_is_compared_by_itself(run: Run, path: str) -
 def test_other_settings_and_logs_are_noted_and_no_difference(run: Run) -> None:
     assert run.summary is not None
     config = {**run.summary["config"], "quality": "another"}
-    comparison = compare_runs(run, replace(run, summary={**run.summary, "config": config, "source": "s"}), Tolerances())
+    comparison = compare_runs(run, run._replace(summary={**run.summary, "config": config, "source": "s"}), Tolerances())
     assert comparison.equal and [note.split(":")[0] for note in comparison.notes] == ["log", "config quality"]
 
 
@@ -96,11 +96,10 @@ def test_classes_are_compared_by_name_and_other_voxels_and_empty_maps_differ() -
 
 
 def test_folders_without_a_run_are_named(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="no such map file"):
+    with pytest.raises(ConfigError, match=r"no map\.npz in this folder"):
         read_run(tmp_path)
     wall().save(tmp_path / "map.npz")
     assert read_run(tmp_path).summary is None, "a map alone"
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(ConfigError, match="is not the summary of a replay"):
         read_run(tmp_path)
-    assert read_run(tmp_path / "map.npz").summary is None

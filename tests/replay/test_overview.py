@@ -88,12 +88,6 @@ def turn_about_up(angle: float) -> np.ndarray:
     return np.array(((c, -s, 0), (s, c, 0), (0, 0, 1.0)))
 
 
-def test_lengths_have_the_unit_that_they_are_in() -> None:
-    figure = figure_of(draw_overview, [strip()], room_points(), ROOMS, title="room", up=UP, unit="units")
-    said = " ".join(t.get_text() for t in figure.findobj(Text))
-    assert "1 units" in said and "1.0 units (red)" in said and "1 m" not in said
-
-
 def test_the_view_from_above_looks_under_the_ceiling() -> None:
     picture = draw_overview([], room_points(), ROOMS, title="room", up=UP)
     from_above = picture[100:, :660]
@@ -132,19 +126,6 @@ def test_the_nearer_of_two_surfaces_is_drawn_without_holes() -> None:
         picture, _ = draw_points(xyz, colors, (80, 80), BLACK)
         inner = picture[10:-10, 10:-10]
         assert inner[..., 0].min() > 150 and inner[..., 2].max() == 0
-
-
-def test_the_scale_is_pixels_a_metre() -> None:
-    xyz, colors = square((3, -2, 0), (255, 255, 255))
-    picture, scale = draw_points(xyz, colors, (200, 120), BLACK)
-    columns = np.flatnonzero((picture[60] > 100).any(axis=-1))
-    assert abs((columns[-1] - columns[0] + 1) / scale - 1) < 0.06
-    assert abs(columns.mean() - 99.5) < 2  # in the middle
-
-
-def test_a_single_point_is_drawn() -> None:
-    picture, _ = draw_points(np.zeros((1, 3)), np.full((1, 3), 255, np.uint8), (30, 20), BLACK)
-    assert picture.max() > 0
 
 
 def test_a_viewer_at_an_angle_sees_near_things_below_and_high_things_above() -> None:

@@ -15,14 +15,11 @@ import pytest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
 from semantic_mapper.replay.page import (
-    MAX_VIEW_POINTS,
     Section,
-    point_view,
     write_page,
 )
 from semantic_mapper.replay.session import MapSession
@@ -114,19 +111,6 @@ def test_the_map_is_on_the_page_in_3d_with_a_legend(run: Path) -> None:
     label = np.frombuffer(base64.b64decode(data["label"]), np.uint8)
     assert sorted(boxes) == np.unique(label).tolist() == np.unique(points.label).tolist()
     assert "viewport" in {meta.get("name") for meta in page.iter("meta")}
-
-
-def test_a_large_map_is_thinned_out_evenly() -> None:
-    side = np.linspace(0, 10, 800)
-    floor = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3).astype(np.float32)
-    points = MapPoints(
-        floor, np.zeros((len(floor), 3), np.uint8), np.full(len(floor), 1, np.uint8), np.ones(len(floor))
-    )
-    data = point_view(points, ROOMS, np.array((0.0, 0.0, 1.0)))["data"]
-    xyz = np.frombuffer(base64.b64decode(data["xyz"]), "<u2").reshape(-1, 3)
-    assert len(xyz) == data["count"] == MAX_VIEW_POINTS < len(floor)
-    counts = np.histogram2d(*xyz[:, :2].T, bins=4)[0]
-    assert counts.min() > 0.95 * counts.max() and 0.0125 < data["spacing"] < 0.05
 
 
 def test_replays_and_logs_are_compared_on_a_page(run: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from semantic_mapper.replay.run_folder import map_path
         ("", "give a saved map or a folder"),
         ("kitchen.mcap", "no map.npz in this folder; its logs hold frames: `semantic-mapper replay"),
         ("kitchen.npz", "name the map itself, such as"),
-        ("run1/map.npz", "there is one in"),
+        ("run1/map.npz", "name the map itself, such as"),
         ("fleet.json", "a fleet's store: `fleet merge` fuses its maps"),
     ],
 )

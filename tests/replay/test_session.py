@@ -5,15 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semantic_mapper.config import MapperConfig, convert_config, to_plain
+from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import LabelError
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, save_checkpoint
-from semantic_mapper.fields.learned import build_field
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
 from semantic_mapper.mapper import Mapper
@@ -32,7 +30,7 @@ from semantic_mapper.replay.session import (
 )
 from semantic_mapper.replay.summary import notes, summary_table
 from semantic_mapper.types import MapUpdate, PosedFrame
-from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
+from tests.small import tiny_config, tiny_field, tiny_frames
 
 
 @pytest.fixture
@@ -51,13 +49,6 @@ def run(weights, frames, rerun=None, depth="auto", **options):
     for frame in frames:
         session.process(frame)
     return session
-
-
-def test_results_of_an_earlier_map_go(tmp_path):
-    for name in ("eval.json", "eval.html", "report.html", "room.mcap"):
-        (tmp_path / name).touch()
-    artifacts.clear_results(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["room.mcap"]
 
 
 def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
@@ -188,15 +179,6 @@ def test_poses_that_contradict_the_depth_are_in_summary_table_picture_and_notes(
     assert third == values[2][names.index("contradicting pairs")] == "not checked"
     assert float(first.removesuffix(" %")) < 1 and float(second.removesuffix(" %")) > 2
     assert not any("inverted" in note for note in notes(right)) and "poses inverted" in notes(wrong)[0]
-
-
-def test_the_summary_names_the_kind_of_field(tmp_path):
-    torch.manual_seed(0)
-    field = build_field("unet", {"encoder": to_plain(SMALL_ENCODER)}, ROOMS)
-    save_checkpoint(Checkpoint(field, (), {"kind": "train", "width": 96}), tmp_path / "unet.safetensors")
-    session = run(tmp_path / "unet.safetensors", tiny_frames()[:2])
-    assert finish_session(session, tmp_path / "out")["field"]["name"] == "unet"
-    assert set(field_predictors(session.bundle)) == {"unet", "unet, novel view"}
 
 
 def test_frames_that_the_weights_have_seen_are_not_scored(weights):
@@ -335,13 +317,6 @@ def test_an_unknown_label_costs_one_frame_of_an_evaluation_and_progress_still_en
     result = evaluate_frames(frames, {"truth": lambda f: Opinion(f.label)}, ROOMS, ROOMS, frozenset(), seen.append)
     assert (result.scored, result.refused) == (2, 1) and seen == [1, 2, 3]
     assert result.methods["truth"]["miou"] == 1.0
-
-
-def test_carried_labels_reproduce_the_keyframe_itself():
-    frame = tiny_frames()[0]
-    predictors = baseline_predictors([frame], ROOMS, seconds=0.5, seed=0)
-    same = predictors["labels carried by depth"](frame).label == frame.label
-    assert same[frame.depth_m > 0].mean() > 0.98
 
 
 def test_other_label_sets_are_scored_on_shared_classes_only(weights):

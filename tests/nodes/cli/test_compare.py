@@ -35,5 +35,5 @@ def test_what_cannot_be_compared_is_no_difference(replayed: Path, log: Path, tmp
     done = run("compare", broken, replayed)
     assert done.returncode == 2 and "map.npz" in error_line(done.stderr)
     done = run("compare", replayed, log)
-    assert done.returncode == 2 and "is a log, and `compare` takes maps or results of runs" in error_line(done.stderr)
+    assert done.returncode == 2 and "is a log; `semantic-mapper replay" in error_line(done.stderr)
     assert run("compare", replayed, replayed, "--labels", "-1").returncode == 2

@@ -118,12 +118,6 @@ def test_a_plan_says_what_was_found_out_for_it(corner: VoxelMap, tmp_path: Path)
     assert told.found == ()
 
 
-def test_a_recording_shows_rooms_and_things(corner: VoxelMap, tmp_path: Path) -> None:
-    export_map(corner, tmp_path / "a.rrd", ExportRequest("rrd"))
-    shown = {chunk.entity_path for chunk in rerun.chunk.RrdReader(tmp_path / "a.rrd").stream()}
-    assert {"/world/graph/rooms", "/world/graph/doors", "/world/graph/things"} <= shown
-
-
 def test_costs_are_read_by_class(corner: VoxelMap, tmp_path: Path) -> None:
     (tmp_path / "costs.toml").write_text("floor = 10\nwall = 90\nunknown = 50\n")
     request = ExportRequest("grid", height=(0.2, 1.0), costs=tmp_path / "costs.toml")
@@ -191,28 +185,6 @@ def test_rerun_has_a_colouring_by_what_was_measured(tmp_path: Path) -> None:
         raise AssertionError("no such cloud")
     for flag, color in ((True, MEASURED_COLOR), (False, COMPUTED_COLOR)):
         assert set((colors[measured == flag] >> 8).tolist()) == {int.from_bytes(bytes(color), "big")}
-
-
-def test_rerun_gets_a_cloud_for_each_colouring(corner: VoxelMap, tmp_path: Path) -> None:
-    export_map(corner, tmp_path / "map.rrd", ExportRequest("rrd"))
-    assert list(tmp_path.iterdir()) == [tmp_path / "map.rrd"]
-    clouds: dict[str, dict[str, np.ndarray]] = {}
-    for chunk in rerun.chunk.RrdReader(tmp_path / "map.rrd").stream():
-        if chunk.entity_path.startswith("/world/map"):
-            batch = chunk.to_record_batch()
-            names = {"positions": np.float32, "colors": np.uint32, "class_ids": np.uint16}
-            clouds[chunk.entity_path.removeprefix("/world/map/")] = {
-                name: np.array(batch.column(f"Points3D:{name}").to_pylist()[0], dtype)
-                for name, dtype in names.items()
-                if f"Points3D:{name}" in batch.schema.names
-            }
-    points = corner.points()
-    assert clouds.keys() == {"class", "colour", "confidence"}, "a saved map does not know its ages"
-    for cloud in clouds.values():
-        np.testing.assert_array_equal(cloud["positions"], points.xyz)
-    np.testing.assert_array_equal(clouds["class"]["class_ids"], points.label)
-    rgb = np.stack([(clouds["colour"]["colors"] >> shift) & 255 for shift in (24, 16, 8)], axis=1)
-    np.testing.assert_array_equal(rgb, points.rgb)
 
 
 def test_a_recording_shows_where_things_were_that_have_gone(corner: VoxelMap, tmp_path: Path) -> None:

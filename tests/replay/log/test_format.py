@@ -78,13 +78,6 @@ def test_any_frame_can_be_read_in_any_order_and_from_any_thread(small_log: Path)
         assert found == [list(range(FRAMES))] * 4
 
 
-def test_poses_can_be_listed_without_decoding_images(small_log: Path) -> None:
-    with LogReader(small_log) as reader:
-        for seq, (envelope, parts) in enumerate(reader.frame_parts()):
-            assert np.array_equal(np.reshape(envelope.T_world_camera, (4, 4)), samples.make_frame(seq).T_world_camera)
-            assert envelope.has_label and parts == encode_frame(samples.make_frame(seq))
-
-
 def test_a_log_may_hold_other_messages_beside_frames(tmp_path: Path) -> None:
     path = tmp_path / "mixed.mcap"
     with LogWriter(path, StreamInfo("test")) as writer:
@@ -110,12 +103,6 @@ def test_a_file_that_is_no_log_is_refused(tmp_path: Path, content: bytes) -> Non
     path.write_bytes(content)
     with pytest.raises(LogError, match=r"x\.mcap"):
         LogReader(path)
-
-
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "missing.mcap", tmp_path):
-        with pytest.raises(LogError, match="cannot be read"):
-            LogReader(path)
 
 
 def test_a_foreign_mcap_is_refused(tmp_path: Path) -> None:
@@ -188,7 +175,7 @@ def test_a_log_cut_anywhere_is_readable_up_to_the_break(small_log: Path, tmp_pat
     rng = random.Random(0)
     cut_log = tmp_path / "cut.mcap"
     first_whole = ends[1]  # stream information and one frame
-    for cut in [first_whole, *(rng.randrange(first_whole, len(data)) for _ in range(150)), *ends[2:], len(data) - 1]:
+    for cut in [first_whole, *(rng.randrange(first_whole, len(data)) for _ in range(50)), *ends[2:], len(data) - 1]:
         cut_log.write_bytes(data[:cut])
         with LogReader(cut_log) as reader:
             whole = sum(end <= cut for end in ends[1:])
@@ -306,33 +293,21 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path, start: bytes, says: str
         LogReader(path)
 
 
-def hostile_log(path: Path, monkeypatch: pytest.MonkeyPatch, *, info: bool) -> Path:
-    """Three frames, the second with ``cy`` far beyond its image; with ``info``, the stream information has that too."""
-    with monkeypatch.context() as patch:
-        patch.setattr("semantic_mapper.types._check_lens", lambda k: None)  # as written before intrinsics were checked
-        wild = dataclasses.replace(samples.INTRINSICS, cy=1e19)
-        cameras = {samples.CAMERA: wild if info else samples.INTRINSICS}
-        with LogWriter(path, StreamInfo("test", cameras, NYU40)) as writer:
-            for seq in range(3):
-                frame = samples.make_frame(seq)
-                writer.write_frame(dataclasses.replace(frame, intrinsics=wild) if seq == 1 else frame)
-    return path
-
-
 def test_a_frame_whose_intrinsics_do_not_fit_is_reported_as_damaged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = hostile_log(tmp_path / "wild.mcap", monkeypatch, info=False)
+    path = tmp_path / "wild.mcap"
+    with (
+        monkeypatch.context() as patch,
+        LogWriter(path, StreamInfo("test", {samples.CAMERA: samples.INTRINSICS})) as log,
+    ):
+        patch.setattr("semantic_mapper.types._check_lens", lambda k: None)  # as another program may write them
+        wild = dataclasses.replace(samples.INTRINSICS, cy=1e19)
+        for seq in range(3):
+            frame = samples.make_frame(seq)
+            log.write_frame(dataclasses.replace(frame, intrinsics=wild) if seq == 1 else frame)
     found = describe_log([path], lambda: None)
     assert found["frames"] == 2 and len(found["damage"]) == 1
     assert "frame 1" in found["damage"][0] and "cy=1e+19" in found["damage"][0]
     with LogReader(path) as reader:
         assert seqs(reader) == [0, 2]
-
-
-def test_stream_information_whose_intrinsics_do_not_fit_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = hostile_log(tmp_path / "wild.mcap", monkeypatch, info=True)
-    with pytest.raises(LogError, match=r"stream information .* cannot be used: .*cy=1e\+19"):
-        LogReader(path)

@@ -232,32 +232,6 @@ def test_disk_that_takes_half_a_message_damages_nothing(
         assert log.finished or size - (tmp_path / "a.mcap").stat().st_size < 50
 
 
-def test_ring_on_a_disk_that_is_full_before_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    Disk(tmp_path, 150_000, monkeypatch)
-    rules = RecordingRules(split_bytes=30_000, disk_full="delete-oldest")
-    ring = recording(tmp_path / "a.mcap", rules, free=plenty)
-    write(ring, range(60))
-    assert ring.lost == 0 and ring.deleted > 0
-    monkeypatch.undo()
-    ring.close()
-    found = frames_in(tmp_path)
-    assert found == list(range(60))[-len(found) :] and len(found) > 8
-
-
-def test_disk_smaller_than_one_message_leaves_no_empty_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 0.0
-    Disk(tmp_path, 16_000, monkeypatch)
-    rules = RecordingRules(split_bytes=50_000, disk_full="delete-oldest")
-    ring = recording(tmp_path / "a.mcap", rules, free=plenty, clock=lambda: now)
-    for seq in range(30):
-        write(ring, range(seq, seq + 1))
-        now += 2
-    assert ring.lost + ring.frames == 30 and ring.lost > 20
-    assert list(parts_on_disk(tmp_path / "a.mcap")) == [0]
-    ring.close()
-    assert frames_in(tmp_path / "a.mcap") == list(range(ring.frames)) and ring.deleted == 0
-
-
 def test_limit_of_the_kernel_on_one_file(tmp_path: Path) -> None:
     with files_at_most(30_000):
         stopped = recording(tmp_path / "stop.mcap", RecordingRules())
