@@ -108,50 +108,6 @@ def fill_holes(depth_m: Float32) -> Float32:
     return values[nearest]
 
 
-def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntrinsics:
-    """Intrinsics of an image that was turned clockwise by this many quarters of a full turn.
-
-    Raises:
-        FrameError: an image that is not rectified.
-    """
-    if intrinsics.distorted:
-        raise FrameError("an image with lens distortion cannot be turned by itself; rectify it first")
-    k = intrinsics
-    for _ in range(quarters % 4):
-        k = CameraIntrinsics(k.fy, k.fx, k.height - 1 - k.cy, k.cx, k.height, k.width)
-    return k
-
-
-def rotate_frame(frame: PosedFrame, quarters: int) -> PosedFrame:
-    """The frame with its images turned clockwise by this many quarters of a full turn, and its pose and intrinsics with
-    them: every pixel keeps its ray in the world.
-
-    Raises:
-        FrameError: an image that is not rectified.
-    """
-    quarters %= 4
-    if quarters == 0:
-        return frame
-    return replace(
-        frame,
-        rgb=np.ascontiguousarray(np.rot90(frame.rgb, -quarters)),
-        depth_m=None if frame.depth_m is None else np.ascontiguousarray(np.rot90(frame.depth_m, -quarters)),
-        label=None if frame.label is None else np.ascontiguousarray(np.rot90(frame.label, -quarters)),
-        depth_sigma_m=(
-            None if frame.depth_sigma_m is None else np.ascontiguousarray(np.rot90(frame.depth_sigma_m, -quarters))
-        ),
-        intrinsics=rotate_intrinsics(frame.intrinsics, quarters),
-        T_world_camera=frame.T_world_camera @ _turn(quarters),
-    )
-
-
-def _turn(quarters: int) -> Float64:
-    """(4, 4): turning the image clockwise turns the camera's axes the other way about its optical axis."""
-    T = np.eye(4)
-    T[:2, :2] = np.linalg.matrix_power(np.array([[0.0, 1.0], [-1.0, 0.0]]), quarters)
-    return T
-
-
 def depth_prior(depth_m: Float32, rgb: UInt8) -> Float32:
     """Depth (H, W) at which the surface of each pixel is expected: without holes, its borders on the image's edges.
 
@@ -201,3 +157,47 @@ def draw_borders_to_edges(
 ) -> None:
     """The filter of ``depth_prior``: ``count`` rows, from depth without holes and with, (H, W) each, into ``out``."""
     ...
+
+
+def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntrinsics:
+    """Intrinsics of an image that was turned clockwise by this many quarters of a full turn.
+
+    Raises:
+        FrameError: an image that is not rectified.
+    """
+    if intrinsics.distorted:
+        raise FrameError("an image with lens distortion cannot be turned by itself; rectify it first")
+    k = intrinsics
+    for _ in range(quarters % 4):
+        k = CameraIntrinsics(k.fy, k.fx, k.height - 1 - k.cy, k.cx, k.height, k.width)
+    return k
+
+
+def rotate_frame(frame: PosedFrame, quarters: int) -> PosedFrame:
+    """The frame with its images turned clockwise by this many quarters of a full turn, and its pose and intrinsics with
+    them: every pixel keeps its ray in the world.
+
+    Raises:
+        FrameError: an image that is not rectified.
+    """
+    quarters %= 4
+    if quarters == 0:
+        return frame
+    return replace(
+        frame,
+        rgb=np.ascontiguousarray(np.rot90(frame.rgb, -quarters)),
+        depth_m=None if frame.depth_m is None else np.ascontiguousarray(np.rot90(frame.depth_m, -quarters)),
+        label=None if frame.label is None else np.ascontiguousarray(np.rot90(frame.label, -quarters)),
+        depth_sigma_m=(
+            None if frame.depth_sigma_m is None else np.ascontiguousarray(np.rot90(frame.depth_sigma_m, -quarters))
+        ),
+        intrinsics=rotate_intrinsics(frame.intrinsics, quarters),
+        T_world_camera=frame.T_world_camera @ _turn(quarters),
+    )
+
+
+def _turn(quarters: int) -> Float64:
+    """(4, 4): turning the image clockwise turns the camera's axes the other way about its optical axis."""
+    T = np.eye(4)
+    T[:2, :2] = np.linalg.matrix_power(np.array([[0.0, 1.0], [-1.0, 0.0]]), quarters)
+    return T
