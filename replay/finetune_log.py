@@ -218,9 +218,9 @@ def _fit(
 def _check_options(request: FinetuneRequest, kind: str) -> None:
     """Refuse options that go with other weights."""
     if request.unlabelled is not None and kind not in FITTERS:
-        raise ConfigError(f"--unlabelled: weights of kind '{kind}' learn from labelled frames alone; leave it out")
+        raise ConfigError(f"unlabelled frames: weights of kind '{kind}' learn from labelled frames alone; leave it out")
     if request.config.irt.variant is not None and kind != IRT.kind:
-        raise ConfigError(f"--variant (irt.variant): goes with weights of kind 'irt', not with '{kind}'; leave it out")
+        raise ConfigError(f"irt.variant: goes with weights of kind 'irt', not with '{kind}'; leave it out")
 
 
 def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[FrameKey, ComputedFrame]:

@@ -14,7 +14,6 @@ import msgspec
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import LabelError, LogError, SemanticMapperError, WeightsError
-from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import find_nesf
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
@@ -77,7 +76,6 @@ def replay_log(
     config: MapperConfig | None = None,
     max_frames: int = 0,
     *,
-    exclude: Path | None = None,
     rerun: Path | None = None,
     corrections: Path | None = None,
     monitor: JobMonitor | None = None,
@@ -92,7 +90,6 @@ def replay_log(
         weights: None = those that ship with the package.
         config: Of the mapper.
         max_frames: 0 = all.
-        exclude: Weights whose finetuning frames are left out of the scores, beyond those of ``weights``.
         rerun: Where to write a Rerun recording.
         corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
         monitor: Gets the progress, and may end it early; ``stopped_by`` of the summary names the signal.
@@ -103,7 +100,6 @@ def replay_log(
     """
     monitor = monitor or JobMonitor()
     trajectory = read_corrections(corrections) if corrections else None
-    seen = load_checkpoint(exclude).train_stamps_ns if exclude else frozenset[int]()
     with hold_folder(out), open_log(log) as source:
         for notice in source.notices:
             _log.warning("log_notice", notice=notice)
@@ -116,7 +112,6 @@ def replay_log(
         session = MapSession(
             bundle,
             stream_labels=source.info.label_set,
-            exclude_stamps=seen,
             source=source.info.source,
             scale_known=source.info.scale_known,
             rerun=open_recording(rerun, bundle.pipeline),

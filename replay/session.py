@@ -108,7 +108,6 @@ class MapSession:
     Args:
         bundle: From ``Mapper.load``.
         stream_labels: Label set of the frames' label images; None where they have none.
-        exclude_stamps: Frames to leave out of the scores, in addition to those that the weights were finetuned on.
         source: Name of the log or stream, for the summary.
         scale_known: Whether its lengths are metres.
         rerun: Gets every frame, what was rendered for it, and the map at the end; see ``open_recording``.
@@ -120,7 +119,6 @@ class MapSession:
         bundle: Mapper,
         *,
         stream_labels: LabelSet | None,
-        exclude_stamps: frozenset[int] = frozenset(),
         source: str = "",
         scale_known: bool = True,
         rerun: RerunLog | None = None,
@@ -131,7 +129,7 @@ class MapSession:
         self.pipeline.voxel_map.note_scale(scale_known)
         self.source = source
         self.odometry_sessions = OdometrySessions(self.pipeline, own_first=own_first)
-        self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
+        self.exclude_stamps = bundle.checkpoint.train_stamps_ns
         self.published = 0
         self.fused = 0
         self.dropped = 0

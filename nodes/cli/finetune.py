@@ -32,6 +32,7 @@ def finetune(
     out: Path,  # weights file to write (.safetensors)
     keyframes: AtLeastTwo | None = None,  # how many labelled frames to use; none for --kind grid and panoptic
     weights: Path | None = None,  # weights to start from; without it the small ones in the package
+    from_scratch: bool = False,  # start from random weights
     # fit a field of this kind (irt, panoptic, grid) to the scene, from all frames; irt: classes of keyframes, panoptic:
     # of boxes and pseudo labels, grid: none
     kind: str | None = None,
@@ -63,6 +64,11 @@ def finetune(
     without_labels = kind in ("grid", "panoptic")
     refused = (
         (kind is not None and weights is not None, "--kind", "starts from nothing; leave out --weights"),
+        (
+            from_scratch and (weights is not None or kind is not None),
+            "--from-scratch",
+            "leave out --weights and --kind",
+        ),
         ((boxes is not None) != (kind == "panoptic"), "--boxes", "--kind panoptic and --boxes FILE go together"),
         (pseudo is not None and kind != "panoptic", "--pseudo", "goes with --kind panoptic only"),
         (
@@ -91,6 +97,7 @@ def finetune(
         keyframes=keyframes or 0,
         config=settings,
         weights=weights,
+        from_scratch=from_scratch,
         depth=load_mapper_config(None, {"depth.source": depth}, OFFLINE).depth,
         kind=kind,
         labels=labels,

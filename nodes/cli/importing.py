@@ -43,6 +43,7 @@ class SourceOptions(Options, frozen=True):
 
     rotate: Literal["0", "90", "180", "270"] = "0"  # turn every image clockwise by this many degrees
     calibration: Path | None = None  # film: file of the camera, from `calibrate`. Without: found
+    focal_prior: AtLeastZero = 0.0  # film: about the focal length, in its pixels, where the lens is unusual
     scale: AtLeastZero = 0.0  # film, transforms, colmap, opensfm: metres per unit of its map without scale. 0 = by GPS
     distance: str = ""  # film: two marked points: "SECONDS:U,V SECONDS:U,V METRES" (pixels of the film)
     square_mm: AtLeastZero = 0.0  # film: side of a square of the printed board that is seen in it
@@ -72,7 +73,7 @@ class SourceOptions(Options, frozen=True):
             board=board_settings(None, self.square_mm).board if self.square_mm else None,
             camera_height_m=self.camera_height or None,
         )
-        return FilmOptions(self.calibration, scale=hint, quarters=self.quarters)
+        return FilmOptions(self.calibration, self.focal_prior or None, hint, self.quarters)
 
     def recording_scale(self) -> float | None:
         """Metres per unit, of a recording that has poses.
@@ -82,8 +83,8 @@ class SourceOptions(Options, frozen=True):
         """
         if msgspec.structs.replace(self, scale=0.0, rotate="0").given:
             raise typer.BadParameter(
-                "the recording has poses and intrinsics of its own; --calibration, --distance, --square-mm and "
-                "--camera-height are for films"
+                "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, "
+                "--square-mm and --camera-height are for films"
             )
         return self.scale or None
 

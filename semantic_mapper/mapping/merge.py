@@ -134,16 +134,6 @@ def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
         target.mark_changed(target.fill(part, values), version)
 
 
-def count_empty(source: BlockGrid) -> int:
-    """Blocks of a grid that hold no measurement: the band of truncation touched them, and no depth fell into it."""
-    empty = 0
-    for _, blocks, grid in source.tiles():
-        weight = grid.buffers().weight
-        for start in range(0, len(blocks), MERGED_AT_ONCE):
-            empty += int((weight[blocks[start : start + MERGED_AT_ONCE]] == 0).all(axis=1).sum())
-    return empty
-
-
 def overlaps(sources: Int64, T_target_source: VoxelTransform) -> Int64:
     """Pairs (P, 2) of packed keys, sorted: a block of the target and a source block that may say something of it."""
     corners = np.array([[x, y, z] for x in (-1, BLOCK_SIDE) for y in (-1, BLOCK_SIDE) for z in (-1, BLOCK_SIDE)])

@@ -44,7 +44,7 @@ def test_paths_become_absolute_and_unknown_schemes_are_refused(monkeypatch: pyte
 def test_errors_of_requests_are_one_of_ours_without_what_signs_their_urls(error: OSError, said: str) -> None:
     with pytest.raises(StoreError, match=said) as caught, reaching("s3://bucket/x?sig=1"):
         raise error
-    assert SECRET not in str(caught.value) and "abc" not in str(caught.value) and "sig" not in str(caught.value)
+    assert SECRET not in str(caught.value) and "abc" not in str(caught.value) and "sig=1" not in str(caught.value)
 
 
 @pytest.fixture

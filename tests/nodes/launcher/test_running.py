@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.launcher import running
-from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder
-from tests.nodes.support import error_line, run, run_here
+from semantic_mapper.nodes.launcher.running import launch_folder
+from tests.nodes.support import run_here
 
 
 def test_advice_fits_how_many_launches_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,11 +38,3 @@ def test_a_mapper_without_a_socket_is_not_asked(
     places = {"MAP": f"ipc://{tmp_path}/query", "poses.tum": str(tmp_path / "poses.tum")}
     code, said = run_here(*(places.get(word, word) for word in words))
     assert code == 1 and f"{places['MAP']}: there is no such socket" in said
-
-
-def test_labels_for_a_launch_without_a_finetuner_are_refused_at_once(log: Path, tmp_path: Path) -> None:
-    note = LaunchNote("live.toml", (NodeNote("eye", "camera", {}), NodeNote("mapper", "mapper", {})))
-    (tmp_path / NOTE).write_bytes(msgspec.json.encode(note))
-    done = run("label", log, "--to", tmp_path, "--timeout", "100000")
-    assert done.returncode == 1
-    assert "live.toml has no finetuner to label for, its nodes are eye (camera), mapper" in error_line(done.stderr)
