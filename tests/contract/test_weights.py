@@ -55,13 +55,12 @@ def without_depth(folder: Path) -> Path:
     return path
 
 
-def rendered(weights: str, folder: Path, *, classes: bool = True) -> dict[str, Any]:
-    """Pixels a class of frames as ``autolabel`` renders them with weights, and their mean depth where none is known."""
+def rendered(weights: str, folder: Path, *, without: bool = True) -> dict[str, Any]:
+    """Pixels a class of frames as ``autolabel`` renders them; with ``without`` also the mean computed depth of a log that
+    has none."""
     out = folder / "rendered.mcap"
     found: dict[str, Any] = {}
-    for log, options in ((LOG, ("--overwrite-labels",)), (without_depth(folder), ("--depth",))):
-        if log == LOG and not classes:
-            continue
+    for log, options in ((LOG, ("--overwrite-labels",)), (without_depth(folder), ("--depth",)))[: 1 + without]:
         ran = api.run_here("autolabel", log, "--weights", weights, "--out", out, *options, "--max-frames", str(FRAMES))
         assert ran.code == 0, ran.stderr
         with LogReader(out) as reader:
@@ -76,7 +75,7 @@ def rendered(weights: str, folder: Path, *, classes: bool = True) -> dict[str, A
 
 
 def fitted(kind: str, folder: Path) -> dict[str, Any]:
-    """The same of weights that were fitted to the golden log, and their held-out loss where it is printed."""
+    """Classes as rendered by weights that were fitted to the golden log, and what was printed of the fit."""
     boxes, out = folder / "boxes.json", folder / f"{kind}.safetensors"
     boxes.write_text(json.dumps({"boxes": [{**box, "size": [0.7, 0.7, 0.7]} for box in BOXES]}))
     options = [str(boxes) if word == "boxes.json" else word for word in FITTED[kind]]
@@ -87,7 +86,7 @@ def fitted(kind: str, folder: Path) -> dict[str, Any]:
     assert ran.code == 0, ran.stderr
     told = {name: re.search(form, ran.stdout) for name, form in TOLD.items()}
     found = {name: float(match[1]) for name, match in told.items() if match}
-    return {**rendered(str(out), folder, classes=kind != "grid"), **found}
+    return found if kind == "grid" else {**rendered(str(out), folder, without=False), **found}
 
 
 def observe(folder: Path) -> dict[str, Any]:
