@@ -56,7 +56,7 @@ def without_depth(folder: Path) -> Path:
 
 
 def rendered(weights: str, folder: Path, *, without: bool = True) -> dict[str, Any]:
-    """Pixels a class of frames as ``autolabel`` renders them; with ``without`` also the mean computed depth of a log that
+    """Pixels a class of frames as ``autolabel`` renders them; ``without``: also the mean computed depth of a log that
     has none."""
     out = folder / "rendered.mcap"
     found: dict[str, Any] = {}
