@@ -125,23 +125,6 @@ def pick_views_on_path(
     return query, sources
 
 
-def training_loss(
-    model: LearnedField,
-    views: Sequence[LabelledView],
-    query: int,
-    sources: Sequence[int],
-    config: StepConfig,
-    generator: torch.Generator,
-) -> Loss | None:
-    """Loss of rays of ``views[query]`` rendered from ``views[sources]``; None where the query has no labelled pixel.
-
-    Gradients flow into the whole model.
-    """
-    device = next(model.parameters()).device
-    batch = draw_batch(views, query, sources, config, generator, len(model.label_set), device)
-    return None if batch is None else batch_loss(model, [batch], config.loss)
-
-
 def draw_batch(
     views: Sequence[LabelledView],
     query: int,

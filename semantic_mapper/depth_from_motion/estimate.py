@@ -1,8 +1,7 @@
 """Depth of one view from several others: matched, compared with its neighbours' depth, smoothed; and how sure it is.
 
-Spreads, in planes of the sweep, are the exponential of a sum of terms, whose factors
-`research.experiments.depth_spread` fits so that 68 % of the errors are within one spread: rooms of training seeds,
-every second with poses that are off by 0.06 degrees and 1.5 mm.
+Spreads, in planes of the sweep, are the exponential of a sum of terms, whose factors were fitted so that 68 % of the
+errors are within one spread: rooms of training seeds, every second with poses that are off by 0.06 degrees and 1.5 mm.
 """
 
 from __future__ import annotations

@@ -125,38 +125,6 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
     assert refused.returncode == 1 and "--protocol scratch" in refused.stderr
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("eval", "log.mcap", "--suite", "rooms"),
-        ("eval", "log.mcap", "--kind", "unet"),
-        ("eval", "log.mcap", "--rooms", "2"),
-        ("suite", "rooms", "--protocol", "finetune", "--sources", "wide"),
-        ("suite", "rooms", "--protocol", "finetune", "--no-own-image"),
-        ("suite", "rooms", "--seconds", "3"),
-        ("suite", "rooms", "--keyframes", "3"),
-        ("suite", "klevr", "--rooms", "3"),
-        ("suite", "klevr", "--map"),
-        ("suite", "klevr", "--arm", "nerf"),
-        ("suite", "klevr", "--tier", "gpu"),
-        ("suite", "aerial", "--rooms", "3"),
-        ("suite", "aerial", "--arm", "nerf"),
-        ("suite", "aerial", "--tier", "gpu"),
-        ("suite", "streets", "--arm", "nerf"),
-        ("suite", "rooms", "--claims"),
-        ("suite", "rooms", "--tier", "record"),
-        ("suite", "rooms", "--protocol", "finetune", "--map"),
-        ("suite", "rooms", "--views", "17"),
-        ("suite", "rooms", "--depth", "computed", "--current", "hard"),
-        ("suite", "rooms", "--rooms", "1", "--out", __file__),
-    ],
-)
-def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, ...]) -> None:
-    done = run(*arguments)
-    assert done.returncode == 2, done.stderr
-    assert "Usage: semantic-mapper" in done.stderr
-
-
 def test_an_unknown_setting_names_the_nearest_one(tmp_path: Path) -> None:
     path = tmp_path / "suite.toml"
     path.write_text("veiws = 3\n", encoding="utf-8")

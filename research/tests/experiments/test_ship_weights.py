@@ -122,13 +122,6 @@ def test_weights_that_no_commit_can_make_again_are_refused_however_far_back(
             convert(weights(tmp_path, recipe), tmp_path / "half.safetensors")
 
 
-def test_a_chain_ends_in_random_weights_and_in_nothing_else(tmp_path: Path) -> None:
-    half = tmp_path / "half.safetensors"
-    convert(weights(tmp_path, run(origins=[origin(run(config={"start": "", "encoder_from": ""}))])), half)
-    with pytest.raises(WeightsError, match="says nothing"):
-        convert(weights(tmp_path, run(origins=[origin(run(config=UNKNOWN_START))])), half)
-
-
 def test_the_card_lists_the_runs_from_the_first_to_the_last(tmp_path: Path) -> None:
     images = {"kind": "unet", "images": {"share": 1.0}, "keep": "best", "validation": {"times": 8}}
     rays = {"kind": "sray", "images": {"share": 0.0}, "keep": "last", "field": {"encoder": {"depth": True}}}
@@ -140,15 +133,3 @@ def test_the_card_lists_the_runs_from_the_first_to_the_last(tmp_path: Path) -> N
     assert lines[start + 2].endswith("| `bbbbbbb` | cpu | 61 |")
     assert lines[start + 3].startswith("| `sray` | rays | colours and depth | 1,500 | last |")
     assert "Nothing was measured." in lines
-
-
-def test_weights_that_others_published_need_no_revision_and_are_named_in_the_card(tmp_path: Path) -> None:
-    published = {"file": "lite0.pth", "sha256": "ab" * 32, "recipe": {"kind": "imagenet", "licence": "Apache-2.0"}}
-    first = run(origins=[published], config={"kind": "sray", "images": {"fraction": 1.0}})
-    later = {"kind": "sray", "start": "w", "images": {"fraction": 0.0, "later": 0.5}}
-    path = weights(tmp_path, run(origins=[origin(first)], config=later))
-    convert(path, tmp_path / "half.safetensors")
-    block = metadata_block(tmp_path / "half.safetensors")
-    assert "ImageNet weights `lite0.pth` (Apache-2.0, SHA-256 `abababababab`)" in block
-    rows = [line for line in block.splitlines() if line.startswith("| `sray`")]
-    assert [row.split(" | ")[1] for row in rows] == ["images", "rays and, 50% of the steps, images"]

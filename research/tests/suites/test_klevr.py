@@ -22,14 +22,11 @@ from research.suites.klevr import (
     labelled_frames,
     novel_seeds,
     run_klevr,
-    scene_frames,
     score_images,
     scored_numbers,
-    surface_points,
     train_seeds,
 )
 from research.suites.klevr_claims import CLAIMS, POINTS_MIOU, TRAIN_MIOU
-from research.suites.klevr_images import color_arm, vote_at_points
 from research.suites.plateau import PLATEAU, fit_to_plateau
 from research.suites.store import RecordStore
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
@@ -107,16 +104,6 @@ def test_records_are_kept_and_not_made_again(gain: float, tmp_path: Path) -> Non
     assert klevr_digest(TINY) != klevr_digest(msgspec.structs.replace(TINY, mlp_steps=7))
 
 
-def test_the_colour_of_a_pixel_gives_the_background_and_little_more() -> None:
-    config = msgspec.structs.replace(TINY, train_scenes=8, mlp_steps=150)
-    total = ConfusionMatrix(KLEVR)
-    for kinds in color_arm(config).scenes.values():
-        total += kinds[TRAIN_CAMERAS]
-    metrics = total.metrics()
-    assert metrics.miou is not None and metrics.miou < 0.4
-    assert metrics.per_class["background"] > 0.9
-
-
 def test_claims_compare_figures_of_one_arm_and_a_fraction() -> None:
     table = {("a", POINTS): matrices([90, 80, 85, 95]), ("a", TRAIN_CAMERAS): matrices([60, 50, 55, 65])}
     gain = check_claim(Claim("3D above 2D", "", POINTS_MIOU, "a", "a", TRAIN_MIOU, least=5.0), table)
@@ -152,18 +139,3 @@ def test_steps_are_doubled_until_the_plateau(reached: tuple[float, ...], steps: 
     if reached[1] < reached[0] and gain > 0:
         asked.clear()
         assert fit_to_plateau(fit, 10, doublings=2, a_loss_ends_it=True)[0] == 10
-
-
-def test_points_take_the_class_that_most_cameras_say() -> None:
-    config = msgspec.structs.replace(TINY, width=72)
-    scene = novel_seeds(config)[0]
-    xyz, truth = surface_points(config, scene)
-    assert np.mean(vote_at_points(config, scene, xyz, right) == truth) > 0.95
-    wrong = {f.seq for f in scene_frames(config, scene, range(3))}
-    said = vote_at_points(config, scene, xyz, lambda f: background(f) if f.seq in wrong else right(f))
-    solid = truth != KLEVR.id_of("background")
-    assert (
-        0.5
-        < np.mean(said[solid] == truth[solid])
-        < np.mean(vote_at_points(config, scene, xyz, right)[solid] == truth[solid])
-    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from research.suites.config import SuiteConfig, check_suite, fit_config
+from research.suites.config import SuiteConfig, fit_config
 from research.suites.entries import load_entries
 from research.suites.figures import compare_with_carried, view_figures
 from research.suites.predict import predict_view
@@ -230,20 +230,3 @@ def test_a_fitting_that_is_stopped_gives_no_figures() -> None:
     suite = tiny_suite(protocol="finetune", scene={"keyframes": 3, "guard": 1, "seconds": 0, "steps": 50})
     assert run_room(tiny_room(), tiny_contestant(), suite, steps.append, lambda: len(steps) >= 2) is None
     assert len(steps) == 2
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"protocol": "finetune", "scene": {"shares": ()}}, "end at 1.0"),
-        ({"protocol": "finetune", "scene": {"shares": (0.0, 1.0)}}, "end at 1.0"),
-        ({"protocol": "scratch", "scene": {"shares": (-0.5, 1.0)}}, "end at 1.0"),
-        ({"protocol": "scratch", "scene": {"shares": (0.5, 3.0)}}, "end at 1.0"),
-        ({"protocol": "scratch", "scene": {"shares": (0.5,)}}, "end at 1.0"),
-        ({"rooms": 21}, "20 rooms"),
-        ({"sequence": {"camera": {"sensor": "none"}}}, "--depth off"),
-    ],
-)
-def test_settings_that_no_run_can_follow_are_refused(changes: dict[str, object], reason: str) -> None:
-    with pytest.raises(ConfigError, match=reason):
-        check_suite(tiny_suite(**changes))

@@ -36,14 +36,6 @@ def test_narrow_views_are_near_even_where_farther_ones_see_more() -> None:
     assert bounded.numbers == (1,)
 
 
-def test_near_views_are_those_that_see_most() -> None:
-    candidates = [frame(1.0), frame(0.1), frame(0.0, turned=True), frame(0.3)]
-    found = choose(candidates, 2, 0.0, 0.0)
-    assert found.numbers == (1, 3)
-    assert found.distance_m == pytest.approx(0.2)
-    assert 0.8 < found.seen <= 1
-
-
 def test_wide_views_keep_their_distance_from_the_query_and_from_each_other() -> None:
     candidates = [frame(x) for x in (0.1, 0.2, 0.5, 0.55, 0.75, -0.6)]
     found = choose(candidates, 3, 0.5, 0.2)
