@@ -217,7 +217,7 @@ def test_a_file_is_sent_from_the_command_line(weights, tmp_path):
         outcome = json.loads(done.stdout)
         assert (outcome["used"], outcome["left_out"], outcome["completed"], outcome["running"]) == (4, 1, 1, False)
         far_file = write_tum(tmp_path / "far.tum", [far])
-        wrong = run("query", robot.query, "correct", far_file, "--apply-until", "0.2", "--no-wait")
+        wrong = run("query", robot.query, "correct", far_file)
         assert wrong.returncode == 1
         assert "none of 1 poses was taken within 5 ms of a frame in the history (8 frames from 0.0" in wrong.stderr
         assert client.correction().completed == 1 and robot.end(8)["map"]["corrected_poses"] == 4
