@@ -35,7 +35,7 @@ def finetune(
     from_scratch: bool = False,  # start from random weights
     # fit a field of this kind (irt, panoptic, grid) to the scene, from all frames; irt: classes of keyframes, panoptic:
     # of boxes and pseudo labels, grid: none
-    kind: str | None = None,
+    kind: Literal["irt", "panoptic", "grid"] | None = None,
     boxes: Path | None = None,  # --kind panoptic: boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360
     # --kind panoptic: pseudo labels, a folder of NNNNNN.png or weights that make them; without it the log's own label
     # images, else the small weights in the package
@@ -86,10 +86,7 @@ def finetune(
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
-    from semantic_mapper.training.finetune import FITTERS
 
-    if kind is not None and kind not in FITTERS:
-        raise typer.BadParameter(f"fitted to one scene are {', '.join(FITTERS)}", param_hint="--kind")
     keep_freed_memory()
     request = FinetuneRequest(
         log,

@@ -39,6 +39,7 @@ _PUMP_PERIOD_S = 0.02
 _SEND_SLICE_MS = 100
 _LATE_S = 0.1  # subscriptions of one socket come in no order; an end must not arrive before what it ends
 _MAX_SUBSCRIPTIONS = 4096  # what an unknown client's subscriptions may cost us
+_MAX_EVENTS = 256  # heard at a time: an unknown client that subscribes without end must not hold up what is published
 _POLL_MS = 50
 # A machine that is gone is found out within 5 s; a process that is gone at once, by the kernel.
 _KEEPALIVE = ((zmq.TCP_KEEPALIVE_IDLE, 2), (zmq.TCP_KEEPALIVE_INTVL, 1), (zmq.TCP_KEEPALIVE_CNT, 3))
@@ -210,7 +211,7 @@ class Publisher:
         for parts in owed:
             self._answer(parts)
         self._answer_late()
-        while True:
+        for _ in range(_MAX_EVENTS):
             try:
                 event = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
@@ -263,6 +264,9 @@ class Publisher:
             self._socket.send_multipart(parts, flags, copy=False)
         except zmq.Again:
             return False
+        except BaseException:  # Ctrl-C between two parts: end the message, or the next one would be glued to it
+            self._socket.send(b"", zmq.NOBLOCK)
+            raise
         return True
 
 

@@ -90,7 +90,7 @@ def test_nothing_is_lost_between_a_blocking_publisher_and_a_slow_lossless_subscr
 def test_a_blocking_publisher_names_a_subscriber_that_hangs(endpoint: str) -> None:
     big = encode_frame(samples.make_frame(size=(960, 720)), CodecOptions(rgb="raw"))  # fills the kernel's buffers soon
     with (
-        Publisher(endpoint, policy="block", hwm=1, linger_ms=0) as publisher,
+        Publisher(endpoint, policy="block", hwm=1) as publisher,
         LosslessSubscriber(endpoint, ["frame"], hwm=1) as subscriber,
     ):
         subscriber.wait_until_heard(WAIT_S)
