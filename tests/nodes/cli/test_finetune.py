@@ -177,7 +177,7 @@ def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, config: Path
     [
         (("--kind", "irt"), "how many labelled frames?"),
         (("--kind", "grid", "--keyframes", "2"), "learns from no keyframes"),
-        (("--kind", "sray", "--keyframes", "2"), "fitted to one scene are grid, irt"),
+        (("--kind", "sray", "--keyframes", "2"), "is not one of 'irt', 'panoptic', 'grid'"),
         (("--kind", "grid", "--weights", "x"), "starts from nothing"),
         (("--kind", "grid", "--strokes"), "learns from no keyframes and strokes"),
     ],
