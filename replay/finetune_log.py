@@ -71,7 +71,6 @@ class FinetuneRequest:
         kind: Of a field that is fitted to one scene, from nothing; None = that of the weights.
         labels: Folder of label images in place of the log's.
         frames: Numbers in the log of the labelled frames, in place of ``keyframes``.
-        unlabelled: How many other frames a kind of one scene uses at most; 0 = all, None = 300.
         boxes, pseudo, uncovered: Of the kind "panoptic": file of boxes, folder or weights of pseudo labels, and what is
             outside of all boxes.
         strokes: Label images are strokes, and grow.
@@ -87,7 +86,6 @@ class FinetuneRequest:
     kind: str | None = None
     labels: Path | None = None
     frames: Sequence[int] = ()
-    unlabelled: int | None = None
     boxes: Path | None = None
     pseudo: str | None = None
     uncovered: str = "stuff"
@@ -217,8 +215,6 @@ def _fit(
 
 def _check_options(request: FinetuneRequest, kind: str) -> None:
     """Refuse options that go with other weights."""
-    if request.unlabelled is not None and kind not in FITTERS:
-        raise ConfigError(f"unlabelled frames: weights of kind '{kind}' learn from labelled frames alone; leave it out")
     if request.config.irt.variant is not None and kind != IRT.kind:
         raise ConfigError(f"irt.variant: goes with weights of kind 'irt', not with '{kind}'; leave it out")
 
@@ -375,7 +371,7 @@ class FrameSource:
         frames: list[PosedFrame] = []
         damaged = 0
         monitor.start(len(self.log))
-        for number in sorted(set(_evenly(range(len(self.log)), self._most))):
+        for number in sorted(set(_evenly(range(len(self.log)), MAX_SCENE_FRAMES))):
             _go_on(monitor, number + 1, "reading frames")
             try:
                 frame = self.log.frame(number)
@@ -401,7 +397,7 @@ class FrameSource:
         frames: list[PosedFrame] = []
         reasons: list[str] = []
         monitor.start(len(self.log))
-        for number in choose_frames(len(self.log), self._most, labels.numbers):
+        for number in choose_frames(len(self.log), MAX_SCENE_FRAMES, labels.numbers):
             _go_on(monitor, number + 1, "reading frames and pseudo labels")
             try:
                 frame = self._with_depth(self.log.frame(number))
@@ -422,12 +418,6 @@ class FrameSource:
         if reasons:
             _log.warning("frames_without_pseudo_label", count=len(reasons), reason=reasons[0])
         return [labels.once_all_are_seen(frame) for frame in frames]
-
-    @property
-    def _most(self) -> int:
-        """Frames of the log that a field of one scene uses at most."""
-        most = MAX_SCENE_FRAMES if self.request.unlabelled is None else self.request.unlabelled
-        return most or len(self.log)
 
     def _read(self, number: int) -> PosedFrame:
         frame = self.log.frame(number)

@@ -238,14 +238,3 @@ STUFF_NAMES = frozenset(
 
 # Classes of things that move by themselves. Vehicles are not among them: most that a camera meets are parked.
 MOVING_NAMES = frozenset("person people human pedestrian rider bicyclist cyclist motorcyclist animal dog cat".split())
-
-
-def label_set_named(name: str) -> LabelSet:
-    """One of the provided sets.
-
-    Raises:
-        LabelError: naming the sets there are.
-    """
-    if name not in PROVIDED:
-        raise LabelError(f"no label set '{name}'; there are {', '.join(sorted(PROVIDED))}")
-    return PROVIDED[name]

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any
 
 HIDDEN = "..."
-CHAIN = "::"  # between the parts of fsspec's chained URLs
 # Where what stands before the @ is a container or the name of an account, and says where something is.
 NAMING_SCHEMES = ("abfs", "abfss", "az", "hdfs", "scp", "sftp", "smb", "ssh", "wasb", "wasbs")
 
@@ -44,17 +43,6 @@ def plain_without_secrets(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain_without_secrets(item) for item in value]
     return value
-
-
-def user_length(scheme: str, rest: str) -> int:
-    """Letters up to and including the @ of user information; 0 = no user information.
-
-    Args:
-        scheme: Before ``://``; empty for paths.
-        rest: All after it.
-    """
-    found = re.match(_USER, rest) if scheme and scheme != "file" else None
-    return 0 if found is None else found.end()
 
 
 def _without_secrets_of_urls(text: str) -> str:

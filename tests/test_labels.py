@@ -10,11 +10,9 @@ from semantic_mapper.errors import LabelError
 from semantic_mapper.labels import (
     NYU40,
     PROVIDED,
-    ROOMS,
     SCANNET20,
     STUFF_NAMES,
     LabelSet,
-    label_set_named,
     make_label_set,
 )
 
@@ -83,12 +81,6 @@ def test_sets_that_contradict_themselves_are_refused(
 ) -> None:
     with pytest.raises(LabelError, match=says):
         LabelSet("bad", ids, names, (RED,) * len(names), ignore_id)
-
-
-def test_sets_are_found_by_name_and_the_error_lists_them() -> None:
-    assert label_set_named("rooms") is ROOMS
-    with pytest.raises(LabelError, match=r"no label set 'room'.*kitti360.*nyu40"):
-        label_set_named("room")
 
 
 def test_a_class_is_found_by_name_and_the_error_lists_them() -> None:

@@ -264,6 +264,7 @@ class ManagedProcess:
         self._backoff = RestartBackoff()
         self._due = 0.0  # of the next start, while there is no process
         self._last_end = self._last_reason = ""
+        self._finishing = self._hopeless = False
         self._start()
 
     @property
@@ -353,8 +354,24 @@ class ManagedProcess:
 
     def request_stop(self) -> None:
         """Of its process, if there is one."""
-        if self.process is not None:
-            self.process.request_stop()
+        if self.process is None or (self._finishing and not self.process.heartbeat.ready):  # it would end at once
+            return
+        self.process.request_stop()
+
+    def start_to_finish(self) -> None:
+        """Start a node that is given up once more, to be stopped: it writes results of what it saved."""
+        if not self.failure or self._finishing or self._hopeless or self._entry.restart == "never":
+            return
+        self._finishing = True
+        before = self.process
+        try:
+            self._start_process(self.restarts + 1)  # it goes on from what this launch saved
+        except OSError as error:
+            _log.error("results_not_written", node=self.name, reason=str(error))
+            return
+        if before is not None:
+            before.close()
+        _log.info("node_finishes", node=self.name, pid=self.process.pid if self.process else 0)
 
     def close(self) -> None:
         """Leave no process behind."""
@@ -364,10 +381,8 @@ class ManagedProcess:
 
     def _start(self) -> None:
         count = self.restarts
-        # A restarted node waits for no subscribers: the others are there, and frames do not wait.
-        job = msgspec.structs.replace(self._job, restarts=count, subscribers=0 if count else self._job.subscribers)
         try:
-            self.process = NodeProcess(self.kind, job, self._server, self._launch.heartbeat_s)
+            process = self._start_process(count)
         except OSError as error:  # no process, memory or file is to be had: that may pass
             _log.error("node_not_started", node=self.name, reason=str(error))
             text = f"node '{self.name}' ({self.kind}) could not be started: {error}"
@@ -376,8 +391,15 @@ class ManagedProcess:
             else:
                 self._restart_later(text, f"could not be started: {error}")
             return
+        _log.info("node_started", node=self.name, kind=self.kind, pid=process.pid, restarts=count)
+
+    def _start_process(self, restarts: int) -> NodeProcess:
+        # A restarted node waits for no subscribers: the others are there, and frames do not wait.
+        subscribers = 0 if restarts else self._job.subscribers
+        job = msgspec.structs.replace(self._job, restarts=restarts, subscribers=subscribers)
+        self.process = process = NodeProcess(self.kind, job, self._server, self._launch.heartbeat_s)
         self._end_limit: ProgressLimit | None = None  # of this process, once its end is awaited
-        _log.info("node_started", node=self.name, kind=self.kind, pid=self.process.pid, restarts=count)
+        return process
 
     def _on_failure(self, process: NodeProcess, why: str, *, last: bool) -> None:
         text = process.describe_end() + (f" ({why})" if why else "")
@@ -386,6 +408,7 @@ class ManagedProcess:
         process.heartbeat.poll()
         failed_itself = code is not None and code > 0 and not process.was_terminated
         hopeless = failed_itself and not process.heartbeat.ready and not self.restarts
+        self._hopeless |= hopeless
         if last or hopeless or self._entry.restart == "never":
             self._give_up(text)
         else:

@@ -16,7 +16,7 @@ import structlog
 from semantic_mapper.config import MapperConfig, read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.map_file import open_map
-from semantic_mapper.mapping.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.map_snapshot import FrozenMap
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.publishing import PartStatus
@@ -93,7 +93,7 @@ class Autosave:
         if self._thread is not None:
             self._thread.join()
 
-    def _save(self, snapshot: MapSnapshot, version: int) -> None:
+    def _save(self, snapshot: FrozenMap, version: int) -> None:
         worked_since = time.monotonic()
 
         def rest() -> None:

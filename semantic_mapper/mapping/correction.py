@@ -36,7 +36,7 @@ from semantic_mapper.geometry import check_pose, interpolate_pose, invert_pose, 
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.blocks import ScratchFile
 from semantic_mapper.mapping.keyframes import KeyframeStore
-from semantic_mapper.mapping.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.map_snapshot import FrozenMap
 from semantic_mapper.mapping.map_types import ALWAYS, CorrectedPoses, CorrectionStatus
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
@@ -153,7 +153,7 @@ class _Rebuild:
     """A map on its way; corrections are applied one after the other."""
 
     voxel_map: VoxelMap
-    snapshots: list[MapSnapshot]  # see ``MapCorrector``
+    snapshots: list[FrozenMap]  # see ``MapCorrector``
     corrections: tuple[PoseCorrection, ...]
     done: int = 0  # frames of the history that are in it
 
@@ -199,7 +199,7 @@ class MapCorrector:
         self._entries: list[_Entry] = []  # oldest first; the number of the first one is ``_left``
         self._left = 0  # frames that have left the history
         self._older = 0  # entries of the older half
-        self._snapshots: list[MapSnapshot] = []  # of the map before the older half, and between the two
+        self._snapshots: list[FrozenMap] = []  # of the map before the older half, and between the two
         self._rebuild: _Rebuild | None = None
         self._lost = self._completed = self._poses = 0
         self._failure = ""
@@ -450,7 +450,7 @@ class MapCorrector:
         return pairs
 
 
-def _close(snapshots: Sequence[MapSnapshot]) -> None:
+def _close(snapshots: Sequence[FrozenMap]) -> None:
     for snapshot in snapshots:
         snapshot.close()
 

@@ -22,7 +22,7 @@ MOST_IN_MEMORY = 2048  # copied blocks, some 20 KB each; of more, the first go t
 _log = get_logger(__name__)
 
 
-class MapSnapshot:
+class FrozenMap:
     """A map as it was when this was made, to be written, or to be begun with again. Close it when it has served.
 
     A block that is about to change is copied first. Where it cannot be copied, the frame that changes it goes on, and

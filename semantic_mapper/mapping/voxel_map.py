@@ -40,7 +40,7 @@ from semantic_mapper.mapping.fusion import (
     probability_table,
 )
 from semantic_mapper.mapping.map_file import BlockPart, MapManifest, open_map
-from semantic_mapper.mapping.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.map_snapshot import FrozenMap
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView, require_same_scale, scale_name
 from semantic_mapper.mapping.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.surface import (
@@ -345,7 +345,7 @@ class VoxelMap:
         """
         self.snapshot().write(path, between)
 
-    def snapshot(self) -> MapSnapshot:
+    def snapshot(self) -> FrozenMap:
         """The map as it is now: for another thread to write, or to begin with again (``restored``)."""
         with _KERNEL_LOCK:
             manifest = MapManifest(
@@ -356,10 +356,10 @@ class VoxelMap:
                 scale=scale_name(self.scale_known),
                 refined=self.refined,
             )
-            return MapSnapshot(self._grid, _KERNEL_LOCK, manifest, self.places.places)
+            return FrozenMap(self._grid, _KERNEL_LOCK, manifest, self.places.places)
 
     @classmethod
-    def restored(cls, snapshot: MapSnapshot) -> VoxelMap:
+    def restored(cls, snapshot: FrozenMap) -> VoxelMap:
         """Another map, as one was when the snapshot was made, bit for bit.
 
         Raises:

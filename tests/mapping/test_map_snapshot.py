@@ -16,7 +16,7 @@ from semantic_mapper.mapping import blocks, map_snapshot
 from semantic_mapper.mapping.block_grid import LEAST_RESIDENT, BlockGrid
 from semantic_mapper.mapping.blocks import BlockValues, pack_keys
 from semantic_mapper.mapping.map_file import MapManifest, describe_map
-from semantic_mapper.mapping.map_snapshot import MapSnapshot
+from semantic_mapper.mapping.map_snapshot import FrozenMap
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.rendered_views import LABELS, small_map
 from tests.mapping.test_blocks import CLASSES, some_blocks
@@ -35,9 +35,9 @@ def filled_grid(memory_bytes: int) -> BlockGrid:
     return grid
 
 
-def snapshot_of(grid: BlockGrid) -> MapSnapshot:
+def snapshot_of(grid: BlockGrid) -> FrozenMap:
     manifest = MapManifest(config=VoxelMapConfig(), label_set=LABELS, frames=1, last_stamp_ns=0)
-    return MapSnapshot(grid, threading.Lock(), manifest, ())
+    return FrozenMap(grid, threading.Lock(), manifest, ())
 
 
 @pytest.mark.parametrize("most_in_memory", [map_snapshot.MOST_IN_MEMORY, 30], ids=["copies in memory", "on disk"])

@@ -116,6 +116,31 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
 
 
 @pytest.mark.slow
+def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
+    long_log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "up"
+    words = [word for setting in live_settings(long_log, weights, config) for word in ("--set", setting)]
+    with Running("up", LIVE_LAUNCH, *words, "--out", out) as running:
+        running.wait_for_line("map_saved")
+        restarts = 0
+        while not re.search(r"node_restarts .*in_s=[1-9].*node=mapper", running.text):  # so long that it is away
+            os.kill(wait_for_start(running, "mapper", restarts), signal.SIGKILL)
+            restarts += 1
+            running.wait_for_line(rf"node_restarts .*node=mapper .*restarts={restarts}\b")
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 1, running.text
+        assert not any(map(is_alive, running.all_pids()))
+    assert (out / "summary.json").exists(), running.text
+    assert "it had not been restarted yet when the launch ended" in error_line(running.text)
+    saved = VoxelMap.load(out / "map.npz")
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["map"]["blocks"] == saved.block_count > 0
+    assert summary["stopped_by"] and f"saved after {saved.frames} frames" in summary["restarted"]
+    assert {"map.ply", "overview.png", "report.html"} <= {path.name for path in out.iterdir()}
+
+
+@pytest.mark.slow
 def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path) -> None:
     with Running("up", alone(tmp_path, long_log)) as running:
         running.wait_for_line(r"\beye\].* playing ")

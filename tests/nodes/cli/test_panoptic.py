@@ -163,7 +163,7 @@ def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights:
 
 
 def test_weights_teach_with_the_map_that_they_make_of_the_frames(log: Path, weights: Path) -> None:
-    request = FinetuneRequest(log, log, config=FinetuneConfig(width=96), unlabelled=0)
+    request = FinetuneRequest(log, log, config=FinetuneConfig(width=96))
     with open_log(log) as opened:
         labels = open_pseudo_labels(opened, str(weights))
         taught = FrameSource(opened, None, request, {}).pseudo_labelled(labels, JobMonitor())
