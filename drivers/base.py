@@ -16,54 +16,38 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
-    """Where a camera was.
+    """Where a camera was."""
 
-    Args:
-        T_world_camera: (4, 4) float64; of sources of a rig's poses (``poses_of_rig``), T_world_rig.
-        source: What says so ("odometry", "board", "vio", ...); becomes ``PosedFrame.pose_source``.
-        sigma: One-sigma position uncertainty in metres; 0 = not known.
-        world: Which world the pose is in, where that begins with the source; becomes ``PosedFrame.world``.
-    """
-
-    T_world_camera: Float64
-    source: str
-    sigma: float = 0.0
-    world: int = 0
+    T_world_camera: Float64  # (4, 4) float64; of sources of a rig's poses (``poses_of_rig``), T_world_rig
+    source: str  # what says so ("odometry", "board", "vio", ...); becomes ``PosedFrame.pose_source``
+    sigma: float = 0.0  # One-sigma position uncertainty in metres; 0 = not known
+    world: int = 0  # which world the pose is in, where that begins with the source; becomes ``PosedFrame.world``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedWorld:
-    """What a pose source thinks now of where the camera was: the world of the poses to come.
+    """What a pose source thinks now of where the camera was: the world of the poses to come."""
 
-    Args:
-        poses: T_world_camera (4, 4) by stamp of the image, of as many of the past images as it remembers.
-        until_ns: Stamp of the last image whose pose was of the world before.
-        motion: (4, 4) what takes the last of these poses from the world before to this one.
-    """
-
+    # T_world_camera (4, 4) by stamp of the image, of as many of the past images as it remembers
     poses: Mapping[int, Float64]
-    until_ns: int
-    motion: Float64
+    until_ns: int  # stamp of the last image whose pose was of the world before
+    motion: Float64  # (4, 4) what takes the last of these poses from the world before to this one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraImage:
-    """What a camera has captured, rectified: all of a ``PosedFrame`` but where the camera was.
+    """What a camera has captured, rectified: all of a ``PosedFrame`` but where the camera was."""
 
-    Args:
-        stamp_ns, seq, camera_id, rgb, depth_m, intrinsics: As of ``PosedFrame``.
-        own_pose: Of a device that tracks itself (visual-inertial odometry); None of all others, and while it is lost.
-        tracks_itself: Whether the device does.
-    """
-
+    # stamp_ns, seq, camera_id, rgb, depth_m, intrinsics: As of ``PosedFrame``.
     stamp_ns: int
     seq: int
     camera_id: str
     rgb: UInt8
     depth_m: Float32 | None
     intrinsics: CameraIntrinsics
+    # of a device that tracks itself (visual-inertial odometry); None of all others, and while it is lost
     own_pose: PoseEstimate | None = None
-    tracks_itself: bool = False
+    tracks_itself: bool = False  # whether the device does
 
 
 class Camera:

@@ -85,18 +85,13 @@ class StereoFile(Config, frozen=True):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoCalibration:
-    """A calibrated pair.
+    """A calibrated pair."""
 
-    Args:
-        left, right: With distortion, both of one size.
-        T_right_left: (4, 4) from the left camera to the right one, metres.
-        swapped: The right camera's image is in the left half of what the device gives.
-    """
-
+    # left, right: With distortion, both of one size.
     left: CameraIntrinsics
     right: CameraIntrinsics
-    T_right_left: Float64
-    swapped: bool = False
+    T_right_left: Float64  # (4, 4) from the left camera to the right one, metres
+    swapped: bool = False  # the right camera's image is in the left half of what the device gives
 
 
 def load_calibration(path: Path) -> CameraIntrinsics:

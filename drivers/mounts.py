@@ -17,17 +17,11 @@ OTHER_FILES = ("oak", "stereo")  # kinds whose `calibration` is a file of anothe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
-    """A camera's place on a rig.
+    """A camera's place on a rig."""
 
-    Args:
-        T_rig_camera: (4, 4); None where nobody has said.
-        requested: Whether the settings name it; a calibration file just has it.
-        camera: For messages.
-    """
-
-    T_rig_camera: Float64 | None
-    requested: bool
-    camera: str
+    T_rig_camera: Float64 | None  # (4, 4); None where nobody has said
+    requested: bool  # whether the settings name it; a calibration file just has it
+    camera: str  # for messages
 
     def for_poses(self, poses: PoseConfig) -> Float64 | None:
         """T_rig_camera where poses are those of the rig; None where they are the camera's own.

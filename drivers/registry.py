@@ -22,19 +22,12 @@ KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
 
 @dataclass(frozen=True, slots=True)
 class FoundCamera:
-    """A camera that is connected.
+    """A camera that is connected."""
 
-    Args:
-        kind: Of ``KINDS``.
-        name: As the device calls itself.
-        address: What its driver's config takes: a path, a serial number, an IP address.
-        note: What else is worth knowing, for people.
-    """
-
-    kind: str
-    name: str
-    address: str
-    note: str = ""
+    kind: str  # of ``KINDS``
+    name: str  # as the device calls itself
+    address: str  # what its driver's config takes: a path, a serial number, an IP address
+    note: str = ""  # what else is worth knowing, for people
 
 
 class Driver(Protocol):

@@ -36,27 +36,16 @@ OptionsT = TypeVar("OptionsT", bound=NodeOptions)
 
 @dataclass(frozen=True, slots=True)
 class NodeContext:
-    """Who a node is and whom it knows.
+    """Who a node is and whom it knows."""
 
-    Args:
-        name: Of the node.
-        endpoints: By node name.
-        subscribers: How many listen to its frames.
-        stop: True once somebody has requested its end.
-        heartbeat: Tells the launcher how far the node is.
-        restarts: How often its launcher has restarted it.
-        folder: Of the launch's notes and sockets; None where it was started by hand.
-        restartable: Whether it restarts where it fails.
-    """
-
-    name: str
-    endpoints: dict[str, str]
-    subscribers: int
-    stop: StopRequest
-    heartbeat: HeartbeatWriter
-    restarts: int = 0
-    folder: Path | None = None
-    restartable: bool = False
+    name: str  # of the node
+    endpoints: dict[str, str]  # by node name
+    subscribers: int  # how many listen to its frames
+    stop: StopRequest  # true once somebody has requested its end
+    heartbeat: HeartbeatWriter  # tells the launcher how far the node is
+    restarts: int = 0  # how often its launcher has restarted it
+    folder: Path | None = None  # of the launch's notes and sockets; None where it was started by hand
+    restartable: bool = False  # whether it restarts where it fails
 
     def endpoint(self, name: str) -> str:
         """Where a node publishes."""

@@ -56,29 +56,17 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class AutolabelRequest:
-    """What to label, and how.
+    """What to label, and how."""
 
-    Args:
-        logs: The log, the parts of one, or a folder with them.
-        out: New log; of several parts, the name of the first.
-        weights: None = those that ship with the package.
-        config: Of the mapper that renders.
-        depth: Also give frames without depth what was computed from the pictures.
-        min_confidence: Pixels that are less sure are unknown.
-        overwrite_labels: Replace labels that are there, too.
-        max_frames: 0 = all.
-        instances: Folder for images of things, of weights that have boxes.
-    """
-
-    logs: tuple[Path, ...]
-    out: Path
-    weights: Path | None = None
-    config: MapperConfig = field(default_factory=MapperConfig)
-    depth: bool = False
-    min_confidence: float = 0.0
-    overwrite_labels: bool = False
-    max_frames: int = 0
-    instances: Path | None = None
+    logs: tuple[Path, ...]  # the log, the parts of one, or a folder with them
+    out: Path  # new log; of several parts, the name of the first
+    weights: Path | None = None  # none = those that ship with the package
+    config: MapperConfig = field(default_factory=MapperConfig)  # of the mapper that renders
+    depth: bool = False  # also give frames without depth what was computed from the pictures
+    min_confidence: float = 0.0  # pixels that are less sure are unknown
+    overwrite_labels: bool = False  # replace labels that are there, too
+    max_frames: int = 0  # 0 = all
+    instances: Path | None = None  # folder for images of things, of weights that have boxes
 
 
 class AutolabelReport(NamedTuple):
@@ -222,20 +210,14 @@ def _messages(reader: LogReader, label_set: LabelSet) -> Iterator[tuple[Envelope
 
 @dataclass(slots=True, eq=False)
 class _Message:
-    """A message on its way to the new log.
+    """A message on its way to the new log."""
 
-    Args:
-        writer: Of the part that it belongs to.
-        envelope, parts: Of the message.
-        waits: For its rendering, or that of a frame before it.
-        number: Of a frame in the log.
-    """
-
-    writer: LogWriter
+    writer: LogWriter  # of the part that it belongs to
+    # envelope, parts: Of the message.
     envelope: Envelope
     parts: list[bytes]
-    waits: bool = False
-    number: int = -1
+    waits: bool = False  # for its rendering, or that of a frame before it
+    number: int = -1  # of a frame in the log
 
 
 class _Labeller:

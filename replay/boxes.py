@@ -64,21 +64,14 @@ WholeNumber = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 @dataclass(frozen=True, slots=True)
 class BoxFile:
-    """What a file of boxes says.
+    """What a file of boxes says."""
 
-    Args:
-        primitives: In the order of the file, those that move among them.
-        merge: By class of the pseudo labels: classes that they cannot tell from it.
-        left_out: How many boxes of the file are of no class that is known.
-        bad: Boxes of XML that cannot be used: number in the file, id and what is wrong.
-        is_xml: Whether it is one of KITTI-360.
-    """
-
-    primitives: tuple[Primitive, ...]
+    primitives: tuple[Primitive, ...]  # in the order of the file, those that move among them
+    # by class of the pseudo labels: classes that they cannot tell from it
     merge: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
-    left_out: int = 0
-    bad: tuple[str, ...] = ()
-    is_xml: bool = False
+    left_out: int = 0  # how many boxes of the file are of no class that is known
+    bad: tuple[str, ...] = ()  # boxes of XML that cannot be used: number in the file, id and what is wrong
+    is_xml: bool = False  # whether it is one of KITTI-360
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

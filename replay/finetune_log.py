@@ -58,38 +58,28 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FinetuneRequest:
-    """What to finetune, and on what.
+    """What to finetune, and on what."""
 
-    Args:
-        log: The log.
-        out: Weights to write.
-        keyframes: How many labelled frames to use; 0 for a kind that learns no classes, and for all frames that the
-            folder ``labels`` has labels of.
-        config: Of the training.
-        weights, from_scratch: Weights to start from, None = those in the package; or random ones.
-        depth: Where the frames' depth comes from.
-        kind: Of a field that is fitted to one scene, from nothing; None = that of the weights.
-        labels: Folder of label images in place of the log's.
-        frames: Numbers in the log of the labelled frames, in place of ``keyframes``.
-        boxes, pseudo, uncovered: Of the kind "panoptic": file of boxes, folder or weights of pseudo labels, and what is
-            outside of all boxes.
-        strokes: Label images are strokes, and grow.
-    """
-
-    log: Path
-    out: Path
+    log: Path  # the log
+    out: Path  # weights to write
+    # how many labelled frames to use; 0 for a kind that learns no classes, and for all frames that the folder
+    # ``labels`` has labels of
     keyframes: int = 0
-    config: FinetuneConfig = field(default_factory=FinetuneConfig)
+    config: FinetuneConfig = field(default_factory=FinetuneConfig)  # of the training
+    # weights, from_scratch: Weights to start from, None = those in the package; or random ones.
     weights: Path | None = None
     from_scratch: bool = False
+    # where the frames' depth comes from
     depth: DepthConfig = field(default_factory=lambda: DepthConfig(source="sensor"))
-    kind: str | None = None
-    labels: Path | None = None
-    frames: Sequence[int] = ()
+    kind: str | None = None  # of a field that is fitted to one scene, from nothing; None = that of the weights
+    labels: Path | None = None  # folder of label images in place of the log's
+    frames: Sequence[int] = ()  # numbers in the log of the labelled frames, in place of ``keyframes``
+    # boxes, pseudo, uncovered: Of the kind "panoptic": file of boxes, folder or weights of pseudo labels, and what is
+    # outside of all boxes.
     boxes: Path | None = None
     pseudo: str | None = None
     uncovered: str = "stuff"
-    strokes: bool = False
+    strokes: bool = False  # label images are strokes, and grow
 
 
 class FinetuneResult(NamedTuple):
@@ -437,22 +427,15 @@ class FrameSource:
 
 @dataclass(frozen=True, slots=True)
 class PseudoLabels:
-    """Where label images come from.
+    """Where label images come from."""
 
-    Args:
-        label_set: Of them.
-        of: The frame, by number in the log, with its pseudo label, or without a label.
-        source: For people.
-        numbers: Frames that have one; None = all.
-        train_stamps_ns: Frames whose true labels those who made them have learned from.
-        once_all_are_seen: A frame and its label, once ``of`` has seen all of them.
-    """
-
-    label_set: LabelSet
+    label_set: LabelSet  # of them
+    # the frame, by number in the log, with its pseudo label, or without a label
     of: Callable[[PosedFrame, int], PosedFrame]
-    source: str
-    numbers: frozenset[int] | None = None
-    train_stamps_ns: frozenset[int] = frozenset()
+    source: str  # for people
+    numbers: frozenset[int] | None = None  # frames that have one; None = all
+    train_stamps_ns: frozenset[int] = frozenset()  # frames whose true labels those who made them have learned from
+    # a frame and its label, once ``of`` has seen all of them
     once_all_are_seen: Callable[[PosedFrame], PosedFrame] = lambda frame: frame
 
 

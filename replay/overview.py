@@ -52,23 +52,14 @@ STRIPES, STRIPE_LIGHT = 40, 0.45  # across computed surface: how many, and how b
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewStrip:
-    """One frame of the run, a row of the picture. Images may differ in size; each is scaled to its tile.
+    """One frame of the run, a row of the picture. Images may differ in size; each is scaled to its tile."""
 
-    Args:
-        name: Says which frame ("frame 120").
-        rgb: (H, W, 3) uint8.
-        rendered: (h, w) uint8 class ids; the ignore id is drawn grey.
-        truth: (H, W) uint8 class ids, None where they are missing.
-        depth_m: (H, W) float32, 0 = none; None for a stream without depth.
-        depth_rendered: The field rendered it; no sensor measured it.
-    """
-
-    name: str
-    rgb: UInt8
-    rendered: UInt8
-    truth: UInt8 | None = None
-    depth_m: Float32 | None = None
-    depth_rendered: bool = False
+    name: str  # says which frame ("frame 120")
+    rgb: UInt8  # (H, W, 3) uint8
+    rendered: UInt8  # (h, w) uint8 class ids; the ignore id is drawn grey
+    truth: UInt8 | None = None  # (H, W) uint8 class ids, None where they are missing
+    depth_m: Float32 | None = None  # (H, W) float32, 0 = none; None for a stream without depth
+    depth_rendered: bool = False  # the field rendered it; no sensor measured it
 
 
 @rendered

@@ -42,22 +42,15 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a page; what it has stands in this order.
+    """A part of a page; what it has stands in this order."""
 
-    Args:
-        heading: None of its own where empty.
-        notes: Paragraphs that the reader must not miss.
-        view: What ``point_view`` returns; at most once a page.
-        pictures, tables: The tables are those that the console shows.
-        folded: Texts that a click unfolds, by their heads.
-    """
-
-    heading: str = ""
-    notes: Sequence[str] = ()
-    view: Mapping[str, Any] | None = None
+    heading: str = ""  # none of its own where empty
+    notes: Sequence[str] = ()  # paragraphs that the reader must not miss
+    view: Mapping[str, Any] | None = None  # what ``point_view`` returns; at most once a page
+    # pictures, tables: The tables are those that the console shows.
     pictures: Sequence[Picture] = ()
     tables: Sequence[Table] = ()
-    folded: Mapping[str, str] = field(default_factory=dict)
+    folded: Mapping[str, str] = field(default_factory=dict)  # texts that a click unfolds, by their heads
 
 
 def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:

@@ -31,21 +31,13 @@ Quality = Literal["fast", "balanced", "reference"] | None
 
 @dataclass(frozen=True, eq=False)
 class ReplayedMap:
-    """The map that a log has become, and the questions of tests to it. Points are (3,) metres in the world.
+    """The map that a log has become, and the questions of tests to it. Points are (3,) metres in the world."""
 
-    Args:
-        folder: What ``semantic-mapper replay`` would have written: map, picture, summary.
-        voxel_map: The map.
-        summary: As in ``summary.json``.
-        root: What paths of stored runs are relative to.
-        update: Store runs instead of comparing with them.
-    """
-
-    folder: Path
-    voxel_map: VoxelMap
-    summary: Mapping[str, Any]
-    root: Path
-    update: bool = False
+    folder: Path  # what ``semantic-mapper replay`` would have written: map, picture, summary
+    voxel_map: VoxelMap  # the map
+    summary: Mapping[str, Any]  # as in ``summary.json``
+    root: Path  # what paths of stored runs are relative to
+    update: bool = False  # store runs instead of comparing with them
 
     def __repr__(self) -> str:
         return f"<map of {self.mapped} frames, {self.blocks} blocks; see {self.folder}>"

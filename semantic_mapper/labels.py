@@ -22,21 +22,14 @@ MAX_NAME = 128  # letters of a name, as in headers of messages (transport/header
 
 @dataclass(frozen=True, slots=True)
 class LabelSet:
-    """An ordered set of classes.
+    """An ordered set of classes."""
 
-    Args:
-        name: Of the set ("nyu40", "rooms", ...).
-        ids: Class ids as they stand in label images, in channel order; ``ignore_id`` is not among them.
-        names: One name a class.
-        colors: One (r, g, b) a class, 0 to 255; for the eye only, sets that differ in nothing else are equal.
-        ignore_id: The id that means "unknown, do not count".
-    """
-
-    name: str
-    ids: tuple[int, ...]
-    names: tuple[str, ...]
+    name: str  # of the set ("nyu40", "rooms", ...)
+    ids: tuple[int, ...]  # class ids as they stand in label images, in channel order; ``ignore_id`` is not among them
+    names: tuple[str, ...]  # one name a class
+    # one (r, g, b) a class, 0 to 255; for the eye only, sets that differ in nothing else are equal
     colors: tuple[tuple[int, int, int], ...] = field(compare=False)
-    ignore_id: int = 0
+    ignore_id: int = 0  # the id that means "unknown, do not count"
 
     def __post_init__(self) -> None:
         if not len(self.ids) == len(self.names) == len(self.colors):

@@ -23,22 +23,15 @@ BOUNDLESS = 1e6  # an upper bound that only keeps out what nothing can be comput
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One setting.
+    """One setting."""
 
-    Args:
-        name: Dotted, as TOML and ``--set`` name it.
-        type: Without its bounds.
-        low, high: Bounds, both included; None = none.
-        default: ``msgspec.NODEFAULT`` where it has to be given.
-        text: What is said where it is declared.
-    """
-
-    name: str
-    type: Any
+    name: str  # dotted, as TOML and ``--set`` name it
+    type: Any  # without its bounds
+    # low, high: Bounds, both included; None = none.
     low: float | None
     high: float | None
-    default: Any
-    text: str
+    default: Any  # ``msgspec.NODEFAULT`` where it has to be given
+    text: str  # what is said where it is declared
 
     @property
     def kind(self) -> str:

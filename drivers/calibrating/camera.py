@@ -42,30 +42,18 @@ _FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """A calibrated camera and how it came about.
+    """A calibrated camera and how it came about."""
 
-    Args:
-        intrinsics: With distortion.
-        estimated: False where they were given, and only compared with the views.
-        rms_px: Root mean square of the distances of corners, seen and predicted.
-        sigmas: One-sigma uncertainty by name (fx, fy, cx, cy, k1, ...); empty where they were given.
-        views: Those used.
-        residuals: (N, 2) a view, seen minus predicted, pixels.
-        errors_px: RMS of each view.
-        tilts: (V, 2) degrees; counts: corners a cell; see ``views``.
-        left_out: Names of views that did not fit the others.
-    """
-
-    intrinsics: CameraIntrinsics
-    estimated: bool
-    rms_px: float
-    sigmas: dict[str, float]
-    views: tuple[BoardView, ...]
-    residuals: tuple[Float64, ...]
-    errors_px: tuple[float, ...]
-    tilts: Float64
+    intrinsics: CameraIntrinsics  # with distortion
+    estimated: bool  # false where they were given, and only compared with the views
+    rms_px: float  # root mean square of the distances of corners, seen and predicted
+    sigmas: dict[str, float]  # One-sigma uncertainty by name (fx, fy, cx, cy, k1, ...); empty where they were given
+    views: tuple[BoardView, ...]  # those used
+    residuals: tuple[Float64, ...]  # (N, 2) a view, seen minus predicted, pixels
+    errors_px: tuple[float, ...]  # RMS of each view
+    tilts: Float64  # (V, 2) degrees; counts: corners a cell; see ``views``
     counts: NDArray[np.int64]
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()  # names of views that did not fit the others
 
 
 def calibrate_camera(

@@ -30,31 +30,21 @@ _HUBER_PX = 1.0  # residuals beyond count less
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigCalibration:
-    """A calibrated rig.
+    """A calibrated rig."""
 
-    Args:
-        T_rig_camera: (4, 4) by camera; the rig is where the first one sits.
-        rms_px: Of all corners at once.
-        instants: By camera: at how many it saw the board together with another one.
-        position_sigma_m, turn_sigma_deg: One-sigma uncertainty by camera; 0 of the first.
-    """
-
-    T_rig_camera: dict[str, Float64]
-    rms_px: float
-    instants: dict[str, int]
+    T_rig_camera: dict[str, Float64]  # (4, 4) by camera; the rig is where the first one sits
+    rms_px: float  # of all corners at once
+    instants: dict[str, int]  # by camera: at how many it saw the board together with another one
+    # position_sigma_m, turn_sigma_deg: One-sigma uncertainty by camera; 0 of the first.
     position_sigma_m: dict[str, float]
     turn_sigma_deg: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """All that came out.
+    """All that came out."""
 
-    Args:
-        cameras: By name; rig: None where it was not requested.
-    """
-
-    cameras: dict[str, CameraCalibration]
+    cameras: dict[str, CameraCalibration]  # by name; rig: None where it was not requested
     rig: RigCalibration | None
 
 

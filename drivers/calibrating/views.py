@@ -32,19 +32,12 @@ FLAT = 0.05  # corners whose spread across their main line is below this fractio
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardView:
-    """The corners of the board in one image.
+    """The corners of the board in one image."""
 
-    Args:
-        name: Of the image, for people.
-        stamp_ns: When it was taken.
-        points: (N, 3) on the board, metres.
-        pixels: (N, 2) in the image as the lens gives it.
-    """
-
-    name: str
-    stamp_ns: int
-    points: Float64
-    pixels: Float64
+    name: str  # of the image, for people
+    stamp_ns: int  # when it was taken
+    points: Float64  # (N, 3) on the board, metres
+    pixels: Float64  # (N, 2) in the image as the lens gives it
 
 
 class ViewGatherer:

@@ -26,48 +26,33 @@ QUEUE = 4  # images that wait where the reader is slow; the oldest gives way, wh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryPorts:
-    """Where odometry takes its images and gives its poses.
+    """Where odometry takes its images and gives its poses."""
 
-    Args:
-        left_out, right_out: ``dai.Node.Output`` of the stereo pair.
-        left_in, right_in: ``dai.Node.Input`` of the odometry node.
-        pose_out: ``dai.Node.Output`` of its poses (``dai.TransformData``), in the order of the images.
-        T_left_rgb: (4, 4) from the colour camera to the left one, metres.
-    """
-
+    # left_out, right_out: ``dai.Node.Output`` of the stereo pair.
     left_out: Any
     right_out: Any
+    # left_in, right_in: ``dai.Node.Input`` of the odometry node.
     left_in: Any
     right_in: Any
-    pose_out: Any
-    T_left_rgb: Float64
+    pose_out: Any  # ``dai.Node.Output`` of its poses (``dai.TransformData``), in the order of the images
+    T_left_rgb: Float64  # (4, 4) from the colour camera to the left one, metres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sources:
-    """What a pipeline gets its messages from.
+    """What a pipeline gets its messages from."""
 
-    Args:
-        pipeline: ``dai.Pipeline`` that holds the source nodes; not started yet.
-        device: ``dai.Device`` to close at the end; None on the host alone.
-        rgb, depth: ``dai.Node.Output`` of the colour images and of their depth; None without depth.
-        calibration: ``dai.CalibrationHandler`` of the device.
-        name: What people call it; ``address``: by which it is found again.
-        metadata: For the stream's information.
-        notes: What does not work as it should, as far as one knows at once.
-        odometry: None without.
-    """
-
-    pipeline: Any
-    device: Any | None
+    pipeline: Any  # ``dai.Pipeline`` that holds the source nodes; not started yet
+    device: Any | None  # ``dai.Device`` to close at the end; None on the host alone
+    # rgb, depth: ``dai.Node.Output`` of the colour images and of their depth; None without depth.
     rgb: Any
     depth: Any | None
-    calibration: Any
-    name: str
+    calibration: Any  # ``dai.CalibrationHandler`` of the device
+    name: str  # what people call it; ``address``: by which it is found again
     address: str
-    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
-    notes: tuple[str, ...] = ()
-    odometry: OdometryPorts | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])  # for the stream's information
+    notes: tuple[str, ...] = ()  # what does not work as it should, as far as one knows at once
+    odometry: OdometryPorts | None = None  # none without
 
     def close(self) -> None:
         """Free the device; one that has gone already is no error."""

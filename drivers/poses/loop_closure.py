@@ -74,41 +74,26 @@ def lies_on(found: Fit) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryKeyframe:
-    """A view that others are aligned to.
+    """A view that others are aligned to."""
 
-    Args:
-        number: Counts keyframes.
-        target: What views are aligned to, with its pose.
-        features: For finding back.
-        place: For loop closure.
-        way_m: Length of the shortest chain of keyframes back to the first one: errors add up along it.
-        unsure_m: How far it may be off along what no point showed.
-    """
-
-    number: int
-    target: Target
-    features: Features
-    place: Features
-    way_m: float
-    unsure_m: float = 0.0
+    number: int  # counts keyframes
+    target: Target  # what views are aligned to, with its pose
+    features: Features  # for finding back
+    place: Features  # for loop closure
+    way_m: float  # length of the shortest chain of keyframes back to the first one: errors add up along it
+    unsure_m: float = 0.0  # how far it may be off along what no point showed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """A measured motion from one keyframe to another.
+    """A measured motion from one keyframe to another."""
 
-    Args:
-        a, b: Keyframes by number.
-        T_a_b: (4, 4).
-        covariance: (6, 6) of rotation and position, in the axes of b.
-        chain: Between keyframes that tracking has linked, and measured well: no loop may bend it.
-    """
-
+    # a, b: Keyframes by number.
     a: int
     b: int
-    T_a_b: Float64
-    covariance: Float64
-    chain: bool = False
+    T_a_b: Float64  # (4, 4)
+    covariance: Float64  # (6, 6) of rotation and position, in the axes of b
+    chain: bool = False  # between keyframes that tracking has linked, and measured well: no loop may bend it
 
     @property
     def strength(self) -> tuple[bool, float]:

@@ -101,19 +101,12 @@ class _View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """Where a view lies on keyframes.
+    """Where a view lies on keyframes."""
 
-    Args:
-        T_world_camera: (4, 4).
-        nearest: The keyframe that it was aligned to first.
-        fits: To the keyframes that it was aligned to.
-        unsure_m: How far it may be off along what no point shows.
-    """
-
-    T_world_camera: Float64
-    nearest: OdometryKeyframe
-    fits: list[Fit]
-    unsure_m: float
+    T_world_camera: Float64  # (4, 4)
+    nearest: OdometryKeyframe  # the keyframe that it was aligned to first
+    fits: list[Fit]  # to the keyframes that it was aligned to
+    unsure_m: float  # how far it may be off along what no point shows
 
 
 class OdometryPoseSource(PoseSource):

@@ -217,15 +217,11 @@ def _frame(image: CameraImage, estimate: PoseEstimate) -> PosedFrame:
 
 
 class FilterResult(NamedTuple):
-    """What becomes of a frame, and of those that were held back before it.
+    """What becomes of a frame, and of those that were held back before it."""
 
-    Args:
-        passed: Frames to give, in the order of capture.
-        refused: Frames to leave out, each with the counter's name and why: "outliers" cannot have been reached from
-            poses that are believed; "uninitialized" did not agree with those after it while none was believed.
-    """
-
-    passed: list[PosedFrame]
+    passed: list[PosedFrame]  # frames to give, in the order of capture
+    # frames to leave out, each with the counter's name and why: "outliers" cannot have been reached from poses that are
+    # believed; "uninitialized" did not agree with those after it while none was believed
     refused: list[tuple[PosedFrame, str, str]]
 
 

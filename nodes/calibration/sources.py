@@ -46,21 +46,14 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(slots=True)
 class Source:
-    """Images of one camera or, of a log, of several.
+    """Images of one camera or, of a log, of several."""
 
-    Args:
-        images: Gives them with what to call each, to the end; a live camera's until ``stop``.
-        live: It has no end.
-        stream: Its images follow each other closely.
-        known: The intrinsics that it gives are right.
-        stop: Ends ``images`` soon, from any thread.
-    """
-
+    # gives them with what to call each, to the end; a live camera's until ``stop``
     images: Callable[[], Iterator[tuple[str, CameraImage]]]
-    live: bool = False
-    stream: bool = True
-    known: bool = False
-    stop: Callable[[], None] = lambda: None
+    live: bool = False  # it has no end
+    stream: bool = True  # its images follow each other closely
+    known: bool = False  # the intrinsics that it gives are right
+    stop: Callable[[], None] = lambda: None  # ends ``images`` soon, from any thread
 
 
 def check_places(texts: Sequence[str]) -> None:

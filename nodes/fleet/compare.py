@@ -65,41 +65,28 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class LogChange:
-    """One log in both results, or the mean over all with a score in both.
+    """One log in both results, or the mean over all with a score in both."""
 
-    Args:
-        log: Its URL in A.
-        a, b: The metric; None = no score.
-        estimate: None where its noise is unknown.
-        status: "worse", "better", "same"; "failed", "missing", "unscored": has a score in A only.
-        reason: Why it failed.
-    """
-
-    log: str
+    log: str  # its URL in A
+    # a, b: The metric; None = no score.
     a: float | None
     b: float | None = None
-    estimate: Estimate | None = None
-    status: str = SAME
-    reason: str = ""
+    estimate: Estimate | None = None  # none where its noise is unknown
+    status: str = SAME  # "worse", "better", "same"; "failed", "missing", "unscored": has a score in A only
+    reason: str = ""  # why it failed
 
 
 @dataclass(frozen=True, slots=True)
 class FleetComparison:
-    """All that ``compare_stores`` found.
+    """All that ``compare_stores`` found."""
 
-    Args:
-        operation, metric, lower_is_better: What was compared.
-        mean: Over logs.
-        logs: The worst first.
-        reasons: Why B is worse; empty = it is not.
-    """
-
+    # operation, metric, lower_is_better: What was compared.
     operation: str
     metric: str
     lower_is_better: bool
-    mean: LogChange
-    logs: tuple[LogChange, ...]
-    reasons: tuple[str, ...]
+    mean: LogChange  # over logs
+    logs: tuple[LogChange, ...]  # the worst first
+    reasons: tuple[str, ...]  # why B is worse; empty = it is not
 
     def count(self, status: str) -> int:
         """How many logs have a status."""

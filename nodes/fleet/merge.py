@@ -30,17 +30,11 @@ _WAY_OUT = "Give its pose in the file of --poses"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergeReport:
-    """What a merge has done.
+    """What a merge has done."""
 
-    Args:
-        merged: The map.
-        poses: T_world_map (4, 4) float64 by name, in the order in which the maps were added.
-        notes: How the pose of each is known, likewise.
-    """
-
-    merged: VoxelMap
-    poses: Mapping[str, Float64]
-    notes: tuple[str, ...]
+    merged: VoxelMap  # the map
+    poses: Mapping[str, Float64]  # T_world_map (4, 4) float64 by name, in the order in which the maps were added
+    notes: tuple[str, ...]  # how the pose of each is known, likewise
 
 
 def merge_maps(

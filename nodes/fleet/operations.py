@@ -78,19 +78,13 @@ class RefineSettings(Config, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One of ``OPERATIONS``.
+    """One of ``OPERATIONS``."""
 
-    Args:
-        settings: Kind of its settings.
-        run: Does it: log, empty folder for files of the result, weights (None = those that ship), settings.
-        memory_gb: A task is given at least so much, unless the user says otherwise.
-        defaults: Settings that differ from those of the kind.
-    """
-
-    settings: type[Config]
+    settings: type[Config]  # kind of its settings
+    # does it: log, empty folder for files of the result, weights (None = those that ship), settings
     run: Callable[[Path, Path, Path | None, Any], Findings]
-    memory_gb: float = 2.0
-    defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    memory_gb: float = 2.0  # a task is given at least so much, unless the user says otherwise
+    defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])  # settings that differ from those of the kind
 
 
 def read_settings(

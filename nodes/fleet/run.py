@@ -45,27 +45,16 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What to do with each log; goes to the workers, which have nothing else.
+    """What to do with each log; goes to the workers, which have nothing else."""
 
-    Args:
-        operation: Of ``OPERATIONS``.
-        store: URL of the store.
-        settings: Plain data of the operation's kind.
-        shown_settings: What was set, for people.
-        weights: Their file's name, or the name of weights that ship with the package; empty = the default ones.
-        weights_data: Content of their file; empty = they ship with the package.
-        weights_digest: SHA-256 of it.
-        code: Digest of the code that the driver has.
-    """
-
-    operation: str
-    store: str
-    settings: Mapping[str, Any]
-    shown_settings: Mapping[str, Any]
-    weights: str
-    weights_data: bytes
-    weights_digest: str
-    code: str
+    operation: str  # of ``OPERATIONS``
+    store: str  # URL of the store
+    settings: Mapping[str, Any]  # plain data of the operation's kind
+    shown_settings: Mapping[str, Any]  # what was set, for people
+    weights: str  # their file's name, or the name of weights that ship with the package; empty = the default ones
+    weights_data: bytes  # content of their file; empty = they ship with the package
+    weights_digest: str  # SHA-256 of it
+    code: str  # digest of the code that the driver has
 
     def key(self, log: str) -> str:
         """Digest of all that decides the result for a log, which is named by the digest of its content."""

@@ -33,83 +33,52 @@ _BATCH = 256  # documents that are read together; bounds memory
 
 
 class MethodScores(msgspec.Struct, frozen=True):
-    """How well one method labelled a log.
+    """How well one method labelled a log."""
 
-    Args:
-        method: "replay", or a method of ``eval`` such as "sray" or "own image alone".
-        iou: Intersection over union, 0..1, by class.
-        names: L names of classes of ``stretches``.
-        stretches: (S, 3, L) pixels of S stretches of consecutive scored frames, which comparisons draw again: by class
-            hits, truth, and union of truth and prediction.
-        first: (S,) numbers of the first scored frames of the stretches.
-    """
-
-    method: str
-    iou: dict[str, float | None]
-    names: tuple[str, ...] = ()
+    method: str  # "replay", or a method of ``eval`` such as "sray" or "own image alone"
+    iou: dict[str, float | None]  # intersection over union, 0..1, by class
+    names: tuple[str, ...] = ()  # L names of classes of ``stretches``
+    # (S, 3, L) pixels of S stretches of consecutive scored frames, which comparisons draw again: by class hits, truth,
+    # and union of truth and prediction
     stretches: tuple[tuple[tuple[int, ...], ...], ...] = ()
-    first: tuple[int, ...] = ()
+    first: tuple[int, ...] = ()  # (S,) numbers of the first scored frames of the stretches
 
 
 class Findings(msgspec.Struct, frozen=True):
-    """What an operation has found in a log: the same for the same input, but for ``costs``.
+    """What an operation has found in a log: the same for the same input, but for ``costs``."""
 
-    Args:
-        metrics: Figures by name, such as "miou", "map_miou", "frames_fused"; None where there was nothing to score.
-        costs: Seconds and bytes of this run by name, such as "step_ms_p50".
-        scores: Of each method; the metric "miou" is of the first one.
-        events: Kind and text of what a person may want to look at, such as a refused frame.
-    """
-
+    # figures by name, such as "miou", "map_miou", "frames_fused"; None where there was nothing to score
     metrics: dict[str, float | None]
-    costs: dict[str, float | None] = {}
-    scores: tuple[MethodScores, ...] = ()
+    costs: dict[str, float | None] = {}  # seconds and bytes of this run by name, such as "step_ms_p50"
+    scores: tuple[MethodScores, ...] = ()  # of each method; the metric "miou" is of the first one
+    # kind and text of what a person may want to look at, such as a refused frame
     events: tuple[tuple[str, str], ...] = ()
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of a log that was worked on.
+    """What is known of a log that was worked on."""
 
-    Args:
-        key: Digest of all that decides a result: operation, content of the log, weights, settings, code. Of a failure:
-            of operation, URL, weights and settings.
-        operation: "replay", "eval", "autolabel", "finetune" or "refine".
-        log: URL of the log, without credentials.
-        tags: Of the manifest, such as robot, site and date.
-        version: Of the code, for people.
-        finished_ns: When, nanoseconds since 1970.
-    """
-
+    # digest of all that decides a result: operation, content of the log, weights, settings, code. Of a failure: of
+    # operation, URL, weights and settings.
     key: str
-    operation: str
-    log: str
-    tags: dict[str, str]
-    version: str
-    finished_ns: int
+    operation: str  # "replay", "eval", "autolabel", "finetune" or "refine"
+    log: str  # URL of the log, without credentials
+    tags: dict[str, str]  # of the manifest, such as robot, site and date
+    version: str  # of the code, for people
+    finished_ns: int  # when, nanoseconds since 1970
 
 
 class TaskResult(Record, frozen=True, kw_only=True):
-    """``results/KEY.json``; that it is there says that the task is done.
+    """``results/KEY.json``; that it is there says that the task is done."""
 
-    Args:
-        log_digest: SHA-256 of the log's content.
-        weights: Name of the weights; empty = those that ship with the package.
-        settings: What was set.
-        findings: What was found.
-        files: SHA-256 by name below ``folder``.
-        folder: Of the files, "files/KEY/ATTEMPT" below the store.
-        seconds: That it took, without queueing.
-        node: Host that ran it.
-    """
-
-    log_digest: str
-    weights: str
-    settings: dict[str, Any]
-    findings: Findings
-    files: dict[str, str]
-    folder: str
-    seconds: float
-    node: str
+    log_digest: str  # SHA-256 of the log's content
+    weights: str  # name of the weights; empty = those that ship with the package
+    settings: dict[str, Any]  # what was set
+    findings: Findings  # what was found
+    files: dict[str, str]  # SHA-256 by name below ``folder``
+    folder: str  # of the files, "files/KEY/ATTEMPT" below the store
+    seconds: float  # that it took, without queueing
+    node: str  # host that ran it
 
 
 class Failure(Record, frozen=True, kw_only=True):

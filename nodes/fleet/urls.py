@@ -89,14 +89,10 @@ def reaching(url: str) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class LogInput:
-    """One log, or one recording in parts, or one map.
+    """One log, or one recording in parts, or one map."""
 
-    Args:
-        url: Path or URL of a file, or of a folder with the parts of one recording.
-        tags: What a manifest says of it, such as robot, site and date.
-    """
-
-    url: str
+    url: str  # path or URL of a file, or of a folder with the parts of one recording
+    # what a manifest says of it, such as robot, site and date
     tags: dict[str, str] = field(default_factory=dict[str, str])
 
 

@@ -46,17 +46,11 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ProcessKind:
-    """How a kind of node is started and stopped.
+    """How a kind of node is started and stopped."""
 
-    Attributes:
-        preloaded: Forked from a process that has imported PyTorch and Open3D, which take seconds.
-        ends_with_stream: Ends by itself when the stream does; otherwise it is requested to.
-        stop_s: How long it may make no progress when it is to end.
-    """
-
-    preloaded: bool
-    ends_with_stream: bool
-    stop_s: float
+    preloaded: bool  # forked from a process that has imported PyTorch and Open3D, which take seconds
+    ends_with_stream: bool  # ends by itself when the stream does; otherwise it is requested to
+    stop_s: float  # how long it may make no progress when it is to end
 
 
 # In the order in which they are stopped: sources first, so that the others get the end of the stream.

@@ -67,20 +67,13 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(slots=True, eq=False)
 class _PendingRequest:
-    """A question that waits for a snapshot or a worker, or that one answers.
+    """A question that waits for a snapshot or a worker, or that one answers."""
 
-    Args:
-        address: Socket that the answer goes to.
-        until: When the client stops waiting, monotonic seconds.
-        parts: As they came.
-        request: What they mean.
-        answer: Of the worker: parts, or None where nobody waits for them any more; None = it waits for a snapshot.
-    """
-
-    address: bytes
-    until: float
-    parts: list[bytes]
-    request: Request[Any]
+    address: bytes  # socket that the answer goes to
+    until: float  # when the client stops waiting, monotonic seconds
+    parts: list[bytes]  # as they came
+    request: Request[Any]  # what they mean
+    # of the worker: parts, or None where nobody waits for them any more; None = it waits for a snapshot
     answer: Future[list[bytes] | None] | None = None
 
 

@@ -37,19 +37,13 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Live:
-    """Where a running system is listened to.
+    """Where a running system is listened to."""
 
-    Args:
-        query: Where its mapper answers questions.
-        nodes: Endpoints of cameras and mappers, whatever else is among them; none shows the map alone.
-        identity: Of a mapper that has keys.
-        streams: How many of the nodes are cameras; it is over when all of their streams have ended.
-    """
-
-    query: str
+    query: str  # where its mapper answers questions
+    # endpoints of cameras and mappers, whatever else is among them; none shows the map alone
     nodes: tuple[str, ...] = ()
-    identity: ServerIdentity | None = None
-    streams: int = 1
+    identity: ServerIdentity | None = None  # of a mapper that has keys
+    streams: int = 1  # how many of the nodes are cameras; it is over when all of their streams have ended
 
 
 class MapShow:

@@ -17,17 +17,11 @@ MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportFrame:
-    """A frame of a log.
+    """A frame of a log."""
 
-    Args:
-        frame: Decoded.
-        rgb: Its colour image as the log holds it, packed again as PNG where the log holds raw pixels.
-        depth_scale: Units a metre of its depth image as the log holds it; 0 where it has none, or float32.
-    """
-
-    frame: PosedFrame
-    rgb: EncodedImage
-    depth_scale: float
+    frame: PosedFrame  # decoded
+    rgb: EncodedImage  # its colour image as the log holds it, packed again as PNG where the log holds raw pixels
+    depth_scale: float  # units a metre of its depth image as the log holds it; 0 where it has none, or float32
 
 
 class LeftOut(Exception):  # noqa: N818 - the house's errors are for people; this one tells a caller to go on

@@ -57,28 +57,18 @@ AXES = {sign + name: s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) fo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportRequest:
-    """What to write; None = the default, and not requested.
+    """What to write; None = the default, and not requested."""
 
-    Args:
-        format: Of the file.
-        min_weight: Voxels of less weight are left out; 1 = only measured surface.
-        min_confidence: Surface whose label is less sure is left out; 0 keeps what nothing voted for, too.
-        color: Points and meshes: what the colours show; the camera's by default.
-        up: GLB and grid: (3,) unit vector, up in the world; found by ``find_up`` by default, or refused.
-        height: Grid: LOW and HIGH in metres above the floor.
-        resolution: Grid: side of a cell in metres; 5 cm by default, or a voxel where that is larger.
-        floor: Grid: height of the floor along ``up`` in metres; found by default.
-        costs: Grid: TOML file with the cost of classes; a grid of costs is written next to the plan then.
-    """
-
-    format: Format
-    min_weight: float = SURFACE_WEIGHT
-    min_confidence: float = 0.0
-    color: ColorBy | None = None
+    format: Format  # of the file
+    min_weight: float = SURFACE_WEIGHT  # voxels of less weight are left out; 1 = only measured surface
+    min_confidence: float = 0.0  # surface whose label is less sure is left out; 0 keeps what nothing voted for, too
+    color: ColorBy | None = None  # points and meshes: what the colours show; the camera's by default
+    # GLB and grid: (3,) unit vector, up in the world; found by ``find_up`` by default, or refused
     up: Float64 | None = None
-    height: tuple[float, float] | None = None
-    resolution: float | None = None
-    floor: float | None = None
+    height: tuple[float, float] | None = None  # grid: LOW and HIGH in metres above the floor
+    resolution: float | None = None  # grid: side of a cell in metres; 5 cm by default, or a voxel where that is larger
+    floor: float | None = None  # grid: height of the floor along ``up`` in metres; found by default
+    # grid: TOML file with the cost of classes; a grid of costs is written next to the plan then
     costs: Path | None = None
 
 

@@ -33,25 +33,18 @@ MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """How to read a recording.
+    """How to read a recording."""
 
-    Args:
-        every: Only every this many-th frame of the recording, the first one among them.
-        max_frames: Stop after this many frames; None = all.
-        quarters: Turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side.
-        topics: ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), where several fit. Depth
-            "none", of every format: without.
-        world: ROS bags: frame of tf in which poses are; empty = map, world or odom.
-        body: ROS bags: frame whose pose the topic of poses tells; empty = as its messages say.
-        scale: Metres per unit of poses whose unit is their own (transforms, colmap, opensfm); None = not known.
-    """
-
-    every: int = 1
-    max_frames: int | None = None
+    every: int = 1  # only every this many-th frame of the recording, the first one among them
+    max_frames: int | None = None  # stop after this many frames; None = all
+    # turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side
     quarters: int = 0
+    # ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), where several fit. Depth "none", of
+    # every format: without.
     topics: Mapping[str, str] = field(default_factory=dict[str, str])
-    world: str = ""
-    body: str = ""
+    world: str = ""  # ROS bags: frame of tf in which poses are; empty = map, world or odom
+    body: str = ""  # ROS bags: frame whose pose the topic of poses tells; empty = as its messages say
+    # metres per unit of poses whose unit is their own (transforms, colmap, opensfm); None = not known
     scale: float | None = None
 
     @property

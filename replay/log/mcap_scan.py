@@ -44,19 +44,14 @@ _KINDS = {
 
 @dataclass(slots=True)
 class Scan:
-    """Where the messages of a file are.
+    """Where the messages of a file are."""
 
-    Args:
-        chunks: (offset, length) of each chunk record, or of a message that stands outside chunks.
-        attachments: (offset, length) of each attachment record.
-        damaged_from: From where on nothing can be read, and why; None where all can.
-        finished: Whether the file was closed by its writer; False after a crash.
-    """
-
+    # (offset, length) of each chunk record, or of a message that stands outside chunks
     chunks: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
+    # (offset, length) of each attachment record
     attachments: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
-    damaged_from: tuple[int, str] | None = None
-    finished: bool = False
+    damaged_from: tuple[int, str] | None = None  # from where on nothing can be read, and why; None where all can
+    finished: bool = False  # whether the file was closed by its writer; False after a crash
 
 
 def scan(fd: int, where: str) -> Scan:

@@ -30,43 +30,28 @@ logger = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """How to play.
+    """How to play."""
 
-    Args:
-        mode: "lockstep": wait for the mapper's answer to each frame; "realtime": keep the recording's distances in
-            time; "fast": as fast as the subscribers take frames (with a publisher of policy "block", nothing is lost).
-        rate: Of "realtime"; 2 = twice as fast.
-        max_frames: Stop after this many; None = all.
-        subscribers: Wait for this many before the first frame.
-        subscriber_timeout_s: How long to wait for them.
-        ack_timeout_s: How long the mapper may take for one frame where it is waited for; the first ones compile.
-        source: How the player calls itself in its ``EndOfStream``.
-        from_stamp_ns: Frames captured before are passed over; 0 = none.
-    """
-
+    # "lockstep": wait for the mapper's answer to each frame; "realtime": keep the recording's distances in time;
+    # "fast": as fast as the subscribers take frames (with a publisher of policy "block", nothing is lost)
     mode: Mode = "lockstep"
-    rate: float = 1.0
-    max_frames: int | None = None
-    subscribers: int = 1
-    subscriber_timeout_s: float = 60.0
+    rate: float = 1.0  # of "realtime"; 2 = twice as fast
+    max_frames: int | None = None  # stop after this many; None = all
+    subscribers: int = 1  # wait for this many before the first frame
+    subscriber_timeout_s: float = 60.0  # how long to wait for them
+    # how long the mapper may take for one frame where it is waited for; the first ones compile
     ack_timeout_s: float = 300.0
-    source: str = "player"
-    from_stamp_ns: int = 0
+    source: str = "player"  # how the player calls itself in its ``EndOfStream``
+    from_stamp_ns: int = 0  # frames captured before are passed over; 0 = none
 
 
 @dataclass(frozen=True, slots=True)
 class PlayReport:
-    """What was played.
+    """What was played."""
 
-    Args:
-        published: Frames sent.
-        errors: Frames of the log that could not be read.
-        stopped: Whether a person ended it before the log did.
-    """
-
-    published: int
-    errors: tuple[LogError, ...]
-    stopped: bool
+    published: int  # frames sent
+    errors: tuple[LogError, ...]  # frames of the log that could not be read
+    stopped: bool  # whether a person ended it before the log did
 
 
 def play(

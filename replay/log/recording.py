@@ -27,22 +27,16 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RecordingRules:
-    """How a recording is split, and what happens where the disk is full.
+    """How a recording is split, and what happens where the disk is full."""
 
-    Args:
-        split_bytes: Messages of a part take at most so much (one that is larger has a part of its own), its index some
-            kilobytes more; 0 = any size.
-        split_s: A part covers at most this many seconds of recording; 0 = any time.
-        disk_full: "stop": what is recorded stays, and recording ends. "delete-oldest": the oldest parts of this
-            recording are deleted, never the one that is being written; where none is left, recording pauses until
-            there is room.
-        reserve_bytes: So much of the disk is left free for others.
-    """
-
+    # messages of a part take at most so much (one that is larger has a part of its own), its index some kilobytes more;
+    # 0 = any size
     split_bytes: int = 0
-    split_s: float = 0.0
+    split_s: float = 0.0  # a part covers at most this many seconds of recording; 0 = any time
+    # "stop": what is recorded stays, and recording ends. "delete-oldest": the oldest parts of this recording are
+    # deleted, never the one that is being written; where none is left, recording pauses until there is room.
     disk_full: DiskFull = "stop"
-    reserve_bytes: int = 0
+    reserve_bytes: int = 0  # so much of the disk is left free for others
 
     @property
     def splits(self) -> bool:

@@ -104,46 +104,27 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmReport:
-    """What became of a film.
+    """What became of a film."""
 
-    Args:
-        film: Its file or folder.
-        looked_at: Frames of the film.
-        picked, registered: Frames that structure from motion was given, and has registered.
-        left_out: Frames that are not in the log, in order.
-        error_px: Mean reprojection error of the points.
-        points: How many there are.
-        focal_px: Of the frames before they are rectified, in pixels of the film.
-        focal_source: Where it comes from.
-        distortion: OpenCV's coefficients.
-        scale: How the scale was found; empty = unknown.
-        height_m: Median height of the camera over the floor; None where no floor is found.
-        T_world_camera: (N, 4, 4) of the N frames in the log.
-        xyz: (M, 3) points, some of them.
-        notices: Sentences on what had to be assumed.
-        pictures: RGB of a few frames of the log, with their times in seconds.
-        info: What stands in the log's head.
-        bytes: Size of the log.
-    """
-
-    film: Path
-    looked_at: int
+    film: Path  # its file or folder
+    looked_at: int  # frames of the film
+    # picked, registered: Frames that structure from motion was given, and has registered.
     picked: int
     registered: int
-    left_out: tuple[LeftOut, ...]
-    error_px: float
-    points: int
-    focal_px: float
-    focal_source: str
-    distortion: tuple[float, ...]
-    scale: str
-    height_m: float | None
-    T_world_camera: Float64
-    xyz: Float64
-    notices: tuple[str, ...]
-    pictures: tuple[tuple[float, UInt8], ...]
-    info: StreamInfo
-    bytes: int
+    left_out: tuple[LeftOut, ...]  # frames that are not in the log, in order
+    error_px: float  # mean reprojection error of the points
+    points: int  # how many there are
+    focal_px: float  # of the frames before they are rectified, in pixels of the film
+    focal_source: str  # where it comes from
+    distortion: tuple[float, ...]  # OpenCV's coefficients
+    scale: str  # how the scale was found; empty = unknown
+    height_m: float | None  # median height of the camera over the floor; None where no floor is found
+    T_world_camera: Float64  # (N, 4, 4) of the N frames in the log
+    xyz: Float64  # (M, 3) points, some of them
+    notices: tuple[str, ...]  # sentences on what had to be assumed
+    pictures: tuple[tuple[float, UInt8], ...]  # RGB of a few frames of the log, with their times in seconds
+    info: StreamInfo  # what stands in the log's head
+    bytes: int  # size of the log
 
     @property
     def frames(self) -> int:

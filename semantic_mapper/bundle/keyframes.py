@@ -37,64 +37,40 @@ _log = get_logger(__name__)
 
 @dataclass(slots=True, eq=False)
 class Keyframe:
-    """A frame that takes part in the bundle.
+    """A frame that takes part in the bundle."""
 
-    Args:
-        number: Counts keyframes from 0.
-        tracks: What it sees.
-        T_world_camera: (4, 4), the best that is known.
-        prior: (4, 4) as given; anything where ``prior_sigmas`` are infinite.
-        prior_sigmas: Metres and radians.
-    """
-
-    number: int
-    tracks: Tracks
-    T_world_camera: Float64
-    prior: Float64
-    prior_sigmas: tuple[float, float]
+    number: int  # counts keyframes from 0
+    tracks: Tracks  # what it sees
+    T_world_camera: Float64  # (4, 4), the best that is known
+    prior: Float64  # (4, 4) as given; anything where ``prior_sigmas`` are infinite
+    prior_sigmas: tuple[float, float]  # metres and radians
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleProblem:
-    """K keyframes, P points, N sights of them.
+    """K keyframes, P points, N sights of them."""
 
-    Args:
-        intrinsics: Of the images that the pixels are in.
-        poses: (K, 4, 4) T_world_camera, first guesses.
-        held: (K,) whether a keyframe stays at its first guess.
-        priors: (K, 4, 4) T_world_camera as given.
-        prior_sigmas: (K, 2) one sigma of these in metres and radians; infinite = none was given.
-        points: (P, 3) first guesses, world.
-        keyframe, point: (N,) rows of what sees and what is seen.
-        pixels: (N, 2) as (u, v).
-        keyframes, ids: Of a map: its keyframes, and the tracks of the points.
-    """
-
-    intrinsics: CameraIntrinsics
-    poses: Float64
-    held: Bool
-    priors: Float64
-    prior_sigmas: Float64
-    points: Float64
+    intrinsics: CameraIntrinsics  # of the images that the pixels are in
+    poses: Float64  # (K, 4, 4) T_world_camera, first guesses
+    held: Bool  # (K,) whether a keyframe stays at its first guess
+    priors: Float64  # (K, 4, 4) T_world_camera as given
+    prior_sigmas: Float64  # (K, 2) one sigma of these in metres and radians; infinite = none was given
+    points: Float64  # (P, 3) first guesses, world
+    # keyframe, point: (N,) rows of what sees and what is seen.
     keyframe: Int64
     point: Int64
-    pixels: Float64
+    pixels: Float64  # (N, 2) as (u, v)
+    # keyframes, ids: Of a map: its keyframes, and the tracks of the points.
     keyframes: Sequence[Keyframe] = ()
     ids: Sequence[int] = ()
 
 
 class BundleResult(NamedTuple):
-    """What a bundle adjustment found.
+    """What a bundle adjustment found."""
 
-    Args:
-        poses: (K, 4, 4).
-        points: (P, 3).
-        errors_px: (N,) of each sight; infinite behind the camera.
-    """
-
-    poses: Float64
-    points: Float64
-    errors_px: Float64
+    poses: Float64  # (K, 4, 4)
+    points: Float64  # (P, 3)
+    errors_px: Float64  # (N,) of each sight; infinite behind the camera
 
 
 class KeyframeMap:

@@ -38,20 +38,14 @@ _CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not reported
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedPose:
-    """What became of a frame's pose.
+    """What became of a frame's pose."""
 
-    Args:
-        T_world_camera: (4, 4) float64.
-        refined: Whether the picture took part; the given pose, moved like the frames around it, where not.
-        given_error_px: Median distance in pixels of the frame between corners and where they would be by the given
-            poses of this frame and the last keyframe; NaN where too few corners are known.
-        error_px: The same by the refined poses.
-    """
-
-    T_world_camera: Float64
-    refined: bool
+    T_world_camera: Float64  # (4, 4) float64
+    refined: bool  # whether the picture took part; the given pose, moved like the frames around it, where not
+    # median distance in pixels of the frame between corners and where they would be by the given poses of this frame
+    # and the last keyframe; NaN where too few corners are known
     given_error_px: float
-    error_px: float
+    error_px: float  # the same by the refined poses
 
 
 @dataclass(slots=True, eq=False)

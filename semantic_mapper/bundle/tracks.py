@@ -24,15 +24,10 @@ _EPIPOLAR_LEAST = 12  # corners that a fundamental matrix is fitted to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Corners of one image.
+    """Corners of one image."""
 
-    Args:
-        ids: (N,) numbers, ascending; the same corner has the same number in every image.
-        pixels: (N, 2) float64 as (u, v).
-    """
-
-    ids: Int64
-    pixels: Float64
+    ids: Int64  # (N,) numbers, ascending; the same corner has the same number in every image
+    pixels: Float64  # (N, 2) float64 as (u, v)
 
     def rows(self, ids: Int64) -> Int64:
         """Rows (M,) of tracks that are there."""

@@ -40,16 +40,12 @@ AROUND = 9  # pixels a side in which other pixels support one
 
 
 class Agreement(NamedTuple):
-    """What neighbours say of a depth image.
+    """What neighbours say of a depth image."""
 
-    Args:
-        agree, visible: (h, w) uint8 neighbours whose depth agrees; that have a depth there.
-        mean_m: (h, w) float32 depth averaged with those that agree, in inverse depth; 0 = none.
-    """
-
+    # agree, visible: (h, w) uint8 neighbours whose depth agrees; that have a depth there.
     agree: UInt8
     visible: UInt8
-    mean_m: Float32
+    mean_m: Float32  # (h, w) float32 depth averaged with those that agree, in inverse depth; 0 = none
 
 
 def estimate_depth(

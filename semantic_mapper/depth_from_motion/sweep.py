@@ -30,23 +30,14 @@ T = TypeVar("T", bound=np.generic)
 
 
 class SweepResult(NamedTuple):
-    """What matching found of each pixel of the reference.
+    """What matching found of each pixel of the reference."""
 
-    Args:
-        cost: (h, w, D) uint8 matching cost of each plane.
-        path_sum: (h, w, D) uint16 the same, summed along paths.
-        plane: (h, w) float32 best plane, between planes.
-        confidence: (h, w) float32 in [0, 1], how much the next best plane costs above it.
-        match: (h, w) float32 matching cost of the best plane.
-        seen: (h, w) uint8 the most sources that see one plane of the pixel.
-    """
-
-    cost: UInt8
-    path_sum: UInt16
-    plane: Float32
-    confidence: Float32
-    match: Float32
-    seen: UInt8
+    cost: UInt8  # (h, w, D) uint8 matching cost of each plane
+    path_sum: UInt16  # (h, w, D) uint16 the same, summed along paths
+    plane: Float32  # (h, w) float32 best plane, between planes
+    confidence: Float32  # (h, w) float32 in [0, 1], how much the next best plane costs above it
+    match: Float32  # (h, w) float32 matching cost of the best plane
+    seen: UInt8  # (h, w) uint8 the most sources that see one plane of the pixel
 
 
 def inverse_depths(planes: int, near_m: float, far_m: float) -> Float32:

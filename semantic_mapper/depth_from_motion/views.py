@@ -18,39 +18,26 @@ COLOUR_RATE = 1 / (2 * 20.0**2)  # sigma of 20 8-bit steps
 
 
 class DepthEstimate(NamedTuple):
-    """Depth of a view.
+    """Depth of a view."""
 
-    Args:
-        depth_m: (h, w) float32 z in metres, 0 = none.
-        sigma_m: (h, w) float32 one-sigma spread in metres, 0 where there is no depth.
-    """
-
-    depth_m: Float32
-    sigma_m: Float32
+    depth_m: Float32  # (h, w) float32 z in metres, 0 = none
+    sigma_m: Float32  # (h, w) float32 one-sigma spread in metres, 0 where there is no depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedView:
-    """A frame at the working size, with what matching looks up.
+    """A frame at the working size, with what matching looks up."""
 
-    Args:
-        stamp_ns: Of the frame.
-        intrinsics: At the working size (h, w).
-        intrinsics_double: Of the image at twice the size. Pixel k of ``census`` covers coordinates k to k + 1 of it.
-        T_world_camera: (4, 4) float64.
-        rgb, gray: (h, w, 3), (h, w) uint8.
-        census: (2h, 2w) int32; pixel (2y, 2x) belongs to pixel (y, x) of the working size.
-        estimate: Depth that was found for the view earlier; None where there was none.
-    """
-
-    stamp_ns: int
-    intrinsics: CameraIntrinsics
+    stamp_ns: int  # of the frame
+    intrinsics: CameraIntrinsics  # at the working size (h, w)
+    # of the image at twice the size. Pixel k of ``census`` covers coordinates k to k + 1 of it.
     intrinsics_double: CameraIntrinsics
-    T_world_camera: Float64
+    T_world_camera: Float64  # (4, 4) float64
+    # rgb, gray: (h, w, 3), (h, w) uint8.
     rgb: UInt8
     gray: UInt8
-    census: Int32
-    estimate: DepthEstimate | None = None
+    census: Int32  # (2h, 2w) int32; pixel (2y, 2x) belongs to pixel (y, x) of the working size
+    estimate: DepthEstimate | None = None  # depth that was found for the view earlier; None where there was none
 
 
 def prepare_view(frame: PosedFrame, width: int) -> PreparedView:

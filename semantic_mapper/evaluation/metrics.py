@@ -26,23 +26,15 @@ from semantic_mapper.types import Float32, Float64, UInt8
 
 @dataclass(frozen=True, slots=True)
 class SegmentationMetrics:
-    """Figures in 0..1; ``None`` where no pixel had a truth.
+    """Figures in 0..1; ``None`` where no pixel had a truth."""
 
-    Args:
-        miou: Mean intersection over union of the classes that occur in the truth.
-        total_accuracy: Fraction of the pixels that are right.
-        average_accuracy: Mean over the classes in the truth of the fraction of their pixels that is right.
-        coverage: Fraction of the pixels with any prediction but "unknown".
-        per_class: IoU by class name, for the classes that occur in the truth, in the label set's order.
-        pixels: How many pixels were counted.
-    """
-
-    miou: float | None
-    total_accuracy: float | None
-    average_accuracy: float | None
-    coverage: float | None
+    miou: float | None  # mean intersection over union of the classes that occur in the truth
+    total_accuracy: float | None  # fraction of the pixels that are right
+    average_accuracy: float | None  # mean over the classes in the truth of the fraction of their pixels that is right
+    coverage: float | None  # fraction of the pixels with any prediction but "unknown"
+    # IoU by class name, for the classes that occur in the truth, in the label set's order
     per_class: dict[str, float] = field(default_factory=dict[str, float])
-    pixels: int = 0
+    pixels: int = 0  # how many pixels were counted
 
 
 class ConfusionMatrix:
@@ -245,17 +237,11 @@ MAX_SEGMENTS = 64
 
 @dataclass(slots=True, eq=False)
 class Segment:
-    """Consecutive scored frames.
+    """Consecutive scored frames."""
 
-    Args:
-        first: Number of its first frame among those that were scored.
-        frames: How many there are.
-        confusion: Of all their pixels.
-    """
-
-    first: int
-    frames: int
-    confusion: ConfusionMatrix
+    first: int  # number of its first frame among those that were scored
+    frames: int  # how many there are
+    confusion: ConfusionMatrix  # of all their pixels
 
 
 class Segments:

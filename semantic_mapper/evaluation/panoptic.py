@@ -49,23 +49,19 @@ class ClassQuality:
 
 @dataclass(frozen=True, slots=True)
 class PanopticMetrics:
-    """Means over the classes that were true or found somewhere, in 0..1; None without such classes.
+    """Means over the classes that were true or found somewhere, in 0..1; None without such classes."""
 
-    Args:
-        pq, sq, rq, pq_plus: Of all classes.
-        pq_things, pq_stuff: PQ of a part of them.
-        per_class: By name, in the label set's order.
-        segments: True segments.
-    """
-
+    # pq, sq, rq, pq_plus: Of all classes.
     pq: float | None = None
     sq: float | None = None
     rq: float | None = None
     pq_plus: float | None = None
+    # pq_things, pq_stuff: PQ of a part of them.
     pq_things: float | None = None
     pq_stuff: float | None = None
+    # by name, in the label set's order
     per_class: dict[str, ClassQuality] = field(default_factory=dict[str, ClassQuality])
-    segments: int = 0
+    segments: int = 0  # true segments
 
 
 class PanopticCounts:

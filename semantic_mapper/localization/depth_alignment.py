@@ -37,52 +37,32 @@ _EDGE = 0.05  # fraction of the depth by which these may differ, or they are of 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """A depth image at one size.
+    """A depth image at one size."""
 
-    Args:
-        points: (H, W, 3) float32 in the camera's axes, metres; NaN = none.
-        normals: (H, W, 3) float32 of unit length; NaN = none.
-        intrinsics: Of this size.
-    """
-
-    points: Float32
-    normals: Float32
-    intrinsics: CameraIntrinsics
+    points: Float32  # (H, W, 3) float32 in the camera's axes, metres; NaN = none
+    normals: Float32  # (H, W, 3) float32 of unit length; NaN = none
+    intrinsics: CameraIntrinsics  # of this size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """What is aligned to: a view with a pose.
+    """What is aligned to: a view with a pose."""
 
-    Args:
-        levels: Finest first.
-        T_world_camera: (4, 4).
-    """
-
-    levels: tuple[Level, ...]
-    T_world_camera: Float64
+    levels: tuple[Level, ...]  # finest first
+    T_world_camera: Float64  # (4, 4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """How well a view at a pose lies on a target.
+    """How well a view at a pose lies on a target."""
 
-    Args:
-        overlap: Fraction of the view's points that the target's image holds.
-        fitness: Fraction of these that lie on its surface.
-        near: How many these are.
-        rmse_m: Of the distances of these.
-        cost_m: Mean distance of the points that the target's image holds, no one's more than the outlier distance.
-        noise_m: Of the distances, as of points at 1 m.
-        normal_matrix, gradient: (6, 6) and (6,) of turning and shifting the camera, in its own axes, in points at 1 m.
-    """
-
-    overlap: float
-    fitness: float
-    near: int
-    rmse_m: float
-    cost_m: float
-    noise_m: float
+    overlap: float  # fraction of the view's points that the target's image holds
+    fitness: float  # fraction of these that lie on its surface
+    near: int  # how many these are
+    rmse_m: float  # of the distances of these
+    cost_m: float  # mean distance of the points that the target's image holds, no one's more than the outlier distance
+    noise_m: float  # of the distances, as of points at 1 m
+    # normal_matrix, gradient: (6, 6) and (6,) of turning and shifting the camera, in its own axes, in points at 1 m.
     normal_matrix: Float64
     gradient: Float64
 

@@ -28,17 +28,11 @@ _LEAST = 4  # points that PnP needs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """N features.
+    """N features."""
 
-    Args:
-        pixels: (N, 2) float64 as (u, v).
-        depth_m: (N,) float64, 0 = none.
-        descriptors: (N, 32) uint8 of ORB, or (N, 128) uint8 of SIFT.
-    """
-
-    pixels: Float64
-    depth_m: Float64
-    descriptors: UInt8
+    pixels: Float64  # (N, 2) float64 as (u, v)
+    depth_m: Float64  # (N,) float64, 0 = none
+    descriptors: UInt8  # (N, 32) uint8 of ORB, or (N, 128) uint8 of SIFT
 
     def points(self, intrinsics: CameraIntrinsics) -> Float64:
         """(N, 3) in the camera's axes, metres; 0 where there is no depth."""

@@ -35,20 +35,14 @@ def rank_places(features: Features, descriptors: Mapping[int, UInt8], count: int
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """What a map keeps of a view to find itself by.
+    """What a map keeps of a view to find itself by."""
 
-    Args:
-        camera_id, stamp_ns: Of the frame.
-        T_world_camera: (4, 4) float64.
-        points: (N, 3) float32 features in the camera's axes, metres.
-        descriptors: (N, 128) uint8.
-    """
-
+    # camera_id, stamp_ns: Of the frame.
     camera_id: str
     stamp_ns: int
-    T_world_camera: Float64
-    points: Float32
-    descriptors: UInt8
+    T_world_camera: Float64  # (4, 4) float64
+    points: Float32  # (N, 3) float32 features in the camera's axes, metres
+    descriptors: UInt8  # (N, 128) uint8
 
 
 def make_place(

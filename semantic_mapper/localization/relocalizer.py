@@ -120,28 +120,17 @@ _NOTHING = _Landmarks(np.zeros((0, 3)), np.zeros((0, 2)))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tried:
-    """A pose that was aligned, and how the frame lies on the map there.
+    """A pose that was aligned, and how the frame lies on the map there."""
 
-    Args:
-        guess: What it was aligned from.
-        landmarks: That led to the guess.
-        pose: As aligned.
-        support: Features that agree on it.
-        view: The map as seen from there.
-        agreeing: (h, w) where the depth is the map's.
-        overlap: Fraction of the measured pixels that show what the map has, too.
-        agree: Fraction of these whose depth is the map's.
-        likeness: Correlation of the brightness of frame and map where the depth agrees, -1..1; 0 where all is one grey.
-    """
-
-    guess: Float64
-    landmarks: _Landmarks
-    pose: Float64
-    support: _Landmarks
-    view: _MapView
-    agreeing: Bool
-    overlap: float
-    agree: float
+    guess: Float64  # what it was aligned from
+    landmarks: _Landmarks  # that led to the guess
+    pose: Float64  # as aligned
+    support: _Landmarks  # features that agree on it
+    view: _MapView  # the map as seen from there
+    agreeing: Bool  # (h, w) where the depth is the map's
+    overlap: float  # fraction of the measured pixels that show what the map has, too
+    agree: float  # fraction of these whose depth is the map's
+    # correlation of the brightness of frame and map where the depth agrees, -1..1; 0 where all is one grey
     likeness: float
 
 

@@ -103,14 +103,10 @@ def empty_blocks(count: int, classes: int) -> BlockValues:
 class PackedBlocks(NamedTuple):
     """B blocks one behind the other, each: which voxels are measured and which have votes, as two bit masks of 512 bits
     (of a byte, the highest first); TSDF, weight and colour of those measured; evidence and votes of those with votes.
-
-    Args:
-        data: (N,) float32; of masks, the bits.
-        ends: (B + 1,) where blocks begin and end in it.
     """
 
-    data: Float32
-    ends: Int64
+    data: Float32  # (N,) float32; of masks, the bits
+    ends: Int64  # (B + 1,) where blocks begin and end in it
 
     def blobs(self) -> list[memoryview]:
         """The bytes of each block; they share memory."""

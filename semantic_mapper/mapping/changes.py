@@ -51,34 +51,22 @@ NONE_CLEARED = ClearedBlocks(*(np.empty(0, np.int64) for _ in range(4)))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockChanges:
-    """Blocks of a map that changed after one version, as they are now; voxels in the order [z][y][x].
+    """Blocks of a map that changed after one version, as they are now; voxels in the order [z][y][x]."""
 
-    Args:
-        since: Who has all up to this version
-        version: has, with these blocks, all up to this one.
-        newest: Version of the map: where it is ``version``, nothing is missing.
-        epoch: Of the map. Where it is another than before, blocks of before are gone: those of the new epoch come all.
-        keys: (B, 3) int32 block coordinates in lexicographic order.
-        tsdf: (B, 512) int8 signed distance over truncation, times 127; -128 where not observed.
-        label: (B, 512) uint8 class ids, the ignore id where nothing voted, or the map is too unsure.
-        confidence: (B, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
-        rgb: (B, 512, 3) uint8.
-        scale_known: Whether lengths of the map are metres.
-        computed: (B, 512) uint8, 1 where no sensor measured what was observed; None = it did everywhere.
-        cleared: Which of these blocks lost surface that frames saw through after ``since``, and when; the latest.
-    """
-
-    since: int
-    version: int
-    newest: int
+    since: int  # who has all up to this version
+    version: int  # has, with these blocks, all up to this one
+    newest: int  # version of the map: where it is ``version``, nothing is missing
+    # of the map. Where it is another than before, blocks of before are gone: those of the new epoch come all.
     epoch: int
-    keys: Int32
-    tsdf: NDArray[np.int8]
-    label: UInt8
-    confidence: UInt8
-    rgb: UInt8
-    scale_known: bool = True
+    keys: Int32  # (B, 3) int32 block coordinates in lexicographic order
+    tsdf: NDArray[np.int8]  # (B, 512) int8 signed distance over truncation, times 127; -128 where not observed
+    label: UInt8  # (B, 512) uint8 class ids, the ignore id where nothing voted, or the map is too unsure
+    confidence: UInt8  # (B, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted
+    rgb: UInt8  # (B, 512, 3) uint8
+    scale_known: bool = True  # whether lengths of the map are metres
+    # (B, 512) uint8, 1 where no sensor measured what was observed; None = it did everywhere
     computed: UInt8 | None = None
+    # which of these blocks lost surface that frames saw through after ``since``, and when; the latest
     cleared: ClearedBlocks = NONE_CLEARED
 
     @property
@@ -98,21 +86,16 @@ class Decision(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CopiedChanges:
-    """Blocks of a map as they were, not compact yet: what a thread that must not be held up hands to another one.
+    """Blocks of a map as they were, not compact yet: what a thread that must not be held up hands to another one."""
 
-    Args:
-        since, version, newest, epoch, keys, scale_known, cleared: Of the result.
-        decision: How it is read.
-        parts: Rows of the result, and the blocks there.
-    """
-
+    # since, version, newest, epoch, keys, scale_known, cleared: of the result
     since: int
     version: int
     newest: int
     epoch: int
     keys: Int32
-    decision: Decision
-    parts: Iterable[tuple[Int64, PackedBlocks]]
+    decision: Decision  # how it is read
+    parts: Iterable[tuple[Int64, PackedBlocks]]  # rows of the result, and the blocks there
     scale_known: bool = True
     cleared: ClearedBlocks = NONE_CLEARED
 

@@ -59,17 +59,13 @@ class DepthBounds(NamedTuple):
 
     The least depth of a square of pixels is the least of four entries, whatever its size: those of the largest square
     of 2^level cells a side that fits, put into each of its corners.
-
-    Args:
-        nearest: (levels, h, w) float32 metres: of the 2^level x 2^level cells from each one on; inf where there is no
-            depth. No levels: nothing is to be cleared.
-        farthest: (ceil(h / 8), ceil(w / 8)) float32 metres, of 8 x 8 cells; 0 where there is no depth.
-        cell: Pixels a side.
     """
 
+    # (levels, h, w) float32 metres: of the 2^level x 2^level cells from each one on; inf where there is no depth. No
+    # levels: nothing is to be cleared.
     nearest: Float32
-    farthest: Float32
-    cell: int
+    farthest: Float32  # (ceil(h / 8), ceil(w / 8)) float32 metres, of 8 x 8 cells; 0 where there is no depth
+    cell: int  # pixels a side
 
 
 NO_BOUNDS = DepthBounds(np.empty((0, 0, 0), np.float32), np.empty((0, 0), np.float32), 1)

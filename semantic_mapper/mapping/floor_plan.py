@@ -95,21 +95,15 @@ def _normal(xyz: Float64) -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
-    """A floor plan in the grid's frame: z up, the floor at z = 0, x and y those of the world where that has z up, too.
+    """A floor plan in the grid's frame: z up, the floor at z = 0, x and y those of the world where the world has z up"""
 
-    Args:
-        cells: (H, W) int8, ``FREE``, ``OCCUPIED`` or ``UNKNOWN``; row j, column i is the square from
-            ``origin_m + (i, j) * resolution_m`` on: rows run along +y.
-        resolution_m: Side of a cell.
-        origin_m: (x, y) of the outer corner of cell (0, 0).
-        T_grid_world: (4, 4).
-        costs: (H, W) int8, 0 to 100 or ``UNKNOWN``, by class; None where no costs were given.
-    """
-
+    # (H, W) int8, ``FREE``, ``OCCUPIED`` or ``UNKNOWN``; row j, column i is the square from ``origin_m + (i, j) *
+    # resolution_m`` on: rows run along +y
     cells: NDArray[np.int8]
-    resolution_m: float
-    origin_m: tuple[float, float]
-    T_grid_world: Float64
+    resolution_m: float  # side of a cell
+    origin_m: tuple[float, float]  # (x, y) of the outer corner of cell (0, 0)
+    T_grid_world: Float64  # (4, 4)
+    # (H, W) int8, 0 to 100 or ``UNKNOWN``, by class; None where no costs were given
     costs: NDArray[np.int8] | None = None
 
 

@@ -30,24 +30,16 @@ HERE_M = 6.0  # from the newest keyframe: beyond, others are worth less, by the 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A frame that later frames are rendered from.
+    """A frame that later frames are rendered from."""
 
-    Args:
-        seq, stamp_ns, camera_id: Of the frame.
-        T_world_camera: (4, 4) float64.
-        intrinsics: Of ``depth_m``.
-        depth_m: (h, w) float32, small, 0 = none.
-        encoded: One view.
-        labelled: The field was finetuned on this view; such keyframes are never dropped.
-    """
-
+    # seq, stamp_ns, camera_id: Of the frame.
     seq: int
     stamp_ns: int
-    T_world_camera: Float64
-    intrinsics: CameraIntrinsics
-    depth_m: Float32
-    encoded: EncodedViews
-    labelled: bool = False
+    T_world_camera: Float64  # (4, 4) float64
+    intrinsics: CameraIntrinsics  # of ``depth_m``
+    depth_m: Float32  # (h, w) float32, small, 0 = none
+    encoded: EncodedViews  # one view
+    labelled: bool = False  # the field was finetuned on this view; such keyframes are never dropped
     camera_id: str = ""
 
 

@@ -43,17 +43,11 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapAlignment:
-    """Where another map lies.
+    """Where another map lies."""
 
-    Args:
-        T_map_other: (4, 4) float64.
-        agreeing: Places of the other map that say so.
-        looked_for: Of so many.
-    """
-
-    T_map_other: Float64
-    agreeing: int
-    looked_for: int
+    T_map_other: Float64  # (4, 4) float64
+    agreeing: int  # places of the other map that say so
+    looked_for: int  # of so many
 
 
 def check_mergeable(path: Path, other: Path, *, find: bool) -> None:

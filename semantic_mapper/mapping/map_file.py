@@ -94,30 +94,23 @@ class PlaceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is known of a saved map without reading its blocks.
-
-    Args:
-        frames, last_stamp_ns: Frames fused so far, and stamp of the last of them, 0 before the first.
-        blocks: Blocks of 8^3 voxels.
-        bounds_m: Lowest and highest corner of all blocks, metres in the world; None of an empty map.
-        chunks: In the order of the file.
-        scale: Whether lengths are metres.
-        refined: Digest of the weights that refined the map; empty where none did.
-        places: What it is found again by.
-    """
+    """What is known of a saved map without reading its blocks."""
 
     format: str = FORMAT
     version: int = FORMAT_VERSION
     config: VoxelMapConfig
     label_set: LabelSet
+    # frames, last_stamp_ns: Frames fused so far, and stamp of the last of them, 0 before the first.
     frames: NotNegative
     last_stamp_ns: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
-    blocks: NotNegative = 0
+    blocks: NotNegative = 0  # blocks of 8^3 voxels
+    # lowest and highest corner of all blocks, metres in the world; None of an empty map
     bounds_m: tuple[Corner, Corner] | None = None
-    chunks: tuple[MapChunk, ...] = ()
-    scale: Literal["metres", "unknown"] = "metres"
+    chunks: tuple[MapChunk, ...] = ()  # in the order of the file
+    scale: Literal["metres", "unknown"] = "metres"  # whether lengths are metres
+    # digest of the weights that refined the map; empty where none did
     refined: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
-    places: PlaceTable | None = None
+    places: PlaceTable | None = None  # what it is found again by
 
     @property
     def scale_known(self) -> bool:

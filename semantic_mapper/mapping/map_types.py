@@ -27,28 +27,18 @@ SCALE_FIX = (
 
 @dataclass(frozen=True, slots=True)
 class CorrectionStatus:
-    """Where corrections stand.
+    """Where corrections stand."""
 
-    Args:
-        running: A rebuild is under way; the map in use is still the old one.
-        done, total: Frames of the history that the rebuild has gone through, and all.
-        disk_bytes: Of the history's frames.
-        completed: Corrections that are in the map in use.
-        poses: Given by these, all together.
-        frozen: Frames that have left the history; corrections do not reach them.
-        lost: Frames that could not be read from disk again, and so are in the map no more after a rebuild.
-        failure: Why the last correction was given up; empty where it was not.
-    """
-
-    running: bool
+    running: bool  # a rebuild is under way; the map in use is still the old one
+    # done, total: Frames of the history that the rebuild has gone through, and all.
     done: int
     total: int
-    disk_bytes: int
-    completed: int
-    poses: int
-    frozen: int
-    lost: int
-    failure: str
+    disk_bytes: int  # of the history's frames
+    completed: int  # corrections that are in the map in use
+    poses: int  # given by these, all together
+    frozen: int  # frames that have left the history; corrections do not reach them
+    lost: int  # frames that could not be read from disk again, and so are in the map no more after a rebuild
+    failure: str  # why the last correction was given up; empty where it was not
 
     @property
     def left(self) -> int:
@@ -58,18 +48,13 @@ class CorrectionStatus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPose:
-    """Where a frame was taken.
+    """Where a frame was taken."""
 
-    Args:
-        camera_id, stamp_ns: Of the frame.
-        T_map_camera: (4, 4) float64; None while its place in the map is not known.
-        reason: Why it is not; empty otherwise.
-    """
-
+    # camera_id, stamp_ns: Of the frame.
     camera_id: str
     stamp_ns: int
-    T_map_camera: Float64 | None
-    reason: str = ""
+    T_map_camera: Float64 | None  # (4, 4) float64; None while its place in the map is not known
+    reason: str = ""  # why it is not; empty otherwise
 
 
 class PoseInMap:
@@ -81,21 +66,15 @@ class PoseInMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPoints:
-    """N points of the fused surface.
+    """N points of the fused surface."""
 
-    Args:
-        xyz: (N, 3) float32 metres in the world.
-        rgb: (N, 3) uint8.
-        label: (N,) uint8 class ids, the label set's ignore id where nothing voted or the map is too unsure
-            (``voxel_map.unknown_below``).
-        confidence: (N,) float32 probability of the likeliest class, 0 where nothing voted.
-        measured: (N,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
-    """
-
-    xyz: Float32
-    rgb: UInt8
+    xyz: Float32  # (N, 3) float32 metres in the world
+    rgb: UInt8  # (N, 3) uint8
+    # (N,) uint8 class ids, the label set's ignore id where nothing voted or the map is too unsure
+    # (``voxel_map.unknown_below``)
     label: UInt8
-    confidence: Float32
+    confidence: Float32  # (N,) float32 probability of the likeliest class, 0 where nothing voted
+    # (N,) bool, False where no sensor measured the surface: its depth was computed; None = unknown
     measured: Bool | None = None
 
 
@@ -116,16 +95,11 @@ class MapMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapView:
-    """The map seen from a pose.
+    """The map seen from a pose."""
 
-    Args:
-        depth_m: (H, W) float32 z-depth, 0 where the ray meets no surface.
-        rgb: (H, W, 3) uint8.
-        label, confidence, measured: (H, W) as of ``MapPoints``; ignore id, 0 and False at misses.
-    """
-
-    depth_m: Float32
-    rgb: UInt8
+    depth_m: Float32  # (H, W) float32 z-depth, 0 where the ray meets no surface
+    rgb: UInt8  # (H, W, 3) uint8
+    # label, confidence, measured: (H, W) as of ``MapPoints``; ignore id, 0 and False at misses.
     label: UInt8
     confidence: Float32
     measured: Bool | None = None

@@ -372,17 +372,12 @@ def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> Bool:
 
 
 class Alignment(NamedTuple):
-    """Where a pose is by what views saw.
+    """Where a pose is by what views saw."""
 
-    Args:
-        T_world_camera: (4, 4) corrected; as given where it does not fit or cannot be compared.
-        moved: (6,) by how much: translation, metres, and rotation, radians, in the camera.
-        misfit: Median distance of points from the surface that views saw, in margins; points in front of it by more
-            than a margin do not count. inf where most is elsewhere, 0 where there is too little to compare with.
-    """
-
-    T_world_camera: Float64
-    moved: Float64
+    T_world_camera: Float64  # (4, 4) corrected; as given where it does not fit or cannot be compared
+    moved: Float64  # (6,) by how much: translation, metres, and rotation, radians, in the camera
+    # median distance of points from the surface that views saw, in margins; points in front of it by more than a margin
+    # do not count. inf where most is elsewhere, 0 where there is too little to compare with.
     misfit: float
 
 

@@ -38,15 +38,10 @@ _log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Taken:
-    """What became of frames.
+    """What became of frames."""
 
-    Args:
-        ready: To be mapped, in the map's world, oldest first.
-        given_up: Frames that were held, with the reason why they are not mapped.
-    """
-
-    ready: tuple[PosedFrame, ...] = ()
-    given_up: tuple[tuple[PosedFrame, str], ...] = ()
+    ready: tuple[PosedFrame, ...] = ()  # to be mapped, in the map's world, oldest first
+    given_up: tuple[tuple[PosedFrame, str], ...] = ()  # frames that were held, with the reason why they are not mapped
 
 
 class OdometrySessions:

@@ -60,17 +60,12 @@ ALONG_UP = 0.95  # cosine with up, beyond which a view has no clear roll
 
 
 class SurfacePatches(NamedTuple):
-    """N patches of the surface, in the order of their keys.
+    """N patches of the surface, in the order of their keys."""
 
-    Args:
-        packed: (N,) int64 keys of their blocks.
-        xyz: (N, 3) float64 metres in the world, mean of their voxels.
-        need: (N,) float64, sum over their voxels of ``(1 - confidence) / (1 + votes)``: 1 without votes, little where
-            the class is clear, and 0 where there are votes enough.
-    """
-
-    packed: Int64
-    xyz: Float64
+    packed: Int64  # (N,) int64 keys of their blocks
+    xyz: Float64  # (N, 3) float64 metres in the world, mean of their voxels
+    # (N,) float64, sum over their voxels of ``(1 - confidence) / (1 + votes)``: 1 without votes, little where the class
+    # is clear, and 0 where there are votes enough
     need: Float64
 
 

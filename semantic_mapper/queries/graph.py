@@ -66,21 +66,13 @@ class Floor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Room:
-    """One room.
+    """One room."""
 
-    Args:
-        id: Above 0; stays with the room from update to update, and is never given to another.
-        floor: Id of its floor.
-        area_m2: Of its floor, with what furniture covers.
-        center: (3,) float64 world metres, on the floor where that is widest.
-        outline: (N, 3) float64 world metres, on the floor, anticlockwise seen from above; holes are left out.
-    """
-
-    id: int
-    floor: int
-    area_m2: float
-    center: Float64
-    outline: Float64
+    id: int  # above 0; stays with the room from update to update, and is never given to another
+    floor: int  # id of its floor
+    area_m2: float  # of its floor, with what furniture covers
+    center: Float64  # (3,) float64 world metres, on the floor where that is widest
+    outline: Float64  # (N, 3) float64 world metres, on the floor, anticlockwise seen from above; holes are left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,22 +86,14 @@ class Door:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneGraph:
-    """What a map consists of.
+    """What a map consists of."""
 
-    Args:
-        up: (3,) unit vector.
-        floors: By height.
-        rooms: By id.
-        doors: Between them, by rooms.
-        things: By id, as ``InstanceTracker`` finds them.
-        room_of: Id of the room that holds most of a thing, for each id of a thing; None = none does.
-    """
-
-    up: Float64
-    floors: tuple[Floor, ...]
-    rooms: tuple[Room, ...]
-    doors: tuple[Door, ...]
-    things: tuple[Instance, ...]
+    up: Float64  # (3,) unit vector
+    floors: tuple[Floor, ...]  # by height
+    rooms: tuple[Room, ...]  # by id
+    doors: tuple[Door, ...]  # between them, by rooms
+    things: tuple[Instance, ...]  # by id, as ``InstanceTracker`` finds them
+    # id of the room that holds most of a thing, for each id of a thing; None = none does
     room_of: dict[int, int | None]
 
 

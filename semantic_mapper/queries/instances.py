@@ -33,42 +33,27 @@ LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it be
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrientedBox:
-    """A box that stands upright.
+    """A box that stands upright."""
 
-    Args:
-        center: (3,) float64 world metres.
-        size: (3,) float64 metres along its own axes: x the longer level side, y the shorter, z along up.
-        R_world_box: (3, 3) float64, columns are its axes in the world.
-    """
-
-    center: Float64
-    size: Float64
-    R_world_box: Float64
+    center: Float64  # (3,) float64 world metres
+    size: Float64  # (3,) float64 metres along its own axes: x the longer level side, y the shorter, z along up
+    R_world_box: Float64  # (3, 3) float64, columns are its axes in the world
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instance:
-    """One thing: a connected piece of surface of one class, or what a refined map has as a thing of its own.
+    """One thing: a connected piece of surface of one class, or what a refined map has as a thing of its own."""
 
-    Args:
-        id: Above 0; stays with the thing from update to update, and is never given to another.
-        class_id, class_name: Of the label set.
-        confidence: Mean over its voxels.
-        centroid: (3,) float64 mean of its surface points, world metres.
-        box: Upright box round its surface points.
-        voxels: (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``.
-        measured: Fraction of them that a sensor measured; the depth of the others was computed.
-        gone_ns: Stamp of the frame at which most of it was gone; all else is as it was before. None = it is there.
-    """
-
-    id: int
+    id: int  # above 0; stays with the thing from update to update, and is never given to another
+    # class_id, class_name: Of the label set.
     class_id: int
     class_name: str
-    confidence: float
-    centroid: Float64
-    box: OrientedBox
-    voxels: NDArray[np.int32]
-    measured: float = 1.0
+    confidence: float  # mean over its voxels
+    centroid: Float64  # (3,) float64 mean of its surface points, world metres
+    box: OrientedBox  # upright box round its surface points
+    voxels: NDArray[np.int32]  # (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``
+    measured: float = 1.0  # fraction of them that a sensor measured; the depth of the others was computed
+    # stamp of the frame at which most of it was gone; all else is as it was before. None = it is there.
     gone_ns: int | None = None
 
     @property
@@ -78,23 +63,14 @@ class Instance:
 
 
 class ThingVoxels(NamedTuple):
-    """N surface voxels of some classes in the B blocks of a map, ordered as in ``SurfaceVoxels``.
+    """N surface voxels of some classes in the B blocks of a map, ordered as in ``SurfaceVoxels``."""
 
-    Args:
-        packed: (B,) int64 sorted keys.
-        start: (B + 1,) int64; block b has the voxels ``start[b] .. start[b + 1] - 1``.
-        row: (N,) int32 position of the block in ``packed``.
-        voxel: (N,) int32 within the block, ascending in each.
-        point: (N, 3) float64 surface point in units of voxels.
-        label: (N,) uint8 class ids.
-    """
-
-    packed: Int64
-    start: Int64
-    row: Int32
-    voxel: Int32
-    point: Float64
-    label: UInt8
+    packed: Int64  # (B,) int64 sorted keys
+    start: Int64  # (B + 1,) int64; block b has the voxels ``start[b] .. start[b + 1] - 1``.
+    row: Int32  # (N,) int32 position of the block in ``packed``
+    voxel: Int32  # (N,) int32 within the block, ascending in each
+    point: Float64  # (N, 3) float64 surface point in units of voxels
+    label: UInt8  # (N,) uint8 class ids
 
 
 def thing_voxels(snapshot: MapSnapshot, wanted: Bool) -> ThingVoxels:
@@ -287,17 +263,12 @@ def _count_left(snapshot: MapSnapshot, packed: NDArray[np.int64], voxels: NDArra
 
 
 class Components(NamedTuple):
-    """C components of N surface voxels.
+    """C components of N surface voxels."""
 
-    Args:
-        component: (N,) int64 0..C-1, numbered in the order of their first voxels; -1 = in a piece that is too small.
-        order: (M,) int64 voxels of the first component, ascending, then those of the second, and so on.
-        ends: (C,) int64 where in ``order`` each component ends.
-    """
-
+    # (N,) int64 0..C-1, numbered in the order of their first voxels; -1 = in a piece that is too small
     component: NDArray[np.int64]
-    order: NDArray[np.int64]
-    ends: NDArray[np.int64]
+    order: NDArray[np.int64]  # (M,) int64 voxels of the first component, ascending, then those of the second, and so on
+    ends: NDArray[np.int64]  # (C,) int64 where in ``order`` each component ends
 
 
 def find_components(voxels: ThingVoxels, min_voxels: int) -> Components:

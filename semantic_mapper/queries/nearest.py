@@ -19,19 +19,12 @@ from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestSurface:
-    """A place of the class that was requested.
+    """A place of the class that was requested."""
 
-    Args:
-        xyz: (3,) float64 point of the surface, world metres.
-        distance_m: From the point of the question.
-        confidence: Probability of the class there.
-        measured: Whether a sensor measured it, or its depth was computed.
-    """
-
-    xyz: Float64
-    distance_m: float
-    confidence: float
-    measured: bool = True
+    xyz: Float64  # (3,) float64 point of the surface, world metres
+    distance_m: float  # from the point of the question
+    confidence: float  # probability of the class there
+    measured: bool = True  # whether a sensor measured it, or its depth was computed
 
 
 def nearest(
@@ -106,20 +99,13 @@ MAX_RADIUS_VOXELS = 25.0  # work grows with its cube; ``nearest`` searches farth
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointAnswers:
-    """What is at N points.
+    """What is at N points."""
 
-    Args:
-        label: (N,) uint8 class ids of the nearest surface; the ignore id where none is near or it is unknown.
-        confidence: (N,) float32 probability of the likeliest class, 0 where none is near or nothing voted.
-        distance_m: (N,) float32 to that surface, infinite where none is near.
-        state: (N,) uint8 ``State`` of the voxel that the point itself lies in.
-        measured: (N,) bool, whether a sensor measured that surface; False where none is near; None = unknown.
-    """
-
-    label: UInt8
-    confidence: Float32
-    distance_m: Float32
-    state: UInt8
+    label: UInt8  # (N,) uint8 class ids of the nearest surface; the ignore id where none is near or it is unknown
+    confidence: Float32  # (N,) float32 probability of the likeliest class, 0 where none is near or nothing voted
+    distance_m: Float32  # (N,) float32 to that surface, infinite where none is near
+    state: UInt8  # (N,) uint8 ``State`` of the voxel that the point itself lies in
+    # (N,) bool, whether a sensor measured that surface; False where none is near; None = unknown
     measured: Bool | None = None
 
 

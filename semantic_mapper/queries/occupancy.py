@@ -35,20 +35,14 @@ class State(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DistanceField:
-    """Distances on the voxel grid of a box.
+    """Distances on the voxel grid of a box."""
 
-    Args:
-        origin_m: (3,) float64 centre of voxel [0, 0, 0] in the world.
-        voxel_size_m: Step along each axis.
-        distance_m: (X, Y, Z) float32 from voxel centre to the centre of the nearest occupied or moving voxel, 0 in
-            those, infinite where the box holds none.
-        state: (X, Y, Z) uint8 ``State``.
-    """
-
-    origin_m: Float64
-    voxel_size_m: float
+    origin_m: Float64  # (3,) float64 centre of voxel [0, 0, 0] in the world
+    voxel_size_m: float  # step along each axis
+    # (X, Y, Z) float32 from voxel centre to the centre of the nearest occupied or moving voxel, 0 in those, infinite
+    # where the box holds none
     distance_m: Float32
-    state: UInt8
+    state: UInt8  # (X, Y, Z) uint8 ``State``
 
 
 def occupancy(snapshot: MapSnapshot, points: ArrayLike) -> UInt8:

@@ -100,110 +100,75 @@ Point = tuple[Finite, Finite, Finite]
 
 @dataclass(frozen=True, slots=True)
 class MapInfo:
-    """What a map is.
+    """What a map is."""
 
-    Args:
-        map_id: Another one after the mapper was restarted.
-        version, epoch: ``VoxelMap``'s.
-        blocks: Of 8^3 voxels.
-        voxel_size_m: Edge of a voxel.
-        truncation_voxels: Of the TSDF.
-        label_set: Its classes.
-        scale_known: Whether its lengths are metres.
-    """
-
-    map_id: str
+    map_id: str  # another one after the mapper was restarted
+    # version, epoch: ``VoxelMap``'s.
     version: int
     epoch: int
-    blocks: int
-    voxel_size_m: float
-    truncation_voxels: float
-    label_set: LabelSet
-    scale_known: bool = True
+    blocks: int  # of 8^3 voxels
+    voxel_size_m: float  # edge of a voxel
+    truncation_voxels: float  # of the TSDF
+    label_set: LabelSet  # its classes
+    scale_known: bool = True  # whether its lengths are metres
 
 
 @dataclass(frozen=True, slots=True)
 class Correction(CorrectionStatus):
-    """Where the corrections of a mapper stand.
+    """Where the corrections of a mapper stand."""
 
-    Args:
-        used, left_out: Poses of the request that this answers: with a frame in the history, and without.
-        epoch: Of the map in use: answers of this or a later ``MapInfo.epoch`` are about it.
-    """
-
+    # used, left_out: Poses of the request that this answers: with a frame in the history, and without.
     used: int = 0
     left_out: int = 0
-    epoch: int = 0
+    epoch: int = 0  # of the map in use: answers of this or a later ``MapInfo.epoch`` are about it
 
 
 @dataclass(frozen=True, slots=True)
 class WeightsEntry:
-    """Weights that a mapper was started with (version 0) or was offered.
+    """Weights that a mapper was started with (version 0) or was offered."""
 
-    Args:
-        version: Ascending; 0 = those that it was started with.
-        digest: SHA-256 of the file, hexadecimal.
-        state: What became of them.
-        score, parent_score: Of these, and of those in use then, on the keyframes that judged them.
-        keyframes: That they were learned from.
-        reason: Why they were refused; empty otherwise.
-    """
-
-    version: int
-    digest: str
-    state: Literal["in use", "earlier", "refused", "rolled back"]
+    version: int  # ascending; 0 = those that it was started with
+    digest: str  # SHA-256 of the file, hexadecimal
+    state: Literal["in use", "earlier", "refused", "rolled back"]  # what became of them
+    # score, parent_score: Of these, and of those in use then, on the keyframes that judged them.
     score: float = 0.0
     parent_score: float = 0.0
-    keyframes: int = 0
-    reason: str = ""
+    keyframes: int = 0  # that they were learned from
+    reason: str = ""  # why they were refused; empty otherwise
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Which weights a mapper uses, and what became of those that it was offered.
+    """Which weights a mapper uses, and what became of those that it was offered."""
 
-    Args:
-        in_use: Version; 0 = those that it was started with.
-        before: In use before these; None where there were none.
-        wanted: About to be in use; None = nothing changes.
-        taken, refused, rolled_back: How often that has happened.
-        versions: All that it knows of, the oldest first.
-    """
-
-    in_use: int
-    before: int | None
-    wanted: int | None
+    in_use: int  # version; 0 = those that it was started with
+    before: int | None  # in use before these; None where there were none
+    wanted: int | None  # about to be in use; None = nothing changes
+    # taken, refused, rolled_back: How often that has happened.
     taken: int
     refused: int
     rolled_back: int
-    versions: tuple[WeightsEntry, ...]
+    versions: tuple[WeightsEntry, ...]  # all that it knows of, the oldest first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstanceArrays:
-    """N things as they travel: row n of each array is thing n, and ``voxels`` has those of all, one behind the other.
+    """N things as they travel: row n of each array is thing n, and ``voxels`` has those of all in order."""
 
-    Args:
-        label_set: Of the map.
-        id, class_id, confidence, centroid, measured: (N,) and (N, 3), as of ``Instance``.
-        center, size, R_world_box: (N, 3), (N, 3) and (N, 3, 3), as of ``OrientedBox``.
-        voxel_count: (N,) of each thing.
-        voxels: (M, 3) int32.
-        gone_ns: (N,) stamp of the frame at which most of it was gone; -1 = it is there.
-    """
-
-    label_set: LabelSet
+    label_set: LabelSet  # of the map
+    # id, class_id, confidence, centroid, measured: (N,) and (N, 3), as of ``Instance``.
     id: Int64
     class_id: Int64
     confidence: Float64
     centroid: Float64
+    # center, size, R_world_box: (N, 3), (N, 3) and (N, 3, 3), as of ``OrientedBox``.
     center: Float64
     size: Float64
     R_world_box: Float64
     measured: Float64
-    gone_ns: Int64
-    voxel_count: Int64
-    voxels: NDArray[np.int32]
+    gone_ns: Int64  # (N,) stamp of the frame at which most of it was gone; -1 = it is there
+    voxel_count: Int64  # (N,) of each thing
+    voxels: NDArray[np.int32]  # (M, 3) int32
 
     @classmethod
     def of(cls, things: Sequence[Instance], labels: LabelSet) -> Self:

@@ -35,19 +35,12 @@ class Passage(NamedTuple):
 
 
 class RoomPlan(NamedTuple):
-    """Rooms of a plan.
+    """Rooms of a plan."""
 
-    Args:
-        room: (H, W) int64 number of the room, from 0; -1 = none.
-        rooms: How many there are.
-        clearance_m: (H, W) float64 distance to the nearest cell outside, 0 outside.
-        passages: Between rooms.
-    """
-
-    room: Int64
-    rooms: int
-    clearance_m: Float64
-    passages: tuple[Passage, ...]
+    room: Int64  # (H, W) int64 number of the room, from 0; -1 = none
+    rooms: int  # how many there are
+    clearance_m: Float64  # (H, W) float64 distance to the nearest cell outside, 0 outside
+    passages: tuple[Passage, ...]  # between rooms
 
 
 def find_walls(shown: Bool, cell_m: float) -> Bool:

@@ -41,58 +41,36 @@ COMPUTED, MEASURED = 1, 2  # ``BlockVoxels.weight``: depth was computed, or a se
 
 
 class BlockVoxels(NamedTuple):
-    """Voxels of S block slots, in the order [z][y][x]; ``tsdf`` and ``weight`` have the names ``march`` knows.
+    """Voxels of S block slots, in the order [z][y][x]; ``tsdf`` and ``weight`` have the names ``march`` knows."""
 
-    Args:
-        tsdf: (S, 512) int8 signed distance over truncation, times 127.
-        weight: (S, 512) uint8, 0 where not observed, ``COMPUTED`` where observed, ``MEASURED`` where by a sensor.
-        label: (S, 512) uint8 class ids, the ignore id where nothing voted or the map is too unsure.
-        confidence: (S, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
-        rgb: (S, 512, 3) uint8.
-        classes: (S, 4) uint64, a bit for each class id that a surface voxel of the block may have.
-    """
-
-    tsdf: NDArray[np.int8]
-    weight: UInt8
-    label: UInt8
-    confidence: UInt8
-    rgb: UInt8
-    classes: NDArray[np.uint64]
+    tsdf: NDArray[np.int8]  # (S, 512) int8 signed distance over truncation, times 127
+    weight: UInt8  # (S, 512) uint8, 0 where not observed, ``COMPUTED`` where observed, ``MEASURED`` where by a sensor
+    label: UInt8  # (S, 512) uint8 class ids, the ignore id where nothing voted or the map is too unsure
+    confidence: UInt8  # (S, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted
+    rgb: UInt8  # (S, 512, 3) uint8
+    classes: NDArray[np.uint64]  # (S, 4) uint64, a bit for each class id that a surface voxel of the block may have
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapSnapshot:
-    """A map as it was at one version. Immutable, so any number of threads may query it.
+    """A map as it was at one version. Immutable, so any number of threads may query it."""
 
-    Args:
-        version, epoch: ``VoxelMap``'s of that state.
-        voxel_size_m: Edge of a voxel.
-        truncation_voxels: Of the TSDF.
-        label_set: Of the map.
-        packed: (B,) int64 sorted packed keys of the blocks.
-        slots: (B,) int32 where each of them lies in ``voxels``.
-        serials: (B,) int64; in this process no two contents of a block have the same, in whichever mirror.
-        versions: (B,) int64 version that each block came with, at most ``version``.
-        index: The same as a table for compiled code.
-        voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
-        scale_known: Whether lengths are metres.
-        cleared: Which blocks lost surface that frames saw through, and when; the latest.
-        moving: (M, 3) int64 voxels where something moves that is left out of the map; see ``with_moving``.
-    """
-
+    # version, epoch: ``VoxelMap``'s of that state.
     version: int
     epoch: int
-    voxel_size_m: float
-    truncation_voxels: float
-    label_set: LabelSet
-    packed: NDArray[np.int64]
-    slots: NDArray[np.int32]
+    voxel_size_m: float  # edge of a voxel
+    truncation_voxels: float  # of the TSDF
+    label_set: LabelSet  # of the map
+    packed: NDArray[np.int64]  # (B,) int64 sorted packed keys of the blocks
+    slots: NDArray[np.int32]  # (B,) int32 where each of them lies in ``voxels``
+    # (B,) int64; in this process no two contents of a block have the same, in whichever mirror
     serials: NDArray[np.int64]
-    versions: NDArray[np.int64]
-    index: BlockIndex
-    voxels: BlockVoxels
-    scale_known: bool = True
-    cleared: ClearedBlocks = NONE_CLEARED
+    versions: NDArray[np.int64]  # (B,) int64 version that each block came with, at most ``version``
+    index: BlockIndex  # the same as a table for compiled code
+    voxels: BlockVoxels  # memory shared with other snapshots; only ``slots`` of it belong to this one
+    scale_known: bool = True  # whether lengths are metres
+    cleared: ClearedBlocks = NONE_CLEARED  # which blocks lost surface that frames saw through, and when; the latest
+    # (M, 3) int64 voxels where something moves that is left out of the map; see ``with_moving``
     moving: Int64 = field(default_factory=lambda: np.empty((0, 3), np.int64))
 
     @property

@@ -32,17 +32,11 @@ MAX_RANGE_M = 100.0  # beyond, a ray through nothing takes long
 
 
 class SurfaceVoxels(NamedTuple):
-    """N surface voxels, blocks in lexicographic order, voxels in the order [z][y][x].
+    """N surface voxels, blocks in lexicographic order, voxels in the order [z][y][x]."""
 
-    Args:
-        row: (N,) int32 position of the block in the snapshot's ``packed``.
-        voxel: (N,) int32 within the block.
-        point: (N, 3) float64 surface point in units of voxels.
-    """
-
-    row: NDArray[np.int32]
-    voxel: NDArray[np.int32]
-    point: Float64
+    row: NDArray[np.int32]  # (N,) int32 position of the block in the snapshot's ``packed``
+    voxel: NDArray[np.int32]  # (N,) int32 within the block
+    point: Float64  # (N, 3) float64 surface point in units of voxels
 
 
 def surface_voxels(snapshot: MapSnapshot, rows: NDArray[np.int64] | None = None) -> SurfaceVoxels:
@@ -98,21 +92,13 @@ def collect_surface_voxels(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayHits:
-    """What N rays meet.
+    """What N rays meet."""
 
-    Args:
-        distance_m: (N,) float32 along the ray, 0 where it meets no surface.
-        label: (N,) uint8 class ids, the ignore id at misses and where unknown.
-        confidence: (N,) float32 probability of the likeliest class, 0 at misses and where nothing voted.
-        rgb: (N, 3) uint8.
-        measured: (N,) bool, whether a sensor measured that surface; False at misses; None = unknown.
-    """
-
-    distance_m: Float32
-    label: UInt8
-    confidence: Float32
-    rgb: UInt8
-    measured: Bool | None = None
+    distance_m: Float32  # (N,) float32 along the ray, 0 where it meets no surface
+    label: UInt8  # (N,) uint8 class ids, the ignore id at misses and where unknown
+    confidence: Float32  # (N,) float32 probability of the likeliest class, 0 at misses and where nothing voted
+    rgb: UInt8  # (N, 3) uint8
+    measured: Bool | None = None  # (N,) bool, whether a sensor measured that surface; False at misses; None = unknown
 
 
 def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:

@@ -99,31 +99,22 @@ class EncodedImage:
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """What can be known of a message without decoding its buffers.
+    """What can be known of a message without decoding its buffers."""
 
-    Args:
-        topic: Name of the topic ("frame", "map", ...); ``source``: camera id or node.
-        stamp_ns, seq: 0 where the message has none.
-        T_world_camera: Of a frame, 16 numbers row by row; else empty.
-        world: Of a frame or map update.
-        T_map_world: Of a map update, 16 numbers; empty where it is no motion.
-        has_depth, has_label: Of a frame.
-        has_computed_depth, has_pseudo_label: Whether no sensor and no person has made them.
-        rgb_encoding: Of a frame: "png", "jpeg" or "raw".
-        depth_scale: Units a metre of a frame's depth where it is packed as uint16, else 0.
-    """
-
-    topic: str
+    topic: str  # name of the topic ("frame", "map", ...); ``source``: camera id or node
     source: str
+    # stamp_ns, seq: 0 where the message has none.
     stamp_ns: int = 0
     seq: int = 0
-    T_world_camera: tuple[float, ...] = ()
-    world: int = 0
-    T_map_world: tuple[float, ...] = ()
+    T_world_camera: tuple[float, ...] = ()  # of a frame, 16 numbers row by row; else empty
+    world: int = 0  # of a frame or map update
+    T_map_world: tuple[float, ...] = ()  # of a map update, 16 numbers; empty where it is no motion
+    # has_depth, has_label: Of a frame.
     has_depth: bool = False
     has_label: bool = False
-    rgb_encoding: str = ""
-    depth_scale: float = 0.0
+    rgb_encoding: str = ""  # of a frame: "png", "jpeg" or "raw"
+    depth_scale: float = 0.0  # units a metre of a frame's depth where it is packed as uint16, else 0
+    # has_computed_depth, has_pseudo_label: Whether no sensor and no person has made them.
     has_computed_depth: bool = False
     has_pseudo_label: bool = False
 

@@ -35,17 +35,12 @@ _thread = threading.local()  # zstd contexts must not be shared between threads,
 
 @dataclass(frozen=True, slots=True)
 class CodecOptions:
-    """How images are packed. The defaults lose nothing of a frame.
+    """How images are packed. The defaults lose nothing of a frame."""
 
-    Args:
-        rgb: "png" (lossless, small), "raw" (lossless, fast), "jpeg" (lossy).
-        jpeg_quality: 1 to 100.
-        depth_scale: Units a metre: depth that is exactly uint16 / ``depth_scale`` is sent as these units, other depth
-            as float32; either way it is bit exact.
-    """
-
-    rgb: ImageEncoding = "png"
-    jpeg_quality: int = 92
+    rgb: ImageEncoding = "png"  # "png" (lossless, small), "raw" (lossless, fast), "jpeg" (lossy)
+    jpeg_quality: int = 92  # 1 to 100
+    # units a metre: depth that is exactly uint16 / ``depth_scale`` is sent as these units, other depth as float32;
+    # either way it is bit exact
     depth_scale: float = 1000.0
 
 

@@ -42,14 +42,10 @@ def user_key_folder() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """Keys of this machine; see ``load_keys``.
+    """Keys of this machine; see ``load_keys``."""
 
-    Args:
-        folder: Where they lie.
-        public, secret: 40 letters each (Z85).
-    """
-
-    folder: Path
+    folder: Path  # where they lie
+    # public, secret: 40 letters each (Z85).
     public: bytes
     secret: bytes
 
@@ -67,15 +63,10 @@ class Keys:
 
 @dataclass(frozen=True, slots=True)
 class ServerIdentity:
-    """Whom a client expects at the other end.
+    """Whom a client expects at the other end."""
 
-    Args:
-        keys: Of this machine, which the server has to know as one of its peers.
-        server: Name of the server among the peers; empty = it has the very same keys.
-    """
-
-    keys: Keys
-    server: str = ""
+    keys: Keys  # of this machine, which the server has to know as one of its peers
+    server: str = ""  # name of the server among the peers; empty = it has the very same keys
 
 
 def make_keys(folder: Path) -> Keys:

@@ -99,22 +99,15 @@ class LabelSetForm(Wire, frozen=True):
 
 
 class StreamInfo(Wire, frozen=True):
-    """What a stream of frames is; sent before its first frame and kept in every log.
+    """What a stream of frames is; sent before its first frame and kept in every log."""
 
-    Args:
-        source: Where the frames come from, for people ("folder redkitchen", "OAK-D 18443010").
-        cameras: Intrinsics of each camera by its id.
-        label_set: Classes of the frames' label images; None for a stream without labels.
-        frame_count: Frames that the source will send; None where nobody knows (a live camera).
-        frame_hz: Nominal rate; 0 = not known.
-        metadata: Anything else worth keeping, as text.
-    """
-
-    source: Sentence
+    source: Sentence  # where the frames come from, for people ("folder redkitchen", "OAK-D 18443010")
+    # intrinsics of each camera by its id
     cameras: Annotated[Mapping[Source, CameraIntrinsics], Meta(max_length=64)] = msgspec.field(default_factory=dict)
-    label_set: LabelSet | None = None
-    frame_count: Count | None = None
-    frame_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    label_set: LabelSet | None = None  # classes of the frames' label images; None for a stream without labels
+    frame_count: Count | None = None  # frames that the source will send; None where nobody knows (a live camera)
+    frame_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0  # nominal rate; 0 = not known
+    # anything else worth keeping, as text
     metadata: Annotated[Mapping[Word, Sentence], Meta(max_length=64)] = msgspec.field(default_factory=dict)
 
     @property
@@ -128,21 +121,16 @@ class Status(Wire, frozen=True):
 
     Numbers beyond their bounds become the nearest one that can be sent, and what is too long or too much is cut, so
     that nothing that a node counts can keep it from saying so.
-
-    Args:
-        node: Name of the node.
-        state: Where it is in its life.
-        stamp_ns: When it said so, on the robot's monotonic clock.
-        counters: Totals since its start ("fused", "dropped", "rejected", ...).
-        ages_s: Seconds since something last happened ("frame", ...).
-        degraded: One sentence for each thing that does not work as it should; empty when all is well.
     """
 
-    node: Source
-    state: NodeState
-    stamp_ns: Stamp
+    node: Source  # name of the node
+    state: NodeState  # where it is in its life
+    stamp_ns: Stamp  # when it said so, on the robot's monotonic clock
+    # totals since its start ("fused", "dropped", "rejected", ...)
     counters: Annotated[Mapping[Word, Count], Meta(max_length=_MAX_NUMBERS)] = msgspec.field(default_factory=dict)
+    # seconds since something last happened ("frame", ...)
     ages_s: Annotated[Mapping[Word, Finite], Meta(max_length=_MAX_NUMBERS)] = msgspec.field(default_factory=dict)
+    # one sentence for each thing that does not work as it should; empty when all is well
     degraded: Annotated[tuple[Sentence, ...], Meta(max_length=_MAX_SENTENCES)] = ()
 
     def __post_init__(self) -> None:
@@ -166,22 +154,15 @@ class FrameRefused(Wire, frozen=True):
 
 
 class EndOfStream(Wire, frozen=True):
-    """The last message of a stream of frames.
+    """The last message of a stream of frames."""
 
-    Args:
-        source: Who ends ("player", a camera id, ...).
-        reason: "end" of the recording, "stopped" by a person, or an "error".
-        published: Frames that were sent.
-        detail: The error, for people.
-        damages: What could not be read of a recording, in words; the first few.
-        unreadable: How many frames of a recording could not be read, and were not sent; ``damages`` begins with them.
-    """
-
-    source: Source
-    reason: EndReason
-    published: Count
-    detail: Sentence = ""
+    source: Source  # who ends ("player", a camera id, ...)
+    reason: EndReason  # "end" of the recording, "stopped" by a person, or an "error"
+    published: Count  # frames that were sent
+    detail: Sentence = ""  # the error, for people
+    # what could not be read of a recording, in words; the first few
     damages: Annotated[tuple[Sentence, ...], Meta(max_length=MAX_DAMAGES)] = ()
+    # how many frames of a recording could not be read, and were not sent; ``damages`` begins with them
     unreadable: Count = 0
 
     def __post_init__(self) -> None:
@@ -190,69 +171,45 @@ class EndOfStream(Wire, frozen=True):
 
 
 class LabelledKeyframe(Wire, frozen=True, eq=False):
-    """A frame with labels to learn from.
+    """A frame with labels to learn from."""
 
-    Args:
-        frame: With a label image.
-        label_set: What its ids mean.
-        teacher: Who labelled it, for people ("label tool", "log kitchen.mcap").
-    """
-
-    frame: PosedFrame
-    label_set: LabelSet
-    teacher: Word = ""
+    frame: PosedFrame  # with a label image
+    label_set: LabelSet  # what its ids mean
+    teacher: Word = ""  # who labelled it, for people ("label tool", "log kitchen.mcap")
 
     def __post_init__(self) -> None:
         force_setattr(self, "teacher", self.teacher[:128])
 
 
 class WeightsUpdate(Wire, frozen=True):
-    """Weights that a learner offers to a mapper.
+    """Weights that a learner offers to a mapper."""
 
-    Args:
-        node: The learner.
-        version: Higher than that of all before it.
-        data: A whole weights file (safetensors), never a pickle.
-        digest: SHA-256 of ``data``, hexadecimal.
-        parent: Digest of the weights that it was found better than; a mapper that uses others does not take it.
-        score, parent_score: mIoU over rays of the held-out keyframes, in 0..1, with these weights and with the parent.
-        keyframes, held_out: How many it learned from, and how many it was judged by.
-    """
-
-    node: Source
-    version: Annotated[int, Meta(ge=1, le=2**31)]
+    node: Source  # the learner
+    version: Annotated[int, Meta(ge=1, le=2**31)]  # higher than that of all before it
+    # a whole weights file (safetensors), never a pickle
     data: Annotated[bytes, Meta(min_length=1, max_length=MAX_WEIGHTS_BYTES)] = msgspec.field(name="bytes")
-    digest: Digest
-    parent: Digest
+    digest: Digest  # SHA-256 of ``data``, hexadecimal
+    parent: Digest  # digest of the weights that it was found better than; a mapper that uses others does not take it
+    # score, parent_score: mIoU over rays of the held-out keyframes, in 0..1, with these weights and with the parent.
     score: UnitInterval
     parent_score: UnitInterval
+    # keyframes, held_out: How many it learned from, and how many it was judged by.
     keyframes: Count
     held_out: Count
 
 
 class WeightsInUse(Wire, frozen=True):
-    """What weights a mapper uses, and what became of the last ones that it was offered.
+    """What weights a mapper uses, and what became of the last ones that it was offered."""
 
-    Args:
-        node: The mapper.
-        version: In use; 0 = those that it was started with.
-        digest: SHA-256 of the file in use, hexadecimal.
-        newest: The highest version that it has been offered.
-        judged: The version that it was offered last; 0 = none yet.
-        accepted: Whether that one was taken.
-        reason: Why it was not, for people.
-        rolled_back: How often somebody has requested other weights.
-        contradicts: Whether it was not taken because it contradicts the map, rather than for any other reason.
-    """
-
-    node: Source
-    version: Count
-    digest: Digest
-    newest: Count = 0
-    judged: Count = 0
-    accepted: bool = False
-    reason: Sentence = ""
-    rolled_back: Count = 0
+    node: Source  # the mapper
+    version: Count  # in use; 0 = those that it was started with
+    digest: Digest  # SHA-256 of the file in use, hexadecimal
+    newest: Count = 0  # the highest version that it has been offered
+    judged: Count = 0  # the version that it was offered last; 0 = none yet
+    accepted: bool = False  # whether that one was taken
+    reason: Sentence = ""  # why it was not, for people
+    rolled_back: Count = 0  # how often somebody has requested other weights
+    # whether it was not taken because it contradicts the map, rather than for any other reason
     contradicts: bool = False
 
     def __post_init__(self) -> None:
@@ -288,24 +245,16 @@ def digest_of(data: Buffer) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One kind of message.
+    """One kind of message."""
 
-    Args:
-        name: First word of the topic on the wire.
-        message: Type of the decoded message.
-        source: Field of the header that is the second word of the topic; empty where any sender may stand there.
-        logged: Whether the recorder keeps it.
-        queue: "newest": an unread message gives way to a newer one of the same source; "all": nothing is dropped.
-        latched: The last one is sent again to every new subscriber.
-        closes: Topic of what it ends: its latched message comes after that one's, and holds until there is a new one.
-    """
-
-    name: str
-    message: type[Message]
-    source: str
-    logged: bool
+    name: str  # first word of the topic on the wire
+    message: type[Message]  # type of the decoded message
+    source: str  # field of the header that is the second word of the topic; empty where any sender may stand there
+    logged: bool  # whether the recorder keeps it
+    # "newest": an unread message gives way to a newer one of the same source; "all": nothing is dropped
     queue: Literal["newest", "all"]
-    latched: bool = False
+    latched: bool = False  # the last one is sent again to every new subscriber
+    # topic of what it ends: its latched message comes after that one's, and holds until there is a new one
     closes: str = ""
 
 
