@@ -6,6 +6,7 @@ python -m research.experiments.cpu_seconds research.experiments.taught_rooms --o
 
 from __future__ import annotations
 
+import importlib
 import runpy
 import sys
 import time
@@ -20,10 +21,9 @@ def main() -> None:
 
     torch.set_num_threads(1)
     sys.argv = sys.argv[1:]
-    if sys.argv[0] == "semantic-mapper":
-        from semantic_mapper.nodes.cli.main import main as verbs
-
-        sys.exit(verbs())
+    verbs = {"semantic-mapper": "semantic_mapper.nodes.cli.main", "semantic-mapper-research": "research.cli.main"}
+    if sys.argv[0] in verbs:
+        sys.exit(importlib.import_module(verbs[sys.argv[0]]).main())
     runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 

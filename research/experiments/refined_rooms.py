@@ -65,7 +65,7 @@ class KeptRoom:
         """Of the map refined by a network; None = as it is."""
         voxel_map, surface = VoxelMap.load(self._map_file), self._surface
         if network is not None:
-            refine(voxel_map, network, up=UP)
+            refine(voxel_map, network, up=UP, by_name=True)  # ROOMS has people, the default weights have not
         points = voxel_map.points()
         assert (points.xyz == self._xyz).all(), "refining leaves geometry as it is"
         label = in_rooms(points.label, voxel_map.label_set)
