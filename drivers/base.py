@@ -6,7 +6,6 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 from semantic_mapper.errors import CameraError
@@ -57,9 +56,6 @@ class Camera:
     as a gap in ``seq``. A device that goes away and may come back is waited for within the driver; ``warnings`` says so
     meanwhile. What no waiting can fix raises ``CameraError``.
 
-    Args:
-        camera_id: What its images are called.
-
     Attributes:
         can_wait: Whether its images wait until they are taken, as those of a file do; known before it is open.
     """
@@ -74,11 +70,7 @@ class Camera:
 
     @property
     def info(self) -> StreamInfo:
-        """Its intrinsics, its device, its rate.
-
-        Raises:
-            CameraError: it is not open.
-        """
+        """Its intrinsics, its device, its rate; raises ``CameraError`` where it is not open."""
         if self._info is None:
             raise CameraError(f"camera '{self._camera_id}' is not open")
         return self._info
@@ -95,25 +87,15 @@ class Camera:
         return self._last_poll_time
 
     def __enter__(self) -> Self:
-        """Open it.
-
-        Raises:
-            CameraError: it is not there, or cannot do what its config asks for.
-        """
+        """Open it; raises ``CameraError`` where it is not there, or cannot do what its config asks for."""
         raise NotImplementedError
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Free it."""
         self.stop()
 
     def __iter__(self) -> Iterator[CameraImage]:
-        """Images in the order of capture.
-
-        Raises:
-            CameraError: it is not open, or has failed for good.
-        """
+        """Images in the order of capture; raises ``CameraError`` where it is not open, or has failed for good."""
         raise NotImplementedError
 
     def stop(self) -> None:
@@ -139,12 +121,9 @@ class PoseSource:
         return Counter(self._counters)
 
     def __enter__(self) -> Self:
-        """Open it."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Free it."""
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:

@@ -1,125 +1,102 @@
-"""Live cameras, whose device may go away and come back: those that OpenCV reads, and those of an SDK that is polled."""
+"""Live cameras: devices that may go away and come back, read by a thread of their own."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from types import TracebackType
-from typing import Protocol, Self
+from dataclasses import replace
+from typing import Self, TypeVar
+
+import cv2
+import numpy as np
 
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, UInt8
+from semantic_mapper.types import CameraIntrinsics
 
 FIRST_PAUSE_S = 0.1  # before a lost device is tried again; doubles each time
 MAX_PAUSE_S = 1.0
-FAILURES = 3  # reads in a row that give nothing: the device is opened again
-WAIT_SLICE_S = 0.2
-SLICE_S = 0.1  # how soon a polled camera notices a stop
-RETRY_S = 1.0  # between two attempts to find a polled device that has gone
+START_S = 20.0  # how long a device may take for its first image
+STALL_S = 3.0  # without an image for so long, a device is opened again
+QUEUE = 1  # images that wait for their reader; the oldest gives way, which is a gap
+SLICE_S = 0.1  # how long a device that is polled waits for an image at a time
 FUTURE_NS = 100_000_000  # a stamp further ahead of now is wrong
 MIN_HZ = 1e-3  # of a film or camera: one divided by it is still a time
 DRIFT = 2e-4  # how much faster or slower than ours the sender's clock may run
 LATE_NS = 1_000_000_000  # an image is never so much later than the quickest one: then its clock is not usable
-CLOSE_S = 1.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
+CLOSE_S = 5.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
+_WAIT_SLICE_S = 0.2
+_DAMAGED_PAUSE_S = 0.01  # after a read that gave nothing: it may have failed at once
 
 NOT_CALIBRATED = "not calibrated: the intrinsics are a guess, good for calibrating only"
+
+FirstT = TypeVar("FirstT")
 
 _log = get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RawImage:
-    """One image as the device gave it: (H, W, 3) BGR, and when it was captured on the monotonic clock."""
+class Device:
+    """Base of an open device, used by one thread. Its constructor raises ``CameraError`` where it cannot be had.
 
-    stamp_ns: int
-    bgr: UInt8
+    Attributes:
+        info: Its description, intrinsics and rate.
+    """
 
-
-class Device(Protocol):
-    """An open device, used by one thread."""
-
-    @property
-    def description(self) -> str:
-        """For people: model and address."""
-        ...
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of its images."""
-        ...
-
-    @property
-    def frame_hz(self) -> float:
-        """Nominal rate, 0 = not known."""
-        ...
+    info: StreamInfo
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What it does other than requested."""
-        ...
+        """What it does other than requested; any thread may ask."""
+        return ()
 
-    def read(self) -> RawImage | None:
-        """The next image, waited for; None where none came or it was damaged.
+    def read(self) -> CameraImage | None:
+        """The next image, waited for; ``seq`` is the device's own count. None where none came or it was damaged.
 
         Raises:
-            CameraError: the device is gone.
+            CameraError: the device is gone, or gives what cannot be used.
         """
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Free it."""
-        ...
+        """Free it; one that has gone already is no error."""
+        raise NotImplementedError
 
 
 class LiveCamera(Camera):
-    """A ``Camera`` that OpenCV reads: one thread owns the device, the newest image wins, a lost device is waited for.
-
-    The thread is the only one that touches the device, since a read of a stalled stream may hang for seconds.
+    """A thread owns the device, since a read may hang for seconds. The newest image wins; a lost device is waited for.
 
     Args:
         camera_id: What its images are called.
-        open_device: Opens it, each time again; raises ``CameraError`` where it is not there.
-        measured: Its calibration; None: guessed, said in ``warnings``.
+        open_device: Opens it, each time again; gets an event that tells it to give up. ``CameraError``: not there.
         stall_s: Silence after which a stream counts as stalled.
-        metadata: For ``StreamInfo``.
     """
 
     def __init__(
-        self,
-        camera_id: str,
-        open_device: Callable[[], Device],
-        measured: CameraIntrinsics | None,
-        stall_s: float,
-        metadata: dict[str, str],
+        self, camera_id: str, open_device: Callable[[threading.Event], Device], stall_s: float = STALL_S
     ) -> None:
         super().__init__(camera_id)
         self._open_device = open_device
-        self._measured = measured
         self._stall_s = stall_s
-        self._metadata = metadata
-        self._rectify: Rectifier | None = None
+        self._device: Device | None = None
         self._thread: threading.Thread | None = None
         self._changed = threading.Condition()
-        self._newest: tuple[int, RawImage] | None = None  # number and image; guarded by _changed
-        self._seq = -1  # of the last image; only the thread counts
-        self._failures = 0  # to open the device again, in a row
+        self._waiting: deque[CameraImage] = deque(maxlen=QUEUE)  # guarded by _changed
+        self._counter = FrameCounter()
         self._heard = self._read_at = self._last_request = 0.0
-        self._lost = ""
-        self._device_warnings: tuple[str, ...] = ()
+        self._lost = self._refused = ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """As of ``Camera``."""
-        warnings = list(self._device_warnings)
-        if self._measured is None:
-            warnings.append(NOT_CALIBRATED)
+        warnings = [*(self._device.warnings if self._device is not None else ())]
         silent_s = time.monotonic() - self._heard
+        if self._refused:
+            warnings.append(f"images are passed over: {self._refused}")
         if self._lost:
             warnings.append(f"{self._lost}; waited for since {silent_s:.0f} s")
         elif self._thread is not None and silent_s > self._stall_s:
@@ -134,105 +111,79 @@ class LiveCamera(Camera):
     def __enter__(self) -> Self:
         """As of ``Camera``."""
         device = self._open()
-        intrinsics = self._measured or guess_intrinsics(*device.size)
-        rectify = self._rectify = Rectifier(intrinsics)
-        self._info = StreamInfo(
-            source=device.description,
-            cameras={self._camera_id: rectify.intrinsics},
-            frame_hz=device.frame_hz,
-            metadata=self._metadata,
-        )
         self._heard = self._read_at = self._last_request = time.monotonic()
         self._thread = threading.Thread(target=self._run, args=(device,), name=f"camera {self._camera_id}", daemon=True)
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
 
     def __iter__(self) -> Iterator[CameraImage]:
         """The newest image each time; what was captured meanwhile is a gap in ``seq``."""
-        rectify, thread = self._rectify, self._thread
-        if rectify is None or thread is None:
+        if self._thread is None:
             raise CameraError(f"camera '{self._camera_id}' is not open")
         while not self._stopping.is_set():
             self._last_request = time.monotonic()
             with self._changed:
-                self._changed.wait_for(lambda: self._newest is not None or self._stopping.is_set(), WAIT_SLICE_S)
-                newest, self._newest = self._newest, None
-            if newest is not None and not self._stopping.is_set():
-                seq, picture = newest
-                yield CameraImage(
-                    picture.stamp_ns, seq, self._camera_id, rectify(picture.bgr), None, rectify.intrinsics
-                )
-            elif not thread.is_alive() and not self._stopping.is_set():
+                self._changed.wait_for(lambda: self._waiting or self._stopping.is_set(), _WAIT_SLICE_S)
+                image = self._waiting.popleft() if self._waiting else None
+            if image is not None and not self._stopping.is_set():
+                yield image
+            elif not self._thread.is_alive() and not self._stopping.is_set():
                 raise CameraError(f"camera '{self._camera_id}': its reading thread has failed; the log says why")
 
     def _open(self) -> Device:
-        """Raises: CameraError: it is not there, or its images have another size than was calibrated."""
-        device = self._open_device()
-        expected = device.size if self._measured is None else (self._measured.width, self._measured.height)
-        if device.size != expected:
-            device.close()
-            raise CameraError(
-                f"{device.description}: gives images of {device.size[0]}x{device.size[1]}, but was calibrated at "
-                f"{expected[0]}x{expected[1]}; calibrate for a size that it offers"
-            )
-        self._device_warnings = device.warnings
+        """Raises: CameraError: it is not there."""
+        device = self._device = self._open_device(self._stopping)
+        self._info = device.info
+        self._counter.restart(device.info.frame_hz)
+        _log.info("camera_connected", camera=self._camera_id, device=device.info.source)
         return device
 
-    def _run(self, device: Device) -> None:
+    def _run(self, device: Device | None) -> None:
         """Read until it is stopped; open it again when it is lost."""
-        while True:
+        while device is not None:
             try:
-                lost = self._read_on(device)
+                self._lost = self._read_on(device)
             finally:
                 device.close()
             if self._stopping.is_set():
                 return
-            self._lost = lost
-            self._seq += 1  # a gap shows it, even if nothing else was lost
-            _log.warning("camera_lost", camera=self._camera_id, reason=lost)
-            again = self._open_again()
-            if again is None:
-                return
-            device = again
+            _log.warning("camera_lost", camera=self._camera_id, reason=self._lost)
+            device = self._open_again()
 
     def _read_on(self, device: Device) -> str:
         """Read until it is lost, and say why; empty where it was stopped."""
-        failures = 0
+        heard = time.monotonic()
         while not self._stopping.is_set():
-            began = time.monotonic()
             try:
-                picture = device.read()
+                image = device.read()
             except CameraError as error:
                 return str(error)
             now = self._read_at = time.monotonic()
-            self._seq += 1
-            self._device_warnings = device.warnings
-            if picture is None:
-                failures += 1
-                if failures >= FAILURES or now - began >= self._stall_s:
-                    return f"{device.description}: gives no images"
+            self._refused = "" if image is None else self._counter.refusal(image.stamp_ns)
+            if image is None or self._refused:
+                if now - heard > self._stall_s:
+                    return f"{device.info.source}: gives no images"
+                self._stopping.wait(_DAMAGED_PAUSE_S)
                 continue
-            failures = 0
-            if self._lost:
-                _log.info("camera_back", camera=self._camera_id, device=device.description, seq=self._seq)
-            self._failures, self._heard, self._lost = 0, now, ""
+            heard = self._heard = now
+            self._lost = ""
+            image = self._counter.numbered(image)
             with self._changed:
-                self._newest = (self._seq, picture)
+                self._waiting.append(image)
                 self._changed.notify()
         return ""
 
     def _open_again(self) -> Device | None:
         """Wait for the device, longer each time; None where it was stopped."""
-        while not self._stopping.wait(min(FIRST_PAUSE_S * 2.0 ** min(self._failures, 64), MAX_PAUSE_S)):
+        pause_s = FIRST_PAUSE_S
+        while not self._stopping.wait(pause_s):
+            pause_s = min(2 * pause_s, MAX_PAUSE_S)
             self._read_at = time.monotonic()
-            self._failures += 1
             try:
                 return self._open()
             except CameraError as error:
@@ -240,72 +191,98 @@ class LiveCamera(Camera):
         return None
 
 
-class StreamEnded(Exception):  # noqa: N818 -- an event, not an error: the camera is gone and may come back
-    """The device has gone, or gives nothing any more; the text says which."""
+class CaptureDevice(Device):
+    """A ``Device`` that OpenCV reads, each image rectified.
 
+    Args:
+        camera_id: What its images are called.
+        source: For people: model and address.
+        capture: Open, of the size that it will have.
+        measured: Its calibration; None: guessed, said in ``warnings``.
+        metadata: For ``info``.
 
-class PolledCamera(Camera):
-    """Base of a camera over an SDK that is polled; a device that goes away is looked for until it is back."""
+    Raises:
+        CameraError: it gives no images, or of another size than was calibrated.
+    """
 
-    def __init__(self, camera_id: str) -> None:
-        super().__init__(camera_id)
-        self._connected = False
-
-    def __enter__(self) -> Self:
-        """Open the device and wait for its first image."""
-        self._connect(again=False)
-        self._connected = True
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    def __init__(
+        self,
+        camera_id: str,
+        source: str,
+        capture: cv2.VideoCapture,
+        measured: CameraIntrinsics | None,
+        metadata: dict[str, str],
     ) -> None:
-        """Free the device."""
-        self._disconnect()
+        self._camera_id = camera_id
+        self._capture = capture
+        self._count = -1
+        self._notes: list[str] = [] if measured is not None else [NOT_CALIBRATED]
+        size = (round(self.get(cv2.CAP_PROP_FRAME_WIDTH)), round(self.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        if min(size) <= 0:
+            capture.release()
+            raise CameraError(f"{source}: holds no video that OpenCV can read; is it complete, and its codec common?")
+        measured = measured or guess_intrinsics(*size)
+        if size != (measured.width, measured.height):
+            capture.release()
+            raise CameraError(
+                f"{source}: gives images of {size[0]}x{size[1]}, but was calibrated at "
+                f"{measured.width}x{measured.height}; calibrate for a size that it offers"
+            )
+        self._rectify = Rectifier(measured)
+        hz = nominal_hz(self.get(cv2.CAP_PROP_FPS))
+        self.info = StreamInfo(source, {camera_id: self._rectify.intrinsics}, frame_hz=hz, metadata=metadata)
 
-    def __iter__(self) -> Iterator[CameraImage]:
-        """As of ``Camera``."""
-        source = self.info.source
-        while not self._stopping.is_set():
-            self._last_poll_time = time.monotonic()
-            if self._connected:
-                try:
-                    yield from self._images()
-                except StreamEnded as end:
-                    self._connected = False
-                    self._warn_of_device(f"{source}: {end}; it is looked for every {RETRY_S:g} s")
-                    _log.warning("camera_lost", camera=self._camera_id, device=source, reason=str(end))
-                    self._disconnect()
-            elif not self._stopping.wait(RETRY_S):
-                try:
-                    self._connect(again=True)
-                    self._connected = True
-                except CameraError as error:
-                    self._warn_of_device(f"{source} is away: {error}")
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """As of ``Device``."""
+        return tuple(self._notes)
 
-    def _connect(self, *, again: bool) -> None:
-        """Open the device, start it, and set ``_info``; ``again``: it was away, and is looked for once.
+    def get(self, name: int) -> float:
+        """A property of the capture; 0 for what is no number."""
+        value = float(self._capture.get(name))
+        return value if np.isfinite(value) else 0.0
 
-        Raises:
-            CameraError: it does not work, and nothing is left open.
-        """
+    def read(self) -> CameraImage | None:
+        """As of ``Device``."""
+        self._count += 1
+        try:
+            good, bgr = self._capture.read()
+        except cv2.error as error:
+            raise CameraError(f"{self.info.source}: {error}") from error
+        arrived_ns = time.monotonic_ns()
+        intrinsics = self._rectify.intrinsics
+        if not good or bgr is None:
+            return self._nothing()
+        if bgr.shape != (intrinsics.height, intrinsics.width, 3):
+            return None
+        rgb = self._rectify(np.asarray(bgr, np.uint8))
+        return CameraImage(self._stamp_ns(arrived_ns), self._count, self._camera_id, rgb, None, intrinsics)
+
+    def close(self) -> None:
+        """As of ``Device``."""
+        self._capture.release()
+
+    def _nothing(self) -> None:
+        """There was no image; raises ``CameraError`` where there will be no more."""
+
+    def _stamp_ns(self, arrived_ns: int) -> int:
+        """When the last image was captured."""
         raise NotImplementedError
 
-    def _images(self) -> Iterator[CameraImage]:
-        """Images of one connection.
 
-        Raises:
-            StreamEnded: at its end.
-        """
-        raise NotImplementedError
+def first_of(read: Callable[[], FirstT | None], stopping: threading.Event, name: str) -> FirstT:
+    """The first thing that a device gives.
 
-    def _disconnect(self) -> None:
-        """Free the device; one that has gone already is no error."""
-        raise NotImplementedError
-
-    def _warn_of_device(self, text: str) -> None:
-        """Keep it for ``warnings``, until an image comes."""
-        raise NotImplementedError
+    Raises:
+        CameraError: it gives nothing for ``START_S``, or a stop was requested.
+    """
+    deadline = time.monotonic() + START_S
+    while not stopping.is_set() and time.monotonic() < deadline:
+        if (found := read()) is not None:
+            return found
+    raise CameraError(
+        f"{name} was opened, but has given no image for {START_S:g} s: plug it in again, or set a lower `fps`"
+    )
 
 
 def nominal_hz(reported: float) -> float:
@@ -314,19 +291,16 @@ def nominal_hz(reported: float) -> float:
 
 
 class FrameCounter:
-    """Numbers a camera's images from 0, with jumps where images were lost, over all its connections.
+    """Numbers a camera's images from 0, with jumps where images were lost, over all its connections."""
 
-    Args:
-        hz: Nominal rate, by which the images that are lost while the device is away are counted.
-    """
-
-    def __init__(self, hz: float) -> None:
-        self._period_ns = 1e9 / hz
+    def __init__(self) -> None:
+        self._hz = 0.0
         self._last: tuple[int, int] | None = None  # number and stamp of the last image
         self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
 
-    def restart(self) -> None:
-        """The device counts again from here."""
+    def restart(self, hz: float) -> None:
+        """The device counts again from here; its nominal rate tells how many images it lost meanwhile."""
+        self._hz = hz
         self._shift = None
 
     def refusal(self, stamp_ns: int) -> str:
@@ -337,17 +311,17 @@ class FrameCounter:
             return "its stamp is not later than that of the image before"
         return ""
 
-    def number(self, counted: int, stamp_ns: int) -> int:
-        """Number of the image that the device counts as ``counted``."""
+    def numbered(self, image: CameraImage) -> CameraImage:
+        """An image that the device counts as ``seq``, with our number."""
         number = 0
         if self._last is not None:
             last, last_ns = self._last
-            number = counted + self._shift if self._shift is not None else last
+            number = image.seq + self._shift if self._shift is not None else last
             if number <= last:  # the device counts again: ask the clock
-                number = last + max(2, round((stamp_ns - last_ns) / self._period_ns))
-        self._shift = number - counted
-        self._last = (number, stamp_ns)
-        return number
+                number = last + max(2, round((image.stamp_ns - last_ns) / 1e9 * self._hz))
+        self._shift = number - image.seq
+        self._last = (number, image.stamp_ns)
+        return replace(image, seq=number)
 
 
 class StreamClock:

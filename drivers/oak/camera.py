@@ -1,177 +1,225 @@
-"""An OAK as a camera: opened, read, waited for where it goes away."""
+"""An OAK as a camera: messages of the device become images with colours, metres and stamps on this machine's clock."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import msgspec
+import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage
-from semantic_mapper.drivers.live import SLICE_S, PolledCamera, StreamEnded
+from semantic_mapper.drivers.live import SLICE_S, Device, LiveCamera, first_of
 from semantic_mapper.drivers.oak.config import Config
-from semantic_mapper.drivers.oak.device import connect_device
-from semantic_mapper.drivers.oak.images import ImageMaker, geometry_trouble, read_intrinsics, reported_intrinsics
+from semantic_mapper.drivers.oak.device import Sources, capture_ns, clock_offset_ns, connect_device, synced_queue, take
+from semantic_mapper.drivers.oak.devices import load_depthai
 from semantic_mapper.drivers.oak.odometry import Odometry
-from semantic_mapper.drivers.oak.stream import Sources, Stream
-from semantic_mapper.errors import CameraError, PoseError
-from semantic_mapper.log_events import get_logger
+from semantic_mapper.errors import CameraError, FrameError, PoseError
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
-Connect = Callable[[Config, Callable[[str], None], float], Sources]
-
-SEARCH_S = 2.0  # how long the device is looked for before it counts as missing
+QUEUE = 4  # images that wait where the reader is slow; the oldest gives way, which is a gap
 ODOMETRY_WAIT_S = 0.3  # how long an image waits for its pose; then it goes without
-_log = get_logger(__name__)
+DEPTH_UNIT_M = 1e-3  # the stereo node's default
+NO_DEPTH = 65535  # beyond what 16 bits hold
+ALIGNED_PX = 1.0  # within which intrinsics of depth and colour are the same
 
 
-class OakCamera(PolledCamera):
-    """One OAK device; see ``semantic_mapper.drivers.base.Camera``. One process a camera.
+def open_camera(config: Config, camera_id: str, connect: Callable[[Config], Sources] = connect_device) -> LiveCamera:
+    """The camera of a config, opened when it is entered; see ``drivers/registry.py``. One process a camera.
 
     Args:
         config: What to open, and how.
         camera_id: Name in the images.
         connect: Gives the sources of each connection; the device's, but for tests.
     """
+    known = config
 
-    def __init__(self, config: Config, camera_id: str, connect: Connect = connect_device) -> None:
-        super().__init__(camera_id)
+    def open_device(stopping: threading.Event) -> OakDevice:
+        nonlocal known
+        sources = connect(known)
+        # The next connection is to the same device, whatever else is plugged in.
+        known = msgspec.structs.replace(config, device=sources.address)
+        return OakDevice(sources, config, camera_id, stopping)
+
+    return LiveCamera(camera_id, open_device)
+
+
+class OakDevice(Device):
+    """One connection; raises ``CameraError`` where it does not start, or gives no image that can be used."""
+
+    def __init__(self, sources: Sources, config: Config, camera_id: str, stopping: threading.Event) -> None:
+        self._sources = sources
         self._config = config
-        self._open_sources = connect
-        self._lock = threading.Lock()
-        self._warnings: dict[str, str] = {}
-        self._stream: Stream | None = None
-        self._odometry: Odometry | None = None
-        self._maker: ImageMaker | None = None
+        self._camera_id = camera_id
+        self._clock_ns = clock_offset_ns()
+        self._intrinsics: CameraIntrinsics | None = None
+        self._notes = list(sources.notes)
+        outputs = {"rgb": sources.rgb} if sources.depth is None else {"rgb": sources.rgb, "depth": sources.depth}
+        try:
+            self._odometry = None
+            if sources.odometry is not None:
+                self._odometry = Odometry(sources.pipeline, sources.odometry, config.fps)
+            self._groups = synced_queue(sources.pipeline, outputs, 0.5 / config.fps, QUEUE)
+            sources.pipeline.start()
+            if self._odometry is not None:
+                self._odometry.start()
+            # Images that wait for their poses.
+            self._waiting = deque([first_of(lambda: self._next(SLICE_S), stopping, sources.name)])
+        except (RuntimeError, PoseError) as error:  # DepthAI's, and of the extrinsics
+            self.close()
+            raise CameraError(
+                f"{sources.name} cannot be used: {error}; try a smaller `width`, `height` or `fps`"
+            ) from error
+        except CameraError:
+            self.close()
+            raise
+        cameras = {camera_id: self._waiting[0].intrinsics}
+        self.info = StreamInfo(sources.name, cameras, frame_hz=config.fps, metadata={**sources.metadata})
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One sentence for each thing that does not work as it should now."""
-        odometry = self._odometry
-        with self._lock:
-            warnings = [f"camera '{self._camera_id}': {text}" for text in self._warnings.values() if text]
-        if odometry is not None and odometry.trouble:
-            warnings.append(f"camera '{self._camera_id}': {odometry.trouble}")
-        return tuple(warnings)
+        """As of ``Device``."""
+        trouble = () if self._odometry is None or not self._odometry.trouble else (self._odometry.trouble,)
+        return tuple(f"camera '{self._camera_id}': {text}" for text in (*self._notes, *trouble))
 
-    def _images(self) -> Iterator[CameraImage]:
-        waiting: deque[CameraImage] = deque()  # for their poses
-        while not self._stopping.is_set() and self._stream is not None:
-            try:
-                messages = self._stream.read(SLICE_S if not waiting else SLICE_S / 10)
-            except StreamEnded:
-                yield from waiting
-                raise
-            self._last_poll_time = time.monotonic()
-            if self._odometry is not None:
-                self._odometry.check()
-            if messages is not None and (image := self._image(*messages)) is not None:
-                waiting.append(image)
-            while waiting and (done := self._with_pose(waiting[0])) is not None:
-                waiting.popleft()
-                yield done
+    def read(self) -> CameraImage | None:
+        """As of ``Device``; of a camera with odometry, once the pose is known or late."""
+        if self._odometry is not None:
+            self._odometry.check()
+        if (done := self._with_pose()) is not None:
+            return done
+        image = self._next(SLICE_S / 10 if self._waiting else SLICE_S)
+        if image is not None:
+            self._waiting.append(image)
+        return self._with_pose()
 
-    def _image(self, rgb: Any, depth: Any | None) -> CameraImage | None:
-        """Raises CameraError."""
-        maker = self._maker
-        if maker is None:
-            raise CameraError(f"camera '{self._camera_id}' is not open")
-        image = maker.image(rgb, depth)
-        if image is None:
-            self._warn("stamps", f"an image was passed over ({maker.passed_over} so far): {maker.reason}")
-        else:
-            self._warn("stamps", "")
-            self._warn("device", "")
+    def close(self) -> None:
+        """As of ``Device``."""
+        self._sources.close()
+        if self._odometry is not None:
+            self._odometry.close()
+
+    def _with_pose(self) -> CameraImage | None:
+        """The oldest image that waits, as it can go on; None where there is none, or it has to wait for its pose."""
+        if not self._waiting:
+            return None
+        image, odometry = self._waiting[0], self._odometry
+        if odometry is not None:
+            late = time.monotonic_ns() - image.stamp_ns > ODOMETRY_WAIT_S * 1e9
+            if not late and not odometry.reaches(image.stamp_ns):
+                return None
+            image = replace(image, tracks_itself=True, own_pose=odometry.pose_at(image.stamp_ns))
+        self._waiting.popleft()
         return image
 
-    def _with_pose(self, image: CameraImage) -> CameraImage | None:
-        """The image as it can go on; None where it has to wait for its pose."""
-        odometry = self._odometry
-        if odometry is None:
-            return image
-        image = replace(image, tracks_itself=True)
-        late = time.monotonic_ns() - image.stamp_ns > ODOMETRY_WAIT_S * 1e9
-        if not late and not odometry.reaches(image.stamp_ns):
+    def _next(self, timeout_s: float) -> CameraImage | None:
+        """The next image, without its pose; None where it does not come within the time, or is damaged."""
+        try:
+            group = take(self._groups, timeout_s)
+            if group is None:
+                if self._sources.pipeline.isRunning():
+                    return None
+                raise EOFError
+        except EOFError as error:
+            raise CameraError(
+                f"{self._sources.name} has gone (unplugged, without power, or its firmware has crashed)"
+            ) from error
+        rgb, depth = group["rgb"], None if self._sources.depth is None else group["depth"]
+        try:
+            pixels = rgb_pixels(rgb)
+            depth_m = None if depth is None else depth_metres(depth)
+        except (RuntimeError, cv2.error):  # DepthAI's, of a message that is not what it says
             return None
-        return replace(image, own_pose=odometry.pose_at(image.stamp_ns))
-
-    def _connect(self, *, again: bool) -> None:
-        config = self._config
-        sources = self._open_sources(config, self._device_state, SLICE_S if again else SEARCH_S)
-        with ExitStack() as undo:
-            undo.callback(sources.close)
-            try:
-                odometry = Odometry(sources, config) if sources.odometry is not None else None
-                stream = Stream(sources, config)
-                if odometry is not None:
-                    undo.callback(odometry.close)
-                undo.callback(stream.close)
-                stream.start()
-                if odometry is not None:
-                    odometry.start()
-                intrinsics = self._wait_for_first(stream)
-            except (RuntimeError, PoseError) as error:  # DepthAI's, and of the extrinsics
-                raise CameraError(f"{sources.name} cannot be used: {error}") from error
-            except StreamEnded as end:
+        lens = self._intrinsics
+        if lens is None:
+            config = self._config
+            lens = reported_intrinsics(rgb)
+            lens = lens or read_intrinsics(self._sources.calibration, config.rgb, config.width, config.height)
+            self._intrinsics = lens
+            self._notes += geometry_troubles(rgb, depth)
+        for image in (pixels, depth_m):
+            if image is not None and image.shape[:2] != (lens.height, lens.width):
                 raise CameraError(
-                    f"{sources.name} was opened, but {end}: plug it in again, or set a lower `fps`"
-                ) from end
-            undo.pop_all()
-        if self._maker is None:
-            self._maker = ImageMaker(self._camera_id, intrinsics, config.fps)
-        else:
-            self._maker.reconnected(intrinsics)
-        self._stream, self._odometry = stream, odometry
-        self._info = StreamInfo(
-            source=sources.name,
-            cameras={self._camera_id: intrinsics},
-            frame_hz=config.fps,
-            metadata=sources.metadata,
-        )
-        # The next connection is to the same device, whatever else is plugged in.
-        self._config = msgspec.structs.replace(config, device=sources.address)
-        self._warn("state", "")
-        self._warn("notes", "; ".join(sources.notes))
-        _log.info("camera_connected", camera=self._camera_id, device=sources.name)
-
-    def _wait_for_first(self, stream: Stream) -> CameraIntrinsics:
-        """What the first image says of its intrinsics, else what the calibration says.
-
-        Raises:
-            CameraError, StreamEnded: there is no image, or neither says anything.
-        """
-        messages = stream.first(self._stopping)
-        reported = None if messages is None else reported_intrinsics(messages[0])
-        self._warn("geometry", "" if messages is None else geometry_trouble(*messages))
-        config = self._config
-        return reported or read_intrinsics(stream.sources.calibration, config.rgb, config.width, config.height)
-
-    def _disconnect(self) -> None:
-        stream, odometry = self._stream, self._odometry
-        self._stream = self._odometry = None
-        if stream is not None:
-            stream.close()
-        if odometry is not None:
-            odometry.close()
-
-    def _device_state(self, state: str) -> None:
-        """Called by a thread of DepthAI's, where an exception would end the process: nothing here raises."""
-        self._warn("state", "" if state == "running" else f"DepthAI says that the device is {state}")
-
-    def _warn_of_device(self, text: str) -> None:
-        self._warn("device", text)
-
-    def _warn(self, topic: str, text: str) -> None:
-        with self._lock:
-            self._warnings[topic] = text
+                    f"an image of camera '{self._camera_id}' is {image.shape[1]}x{image.shape[0]}, but {lens.width}x"
+                    f"{lens.height} was requested: choose a `width` and `height` that this device can give"
+                )
+        stamp_ns = capture_ns(rgb, self._clock_ns)
+        return CameraImage(stamp_ns, rgb.getSequenceNum(), self._camera_id, pixels, depth_m, lens)
 
 
-def open_camera(config: Config, camera_id: str) -> OakCamera:
-    """The camera of a config, opened when it is entered; see ``drivers/registry.py``."""
-    return OakCamera(config, camera_id)
+def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> CameraIntrinsics:
+    """Intrinsics of an undistorted image, from a ``dai.CalibrationHandler``; what does not fit the ratio is cropped.
+
+    Raises:
+        CameraError: the calibration knows no such camera, or does not fit the image.
+    """
+    dai = load_depthai()
+    try:
+        K = np.array(calibration.getCameraIntrinsics(getattr(dai.CameraBoardSocket, socket), width, height))
+    except (RuntimeError, IndexError) as error:
+        raise CameraError(
+            f"the OAK's calibration says nothing of the camera at {socket}: {error}; calibrate the device, name "
+            "another socket, or give a file by `calibration`"
+        ) from error
+    return _pinhole(K, width, height)
+
+
+def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:
+    """Intrinsics that a message carries: the calibration's, after every crop and scaling that the device has made.
+
+    None where it carries none; ``CameraError`` where they do not fit the image.
+    """
+    transformation = frame.getTransformation()
+    K = np.array(transformation.getIntrinsicMatrix(), np.float64)
+    if not transformation.isValid() or np.array_equal(K, np.eye(3)) or not np.isfinite(K).all():
+        return None
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        return None
+    return _pinhole(K, *transformation.getSize())
+
+
+def _pinhole(K: Float64, width: int, height: int) -> CameraIntrinsics:
+    try:
+        return CameraIntrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
+    except FrameError as error:
+        raise CameraError(f"the OAK's calibration cannot be used: {error}; calibrate the device") from error
+
+
+def geometry_troubles(rgb: Any, depth: Any | None) -> list[str]:
+    """What two messages say against it that they are undistorted and show the same pixels."""
+    if any(rgb.getTransformation().getDistortionCoefficients()):
+        return ["the device says that its images are not undistorted: surfaces may bend"]
+    ours, theirs = reported_intrinsics(rgb), None if depth is None else reported_intrinsics(depth)
+    if ours is None or theirs is None:
+        return []
+    a, b = (np.array((c.fx, c.fy, c.cx, c.cy, c.width, c.height)) for c in (ours, theirs))
+    if np.abs(a - b).max() <= ALIGNED_PX:
+        return []
+    return [f"depth may not be aligned with colour: the device says {theirs} of the one and {ours} of the other"]
+
+
+def rgb_pixels(frame: Any) -> UInt8:
+    """Colours (H, W, 3) of an image message of any colour format, or grey."""
+    kind = load_depthai().ImgFrame.Type.NV12
+    if frame.getType() == kind and frame.getPlaneStride() == frame.getWidth() * frame.getHeight():
+        # no padding: the same bits as below, in a seventh of the time
+        return np.asarray(cv2.cvtColor(frame.getFrame(), cv2.COLOR_YUV2RGB_NV12), np.uint8)
+    pixels = frame.getCvFrame()
+    code = cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB
+    return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+
+
+def depth_metres(frame: Any) -> Float32:
+    """Depth (H, W) of a depth message, 0 where nothing was measured; raises ``CameraError`` where it is none."""
+    raw = frame.getFrame()
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise CameraError(f"the OAK's depth must be 16 bits a pixel, got {raw.dtype} {raw.shape}")
+    depth_m = np.multiply(raw, np.float32(DEPTH_UNIT_M), dtype=np.float32)
+    depth_m[raw == NO_DEPTH] = 0
+    return depth_m

@@ -1,9 +1,16 @@
-"""The device's part of the pipeline: cameras, stereo depth aligned to the colour image, IMU and odometry."""
+"""What a pipeline on an OAK gives: colour, stereo depth aligned to it, IMU and odometry; and what they say of it.
+
+A pipeline has two parts: its sources are the device's, or files and nodes of the host (tests); what is behind them is
+the same. No Python runs in DepthAI's own threads, where an exception would end the process.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -11,48 +18,80 @@ import numpy as np
 
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.oak.devices import find_device, load_depthai
-from semantic_mapper.drivers.oak.stream import OdometryPorts, Sources
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import Float64
 
+SEARCH_S = 2.0  # how long the device is looked for before it counts as missing
 IMU_HZ = 200
 IMU_BATCH = 10  # reports that may wait on the device; each is sent as soon as it is there
 _SLOW_USB = ("LOW", "FULL", "HIGH")
+_CLOCK_READINGS = 5
 
 
-def connect_device(config: Config, on_state: Callable[[str], None], search_s: float) -> Sources:
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryPorts:
+    """Where odometry takes its images and gives its poses."""
+
+    # left_out, right_out: ``dai.Node.Output`` of the stereo pair.
+    left_out: Any
+    right_out: Any
+    # left_in, right_in: ``dai.Node.Input`` of the odometry node.
+    left_in: Any
+    right_in: Any
+    pose_out: Any  # ``dai.Node.Output`` of its poses (``dai.TransformData``), in the order of the images
+    T_left_rgb: Float64  # (4, 4) from the colour camera to the left one, metres
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sources:
+    """What a pipeline gets its messages from."""
+
+    pipeline: Any  # ``dai.Pipeline`` that holds the source nodes; not started yet
+    device: Any | None  # ``dai.Device`` to close at the end; None on the host alone
+    # rgb, depth: ``dai.Node.Output`` of the colour images and of their depth; None without depth.
+    rgb: Any
+    depth: Any | None
+    calibration: Any  # ``dai.CalibrationHandler`` of the device
+    name: str  # what people call it; ``address``: by which it is found again
+    address: str
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])  # for the stream's information
+    notes: tuple[str, ...] = ()  # what does not work as it should, as far as one knows at once
+    odometry: OdometryPorts | None = None  # none without
+
+    def close(self) -> None:
+        """Stop the pipeline and free the device; one that has gone already is no error."""
+        with suppress(RuntimeError):  # the link is dead: there is nothing to stop
+            if self.pipeline.isRunning():
+                self.pipeline.stop()
+            self.pipeline.wait()
+        if self.device is not None:
+            with suppress(RuntimeError):
+                self.device.close()
+
+
+def connect_device(config: Config) -> Sources:
     """Open the device and build its part of the pipeline.
-
-    Args:
-        config: Of the camera.
-        on_state: Called with each new state of the device, by a thread of DepthAI's: it must not raise.
-        search_s: How long the device is looked for before it counts as missing.
 
     Raises:
         CameraError: no such device, or it cannot do what the config asks for.
     """
     dai = load_depthai()
-    info = find_device(config.device, search_s)
+    info = find_device(config.device, SEARCH_S)
+    name = f"the OAK {info.getDeviceId()} ({info.name})"
     try:
         device = dai.Device(info)
     except RuntimeError as error:
         raise CameraError(
-            f"the OAK {info.getDeviceId()} ({info.name}) cannot be opened: {error}; plug it in again, or try another "
-            "cable or port"
+            f"{name} cannot be opened: {error}; plug it in again, or try another cable or port"
         ) from error
     with ExitStack() as undo:
-        undo.callback(_close, device)
+        undo.callback(device.close)
         try:
-            sources = _sources(device, config, on_state)
+            sources = _sources(device, config)
         except RuntimeError as error:
-            raise CameraError(f"the OAK {info.getDeviceId()} does not take this configuration: {error}") from error
+            raise CameraError(f"{name} does not take this configuration: {error}") from error
         undo.pop_all()
     return sources
-
-
-def _close(device: Any) -> None:
-    with suppress(RuntimeError):  # it has gone meanwhile: there is nothing to close
-        device.close()
 
 
 def load_calibration(device: Any, path: str) -> Any:
@@ -86,7 +125,7 @@ def rgb_to_left(calibration: Any, config: Config) -> Float64:
     return np.array(matrix, np.float64)
 
 
-def _sources(device: Any, config: Config, on_state: Callable[[str], None]) -> Sources:
+def _sources(device: Any, config: Config) -> Sources:
     """Raises RuntimeError, too: DepthAI's."""
     dai = load_depthai()
     device.setMaxReconnectionAttempts(0)  # the camera does that itself, and can be stopped
@@ -94,7 +133,6 @@ def _sources(device: Any, config: Config, on_state: Callable[[str], None]) -> So
     calibration = load_calibration(device, config.calibration)
     pipeline = dai.Pipeline(device)
     pipeline.setStopOnDeviceLoss(True)
-    pipeline.setDeviceStateCallback(lambda _, state: on_state(state.name.lower()))
     if config.calibration:
         pipeline.setCalibrationData(calibration)
     if config.ir_dots > 0:
@@ -111,6 +149,9 @@ def _sources(device: Any, config: Config, on_state: Callable[[str], None]) -> So
         depth = _aligned_depth(pipeline, device, left, right, rgb, config)
         if config.odometry:
             odometry = _odometry(pipeline, left, right, rgb_to_left(calibration, config))
+    usb, notes = device.getUsbSpeed().name, ()
+    if usb in _SLOW_USB and "USB" in device.getDeviceInfo().protocol.name:
+        notes = (f"it is connected at USB 2 speed ({usb}), too slow for its images: use a USB 3 port and cable",)
     product = device.getProductName() or device.getDeviceName() or "OAK"
     return Sources(
         pipeline=pipeline,
@@ -121,7 +162,7 @@ def _sources(device: Any, config: Config, on_state: Callable[[str], None]) -> So
         name=f"{product} {device.getDeviceId()}",
         address=config.device or device.getDeviceId(),
         metadata={"device": device.getDeviceId(), "product": str(product), "platform": device.getPlatformAsString()},
-        notes=_notes(device),
+        notes=notes,
         odometry=odometry,
     )
 
@@ -177,18 +218,54 @@ def _odometry(pipeline: Any, left: Any, right: Any, T_left_rgb: Float64) -> Odom
     basalt.runSyncOnHost(True)  # its images come from the host, see ``odometry.py``
     basalt.setImuUpdateRate(IMU_HZ)
     imu.out.link(basalt.imu)
-    return OdometryPorts(
-        left_out=left,
-        right_out=right,
-        left_in=basalt.left,
-        right_in=basalt.right,
-        pose_out=basalt.transform,
-        T_left_rgb=T_left_rgb,
-    )
+    return OdometryPorts(left, right, basalt.left, basalt.right, basalt.transform, T_left_rgb)
 
 
-def _notes(device: Any) -> tuple[str, ...]:
-    usb = device.getUsbSpeed().name
-    if usb in _SLOW_USB and "USB" in device.getDeviceInfo().protocol.name:
-        return (f"it is connected at USB 2 speed ({usb}), too slow for its images: use a USB 3 port and cable",)
-    return ()
+def synced_queue(pipeline: Any, outputs: Mapping[str, Any], within_s: float, size: int) -> Any:
+    """Queue of groups (``dai.MessageGroup``) of messages of one moment, by the names of their outputs.
+
+    Args:
+        pipeline: ``dai.Pipeline``.
+        outputs: ``dai.Node.Output`` by name.
+        within_s: How far the stamps of a group may lie apart; what has no partner is left out.
+        size: Groups that wait; the oldest gives way.
+    """
+    sync = pipeline.create(load_depthai().node.Sync)
+    sync.setRunOnHost(True)
+    sync.setSyncThreshold(timedelta(seconds=within_s))
+    for name, output in outputs.items():
+        output.link(sync.inputs[name])
+    return sync.out.createOutputQueue(maxSize=size, blocking=False)
+
+
+def take(queue: Any, timeout_s: float) -> Any | None:
+    """The next message of a queue; None where it does not come within the time; ``EOFError``: it has ended."""
+    try:
+        return queue.get(timedelta(seconds=timeout_s))
+    except load_depthai().MessageQueue.QueueException as error:
+        raise EOFError from error
+
+
+def to_ns(moment: timedelta) -> int:
+    """A DepthAI time in nanoseconds, exactly."""
+    return moment // timedelta(microseconds=1) * 1000
+
+
+def clock_offset_ns() -> int:
+    """What to add to a time of DepthAI's host clock to have one of this machine's monotonic clock."""
+    dai = load_depthai()
+    readings: list[tuple[int, int]] = []
+    for _ in range(_CLOCK_READINGS):
+        before = time.monotonic_ns()
+        theirs = to_ns(dai.Clock.now())
+        after = time.monotonic_ns()
+        readings.append((after - before, (before + after) // 2 - theirs))
+    return min(readings)[1]
+
+
+def capture_ns(frame: Any, offset_ns: int) -> int:
+    """When the middle of an image was exposed, on this machine's monotonic clock.
+
+    DepthAI keeps the device's clock in step with the host's; ``offset_ns`` is that of ``clock_offset_ns``.
+    """
+    return to_ns(frame.getTimestamp(load_depthai().CameraExposureOffset.MIDDLE)) + offset_ns

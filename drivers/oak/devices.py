@@ -27,16 +27,11 @@ _SEARCH_STEP_S = 0.2
 
 @functools.cache
 def load_depthai() -> Any:
-    """Import DepthAI once and return the module.
-
-    Raises:
-        DependencyError: it cannot be loaded, and how to get it.
-    """
-    # Its handler of signals would end the process where writing to a full disk is an error (SIGXFSZ), and
-    # print a trace of its own in the place of Python's. Who wants it sets the variable to 1.
+    """Import DepthAI once and return the module; ``DependencyError`` where it cannot be loaded."""
+    # Its handler of signals would end the process where writing to a full disk is an error (SIGXFSZ), and print a
+    # trace of its own in the place of Python's.
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
-    # A robot does not report to its maker unless it is instructed to, and leaves no files for that in its working
-    # folder.
+    # A robot does not report to its maker unless it is instructed to, and leaves no files for that.
     os.environ.setdefault("DEPTHAI_TELEMETRY", "0")
     os.environ.setdefault("DEPTHAI_DISABLE_STARTUP_NOTIFICATIONS", "1")
     try:
@@ -49,38 +44,31 @@ def load_depthai() -> Any:
 
 
 def list_devices() -> list[FoundCamera]:
-    """OAK cameras on USB and in the networks of this machine, by name.
-
-    Raises:
-        DependencyError: DepthAI cannot be loaded.
-        CameraError: DepthAI cannot search.
-    """
+    """OAK cameras on USB and in the networks of this machine, by name."""
     return sorted((_describe(info) for info in _search()), key=lambda device: (device.name, device.address))
 
 
 def find_device(address: str, search_s: float) -> Any:
-    """Look for one device until it is there.
+    """DepthAI's ``DeviceInfo`` of one device, which is looked for until it is there.
 
     Args:
         address: Id, IP address or USB path; empty for the only one that is connected.
         search_s: How long to look.
-
-    Returns:
-        DepthAI's ``DeviceInfo``.
 
     Raises:
         CameraError: there is no device, several where one should be, or another process has it; and how to fix it.
     """
     deadline = time.monotonic() + search_s
     while True:
-        found = _matching(address)
+        found = _search(address)
+        names = ", ".join(f"{d.getDeviceId()} ({d.name})" for d in found)
         if len(found) > 1:
-            names = ", ".join(f"{d.getDeviceId()} ({d.name})" for d in found)
             raise CameraError(f"several OAK cameras are connected: {names}; say which one by `device`")
         if found and found[0].state.name not in _BUSY:
             return found[0]
         if time.monotonic() > deadline:
-            raise CameraError(_busy(found[0]) if found else missing(address))
+            busy = f"the OAK {names} is in use by another process: end that one, or name another device"
+            raise CameraError(busy if found else missing(address))
         time.sleep(_SEARCH_STEP_S)
 
 
@@ -128,22 +116,15 @@ def _usb_boards(sysfs: Path, nodes: Path) -> list[Path]:
     return boards
 
 
-def _search() -> list[Any]:
+def _search(address: str = "") -> list[Any]:
+    """Raises CameraError: DepthAI cannot search."""
     dai = load_depthai()
     try:
-        return list(dai.Device.getAllConnectedDevices())
-    except RuntimeError as error:
-        raise CameraError(f"DepthAI cannot search for cameras: {error}") from error
-
-
-def _matching(address: str) -> list[Any]:
-    if not address:
-        return _search()
-    dai = load_depthai()
-    try:
+        if not address:
+            return list(dai.Device.getAllConnectedDevices())
         found, info = dai.Device.getDeviceByIdOrName(address)
     except RuntimeError as error:
-        raise CameraError(f"DepthAI cannot search for the OAK '{address}': {error}") from error
+        raise CameraError(f"DepthAI cannot search for cameras: {error}") from error
     return [info] if found else []
 
 
@@ -156,10 +137,3 @@ def _describe(info: Any) -> FoundCamera:
         notes.append(f"no permission: {UDEV_RULE}")
     name = info.getDeviceId() or info.name  # not every state gives the id
     return FoundCamera(kind="oak", name=name, address=name, note=", ".join(notes))
-
-
-def _busy(info: Any) -> str:
-    return (
-        f"the OAK {info.getDeviceId()} ({info.name}) is in use by another process, and takes one only: end that one, "
-        "or name another device"
-    )

@@ -14,17 +14,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.base import PoseEstimate
-from semantic_mapper.drivers.live import SLICE_S, StreamEnded
-from semantic_mapper.drivers.oak.config import Config
-from semantic_mapper.drivers.oak.images import capture_ns, clock_offset_ns
-from semantic_mapper.drivers.oak.stream import Sources, synced_queue, take
+from semantic_mapper.drivers.live import SLICE_S
+from semantic_mapper.drivers.oak.device import OdometryPorts, capture_ns, clock_offset_ns, synced_queue, take
 from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, PoseError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.types import Float64
 
 ANSWER_S = 2.0  # a pair without a pose for so long will have none
-SOURCE = "vio"
 KEPT = 200  # poses: some seconds
 GAP_NS = 200_000_000  # nothing is interpolated across a longer silence
 
@@ -54,39 +51,31 @@ class Odometry:
     """The poses of one connection; its thread runs from ``start`` to ``close``.
 
     Args:
-        sources: With odometry ports, of a pipeline that is not started yet.
-        config: Of the camera.
+        pipeline: ``dai.Pipeline``, not started yet.
+        ports: Of the odometry node.
+        fps: Rate of the pairs.
+
+    Attributes:
+        trouble: What does not work now; empty when all is well.
 
     Raises:
         PoseError: the extrinsics are no rigid transform.
     """
 
-    def __init__(self, sources: Sources, config: Config) -> None:
-        ports = sources.odometry
-        if ports is None:
-            raise ValueError("these sources have no odometry")
+    def __init__(self, pipeline: Any, ports: OdometryPorts, fps: float) -> None:
         check_pose(ports.T_left_rgb, "extrinsics of the OAK's colour camera")
+        self.trouble = ""
         self._T_left_rgb = ports.T_left_rgb
         self._world = time.monotonic_ns()
         self._track = PoseTrack(KEPT, GAP_NS, max_ahead_ns=0)
         self._lock = threading.Lock()  # of the track
-        self._pairs = synced_queue(
-            sources.pipeline, {"left": ports.left_out, "right": ports.right_out}, 0.5 / config.fps, size=1
-        )
-        self._inputs = {
-            name: port.createInputQueue() for name, port in (("left", ports.left_in), ("right", ports.right_in))
-        }
+        self._pairs = synced_queue(pipeline, {"left": ports.left_out, "right": ports.right_out}, 0.5 / fps, size=1)
+        self._inputs = {"left": ports.left_in.createInputQueue(), "right": ports.right_in.createInputQueue()}
         self._poses = ports.pose_out.createOutputQueue(maxSize=16, blocking=False)
         self._clock_ns = clock_offset_ns()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="oak-odometry", daemon=True)
-        self._trouble = ""
         self._error: Exception | None = None
-
-    @property
-    def trouble(self) -> str:
-        """What does not work now; empty when all is well."""
-        return self._trouble
 
     def reaches(self, stamp_ns: int) -> bool:
         """Whether the poses go as far as this moment: waiting longer brings nothing new for it."""
@@ -99,7 +88,7 @@ class Odometry:
             found = self._track.at(stamp_ns)
         if isinstance(found, str):
             return None
-        return PoseEstimate(T_world_camera=found.T @ self._T_left_rgb, source=SOURCE, world=self._world)
+        return PoseEstimate(found.T @ self._T_left_rgb, "vio", world=self._world)
 
     def start(self) -> None:
         """Begin, once the pipeline runs."""
@@ -112,11 +101,7 @@ class Odometry:
             self._thread.join()
 
     def check(self) -> None:
-        """Raise what ended the thread, if anything did.
-
-        Raises:
-            CameraError: with the cause.
-        """
+        """Raise what ended the thread, if anything did, as a ``CameraError``."""
         if self._error is not None:
             raise CameraError(f"odometry has ended: {self._error}; `odometry = false` does without") from self._error
 
@@ -126,7 +111,7 @@ class Odometry:
                 pair = take(self._pairs, SLICE_S)
                 if pair is not None:
                     self._track_pair(pair)
-        except StreamEnded:  # the reader of the images says so
+        except EOFError:  # the reader of the images says so
             pass
         except Exception as error:  # noqa: BLE001 -- whatever it is, it must be reported where the images are read
             self._error = error
@@ -143,7 +128,7 @@ class Odometry:
                 self._add(stamp_ns, pose)
                 return
             if time.monotonic() > deadline:
-                self._trouble = f"odometry has not answered for {ANSWER_S:g} s: too few features, or a busy processor"
+                self.trouble = f"odometry has not answered for {ANSWER_S:g} s: too few features, or a busy processor"
                 return
 
     def _add(self, stamp_ns: int, pose: Any) -> None:
@@ -152,6 +137,6 @@ class Odometry:
             T_world_left = basalt_pose((t.x, t.y, t.z), (q.qx, q.qy, q.qz, q.qw))
             with self._lock:
                 self._track.add(StampedPose(stamp_ns, T_world_left))
-            self._trouble = ""
+            self.trouble = ""
         except PoseError as error:
-            self._trouble = f"odometry has lost track: {error}"
+            self.trouble = f"odometry has lost track: {error}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import msgspec
@@ -111,13 +110,11 @@ class PosedCamera:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         try:
-            self._camera.__exit__(kind, error, trace)
+            self._camera.__exit__(*error)
         finally:
-            self._poses.__exit__(kind, error, trace)
+            self._poses.__exit__(*error)
 
     def stop(self) -> None:
         """End the iteration soon, from any thread or signal handler."""

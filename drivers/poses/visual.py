@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Any, Self
 
 import cv2
@@ -105,11 +104,9 @@ class VisualPoseSource(PoseSource):
             self._reference.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._reference is not None:
-            self._reference.__exit__(kind, error, trace)
+            self._reference.__exit__(*error)
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose of the next image; None before the world begins, before the scale is known, and while lost.

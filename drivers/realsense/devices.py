@@ -25,11 +25,7 @@ _FIX = (
 
 @functools.cache
 def load_realsense() -> Any:
-    """Import ``pyrealsense2`` once and return the module.
-
-    Raises:
-        DependencyError: it cannot be loaded, and how to get it.
-    """
+    """Import ``pyrealsense2`` once and return the module; ``DependencyError`` where it cannot be loaded."""
     notes = preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")  # the wheel links libusb, and has none
     try:
         return importlib.import_module("pyrealsense2")
@@ -42,41 +38,25 @@ def load_realsense() -> Any:
 
 
 def list_devices() -> list[FoundCamera]:
-    """RealSense cameras of this machine.
-
-    Raises:
-        DependencyError: the SDK cannot be loaded.
-        CameraError: it cannot search.
-    """
-    rs = load_realsense()
+    """RealSense cameras of this machine."""
     found: list[FoundCamera] = []
     for device in connected():
-        usb, firmware = (
-            about(device, what) for what in (rs.camera_info.usb_type_descriptor, rs.camera_info.firmware_version)
-        )
+        usb, firmware = about(device, "usb_type_descriptor"), about(device, "firmware_version")
         notes = [f"USB {usb}"] * bool(usb) + [f"firmware {firmware}"] * bool(firmware)
-        serial = about(device, rs.camera_info.serial_number)
-        found.append(FoundCamera("realsense", about(device, rs.camera_info.name), serial, ", ".join(notes)))
+        serial = about(device, "serial_number")
+        found.append(FoundCamera("realsense", about(device, "name"), serial, ", ".join(notes)))
     return found
 
 
 def find_device(serial: str, search_s: float) -> Any:
-    """Look for one device until it is there.
-
-    Args:
-        serial: Number; empty for the only one that is connected.
-        search_s: How long to look.
-
-    Returns:
-        The SDK's ``device``.
+    """The SDK's ``device`` of a serial number, looked for until it is there; empty for the only one that is connected.
 
     Raises:
         CameraError: there is no device, or several where one should be; and how to fix it.
     """
-    rs = load_realsense()
     deadline = time.monotonic() + search_s
     while True:
-        devices = {about(device, rs.camera_info.serial_number): device for device in connected()}
+        devices = {about(device, "serial_number"): device for device in connected()}
         fitting = [device for number, device in devices.items() if serial in ("", number)]
         if len(fitting) == 1:
             return fitting[0]
@@ -90,17 +70,14 @@ def find_device(serial: str, search_s: float) -> Any:
 
 
 def connected() -> list[Any]:
-    """The SDK's ``device`` of each camera.
-
-    Raises:
-        CameraError: the SDK cannot search.
-    """
+    """The SDK's ``device`` of each camera; ``CameraError`` where it cannot search."""
     try:
         return list(load_realsense().context().query_devices())
     except RuntimeError as error:
         raise CameraError(f"the RealSense SDK cannot search for cameras: {error}") from error
 
 
-def about(device: Any, what: Any) -> str:
-    """What a device says of itself (``camera_info``); empty where it says nothing."""
-    return str(device.get_info(what)) if device.supports(what) else ""
+def about(device: Any, what: str) -> str:
+    """What a device says of itself (a ``camera_info`` by name); empty where it says nothing."""
+    name = getattr(load_realsense().camera_info, what)
+    return str(device.get_info(name)) if device.supports(name) else ""

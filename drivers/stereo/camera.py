@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 
@@ -24,18 +23,10 @@ _OURS = ("device", "calibration", "uncalibrated", "width", "height")  # of the d
 
 
 class StereoCamera(Camera):
-    """The left camera of a pair, with depth.
-
-    Args:
-        config: Of the pair.
-        camera_id: Name in the images.
-
-    Raises:
-        CameraError: no device or no calibration is named.
-        ConfigError: the calibration cannot be read or cannot be worked with, or a setting of the device is unknown.
-    """
+    """The left camera of a pair, with depth."""
 
     def __init__(self, config: Config, camera_id: str) -> None:
+        where = f"stereo pair at {config.device}"
         if not config.device:
             raise CameraError(
                 f"camera '{camera_id}': no device is named; `doctor --cameras --kind stereo` lists what may be "
@@ -43,23 +34,23 @@ class StereoCamera(Camera):
             )
         if not config.calibration:
             raise CameraError(
-                f"stereo pair at {config.device}: has no calibration; make one with `semantic-mapper calibrate "
-                '--stereo`, and name it with calibration = "FILE"'
+                f"{where}: has no calibration; make one with `semantic-mapper calibrate --stereo`, and name it with "
+                'calibration = "FILE"'
             )
         taken = sorted(set(config.source) & set(_OURS))
         if taken:
-            raise CameraError(
-                f"stereo pair at {config.device}: `{taken[0]}` cannot be a key of `source`: it is set here"
-            )
+            raise CameraError(f"{where}: `{taken[0]}` cannot be a key of `source`: it is set here")
         pair = load_stereo(Path(config.calibration))
         self._depth = StereoDepth(pair, config.width, config.min_depth_m, config.max_depth_m)
         self._size = (2 * pair.left.width, pair.left.height)
         self._swapped = pair.swapped
         super().__init__(camera_id)
-        kind, settings = source_of(config.device, *self._size)
+        kind, settings = "opencv", {"source": config.device}
+        if Path(config.device).is_relative_to(devices.DEVICES):
+            kind, settings = "v4l2", {"device": config.device, "width": self._size[0], "height": self._size[1]}
         # Its own rectification is off: that of one lens would be wrong for both.
         settings |= {**config.source, "uncalibrated": True}
-        self._source = registry.open_camera(kind, settings, camera_id, f"stereo pair at {config.device}")
+        self._source = registry.open_camera(kind, settings, camera_id, where)
         self.can_wait = self._source.can_wait
 
     @property
@@ -81,8 +72,7 @@ class StereoCamera(Camera):
             self._source.__exit__(None, None, None)
             raise CameraError(
                 f"{source.source}: gives images of {given.width}x{given.height}, and the pair was calibrated at "
-                f"{self._size[0] // 2}x{self._size[1]}, side by side {self._size[0]}x{self._size[1]}; calibrate for a "
-                "size that it offers"
+                f"{self._size[0]}x{self._size[1]} side by side; calibrate for a size that it offers"
             )
         self._info = msgspec.structs.replace(
             source,
@@ -97,10 +87,8 @@ class StereoCamera(Camera):
         )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._source.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self._source.__exit__(*error)
 
     def __iter__(self) -> Iterator[CameraImage]:
         """Left images with their depth; otherwise as the device's driver gives them."""
@@ -121,22 +109,11 @@ def halves(rgb: UInt8, *, swapped: bool = False) -> tuple[UInt8, UInt8]:
     return (second, first) if swapped else (first, second)
 
 
-def source_of(device: str, width: int = 0, height: int = 0) -> tuple[str, dict[str, Any]]:
-    """Kind and settings of the driver that reads a device.
-
-    Args:
-        device: A V4L2 device, a video file, or a URL.
-        width, height: To ask of it; 0 = as it is.
-    """
-    if Path(device).is_relative_to(devices.DEVICES):
-        return "v4l2", {"device": device, "width": width, "height": height}
-    return "opencv", {"source": device}
-
-
 def open_camera(config: Config, camera_id: str) -> StereoCamera:
     """The camera of a config, opened when it is entered; see ``drivers/registry.py``.
 
     Raises:
-        CameraError, ConfigError: see ``StereoCamera``.
+        CameraError: no device or no calibration is named.
+        ConfigError: the calibration cannot be read or cannot be worked with, or a setting of the device is unknown.
     """
     return StereoCamera(config, camera_id)

@@ -1,6 +1,7 @@
 """What the kernel says of a video device beyond what OpenCV asks: who it is, its formats, its controls.
 
-Layouts and numbers are those of linux/videodev2.h, the same on all 64 bit machines.
+Layouts and numbers are those of linux/videodev2.h, the same on all 64 bit machines. All functions raise ``OSError``
+where a device cannot be opened, does not answer or refuses.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import errno
 import fcntl
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,11 +127,7 @@ class Control:
 
 @contextmanager
 def opened(path: Path) -> Iterator[int]:
-    """A file descriptor of a device, for questions and controls while another one streams.
-
-    Raises:
-        OSError: it cannot be opened.
-    """
+    """A file descriptor of a device, for questions and controls while another one streams."""
     fd = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     try:
         yield fd
@@ -139,11 +136,7 @@ def opened(path: Path) -> Iterator[int]:
 
 
 def query_capability(fd: int) -> Capability:
-    """Who it is.
-
-    Raises:
-        OSError: no video device.
-    """
+    """Who it is."""
     row = _Capability()
     fcntl.ioctl(fd, QUERYCAP, row)
     of_node = row.device_caps if row.capabilities & _CAP_DEVICE_CAPS else row.capabilities
@@ -151,52 +144,43 @@ def query_capability(fd: int) -> Capability:
 
 
 def list_formats(fd: int) -> tuple[str, ...]:
-    """FOURCC of each pixel format that it offers.
-
-    Raises:
-        OSError: it does not answer.
-    """
-    return tuple(fourcc_text(code) for code in _format_codes(fd))
+    """FOURCC of each pixel format that it offers."""
+    return tuple(fourcc_text(row.pixelformat) for row in _formats(fd))
 
 
 def list_sizes(fd: int) -> tuple[tuple[int, int], ...]:
-    """Width and height of each image size that it offers, the largest first; none of a device that scales freely.
-
-    Raises:
-        OSError: it does not answer.
-    """
-    found: set[tuple[int, int]] = set()
-    for code in _format_codes(fd):
-        for index in range(_MAX_ROWS):
-            row = _FrameSize(index=index, pixelformat=code)
-            if not _fetch(fd, ENUM_FRAMESIZES, row) or row.type != _FRAMESIZE_DISCRETE:
-                break
-            found.add((row.size[0], row.size[1]))
-    return tuple(sorted(found, reverse=True))
+    """Width and height of each image size that it offers, the largest first; none of a device that scales freely."""
+    sizes = {
+        (row.size[0], row.size[1])
+        for kind in _formats(fd)
+        for row in _rows(fd, ENUM_FRAMESIZES, lambda i: _FrameSize(index=i, pixelformat=kind.pixelformat))  # noqa: B023
+        if row.type == _FRAMESIZE_DISCRETE
+    }
+    return tuple(sorted(sizes, reverse=True))
 
 
-def _format_codes(fd: int) -> list[int]:
-    found: list[int] = []
+def _formats(fd: int) -> Iterator[Any]:
+    return _rows(fd, ENUM_FMT, lambda i: _Format(index=i, type=_BUF_TYPE_VIDEO_CAPTURE))
+
+
+def _rows(fd: int, request: int, row_of: Callable[[int], Any]) -> Iterator[Any]:
+    """Rows of a list, filled in, to its end."""
     for index in range(_MAX_ROWS):
-        row = _Format(index=index, type=_BUF_TYPE_VIDEO_CAPTURE)
-        if not _fetch(fd, ENUM_FMT, row):
-            break
-        found.append(row.pixelformat)
-    return found
+        row = row_of(index)
+        try:
+            fcntl.ioctl(fd, request, row)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOTTY):
+                return
+            raise
+        yield row
 
 
 def list_controls(fd: int) -> dict[str, Control]:
-    """Its controls by name.
-
-    Raises:
-        OSError: it does not answer.
-    """
+    """Its controls by name."""
     found: dict[str, Control] = {}
     last = 0
-    for _ in range(_MAX_ROWS):
-        row = _QueryControl(id=last | _CTRL_FLAG_NEXT)
-        if not _fetch(fd, QUERYCTRL, row):
-            break
+    for row in _rows(fd, QUERYCTRL, lambda _: _QueryControl(id=last | _CTRL_FLAG_NEXT)):  # noqa: B023 -- asked anew each time
         last = row.id
         name = re.sub(r"[^a-z0-9]+", "_", _text(row.name).lower()).strip("_")
         if not row.flags & _CTRL_FLAG_DISABLED:
@@ -205,18 +189,14 @@ def list_controls(fd: int) -> dict[str, Control]:
 
 
 def get_control(fd: int, control: int) -> int:
-    """Value of a control. Raises ``OSError`` where it cannot be read."""
+    """Value of a control."""
     row = _ControlValue(id=control)
     fcntl.ioctl(fd, G_CTRL, row)
     return row.value
 
 
 def set_control(fd: int, control: int, value: int) -> None:
-    """Set a control.
-
-    Raises:
-        OSError: the device refuses.
-    """
+    """Set a control."""
     fcntl.ioctl(fd, S_CTRL, _ControlValue(id=control, value=value))
 
 
@@ -225,17 +205,6 @@ def fourcc_text(code: int) -> str:
     letters = [chr(code >> shift & 0x7F) for shift in (0, 8, 16, 24)]
     text = "".join(letter if letter.isprintable() else "." for letter in letters)
     return f"{text}-BE" if code & _FOURCC_BIG_ENDIAN else text
-
-
-def _fetch(fd: int, request: int, row: Any) -> bool:
-    """Whether there is such a row of a list."""
-    try:
-        fcntl.ioctl(fd, request, row)
-    except OSError as error:
-        if error.errno in (errno.EINVAL, errno.ENOTTY):
-            return False
-        raise
-    return True
 
 
 def _text(raw: bytes) -> str:

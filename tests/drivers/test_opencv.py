@@ -96,7 +96,7 @@ def test_what_cannot_be_played_is_told(video: Path, tmp_path: Path, settings: di
 def test_a_file_of_another_size_than_was_calibrated_is_refused(video: Path, tmp_path: Path) -> None:
     calibration = write_calibration(tmp_path / "large.toml", 128, 96)
     with (
-        pytest.raises(CameraError, match="64x48, but the camera was calibrated at 128x96"),
+        pytest.raises(CameraError, match="64x48, but was calibrated at 128x96"),
         opencv(video, tmp_path, calibration=calibration),
     ):
         pass

@@ -143,7 +143,7 @@ def test_unplugged_it_is_waited_for_and_found_under_another_index(machine: Machi
 def test_a_stream_that_stalls_is_told_and_started_anew(machine: Machine, tmp_path: Path) -> None:
     sensor = Sensor()
     device = machine.plug(sensor, 0)
-    with v4l2(device, tmp_path) as camera:
+    with v4l2(device, tmp_path, stall_s=1.0) as camera:
         images = iter(camera)
         before = next(images)
         sensor.stalled = True

@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.drivers import live
-from semantic_mapper.drivers.oak import camera, stream
+from semantic_mapper.drivers.oak import camera, device
 from tests.drivers.oak import host
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is lost on a busy machine, and a device is back at once."""
-    monkeypatch.setattr(live, "RETRY_S", 0.02)
-    monkeypatch.setattr(stream, "QUEUE", 64)
-    monkeypatch.setattr(stream, "STALL_S", 5.0)
+    monkeypatch.setattr(live, "FIRST_PAUSE_S", 0.02)
+    monkeypatch.setattr(live, "QUEUE", 64)
+    monkeypatch.setattr(camera, "QUEUE", 64)
     monkeypatch.setattr(camera, "ODOMETRY_WAIT_S", 20.0)
-    monkeypatch.setattr(camera, "SEARCH_S", 0.1)
+    monkeypatch.setattr(device, "SEARCH_S", 0.1)
 
 
 @pytest.fixture(scope="session")

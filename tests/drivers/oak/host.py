@@ -14,9 +14,10 @@ import depthai as dai
 import numpy as np
 from mcap.reader import make_reader
 
-from semantic_mapper.drivers.oak.camera import OakCamera
+from semantic_mapper.drivers.live import LiveCamera
+from semantic_mapper.drivers.oak.camera import open_camera
 from semantic_mapper.drivers.oak.config import Config
-from semantic_mapper.drivers.oak.stream import OdometryPorts, Sources
+from semantic_mapper.drivers.oak.device import OdometryPorts, Sources
 from semantic_mapper.types import Float64
 
 WIDTH, HEIGHT, FPS = 64, 48, 50.0
@@ -134,10 +135,10 @@ def played(
     )
 
 
-def camera(*connections: Callable[[], Sources], config: Config = CONFIG) -> OakCamera:
+def camera(*connections: Callable[[], Sources], config: Config = CONFIG) -> LiveCamera:
     """The driver's camera on these sources, one after the other; each may raise a ``CameraError``."""
     rest = list(connections)
-    return OakCamera(config, "front", connect=lambda config, on_state, search_s: rest.pop(0)())
+    return open_camera(config, "front", connect=lambda _: rest.pop(0)())
 
 
 def record(folder: Path, count: int) -> timedelta:

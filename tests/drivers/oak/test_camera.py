@@ -9,10 +9,10 @@ import depthai as dai
 import numpy as np
 import pytest
 
+from semantic_mapper.drivers import live
 from semantic_mapper.drivers.base import Camera, CameraImage
-from semantic_mapper.drivers.oak import stream
-from semantic_mapper.drivers.oak.images import MAX_DAMAGED
-from semantic_mapper.drivers.oak.stream import Sources
+from semantic_mapper.drivers.oak.camera import open_camera
+from semantic_mapper.drivers.oak.device import Sources
 from semantic_mapper.errors import CameraError
 from tests.drivers.oak import host
 from tests.drivers.oak.host import HEIGHT, PERIOD, WIDTH, depth_message, long_ago, rgb_message
@@ -131,17 +131,14 @@ def test_a_stamp_of_the_future_does_not_stop_those_after_it(calibration: Path) -
 
 def test_a_device_that_goes_away_is_waited_for(calibration: Path) -> None:
     start = long_ago(60)
-    warnings: list[str] = []
-    turned: list[float] = []
+    warnings: list[tuple[str, ...]] = []
 
     def absent() -> Sources:
-        warnings.extend(camera.warnings)
-        turned.append(camera.last_poll_time)
+        warnings.append(camera.warnings)
         raise CameraError("no OAK camera is connected")
 
     def back() -> Sources:
-        warnings.extend(camera.warnings)
-        turned.append(camera.last_poll_time)
+        warnings.append(camera.warnings)
         counted_anew = [host.stamped(rgb_message(k, start), k, start + 25 * PERIOD) for k in range(4)]
         return host.played(calibration, counted_anew, None)
 
@@ -150,34 +147,29 @@ def test_a_device_that_goes_away_is_waited_for(calibration: Path) -> None:
     with camera:
         images = take(camera, 8)
         assert camera.warnings == ()
-        turned.append(camera.last_poll_time)
-    assert 0 < turned[0] < turned[1] < turned[2], "it comes round while it waits, too"
     assert [image.seq for image in images] == [0, 1, 2, 3, 25, 26, 27, 28]  # a number for each that was lost
     assert np.diff([image.stamp_ns for image in images]).min() > 0
-    assert len(warnings) == 2 and "has gone" in warnings[0] and "no OAK camera is connected" in warnings[1]
-    assert all(host.NAME in text and "front" in text for text in warnings)
+    (gone,), (missing,) = warnings
+    assert f"{host.NAME} has gone" in gone and "no OAK camera is connected" in missing
 
 
 def test_the_same_device_is_looked_for_again(calibration: Path) -> None:
     rgb, _ = messages(2)
     asked: list[str] = []
 
-    def connect(config: host.Config, on_state: object, search_s: float) -> Sources:
+    def connect(config: host.Config) -> Sources:
         asked.append(config.device)
         if len(asked) == 2:
             camera.stop()
         return host.played(calibration, rgb, None, ends=True)
 
-    camera = host.OakCamera(host.CONFIG, "front", connect=connect)
+    camera = open_camera(host.CONFIG, "front", connect=connect)
     with camera:
-        for _ in zip(range(2), camera, strict=False):
-            pass
         list(camera)  # all that comes then is older than the last image
     assert asked == ["", "1844301000000000"]
 
 
-def test_a_stream_that_stalls_is_opened_again(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "STALL_S", 3.0)
+def test_a_stream_that_stalls_is_opened_again(calibration: Path) -> None:
     start = long_ago(60)
     warnings: list[str] = []
 
@@ -190,14 +182,14 @@ def test_a_stream_that_stalls_is_opened_again(calibration: Path, monkeypatch: py
     with camera:
         seqs = [image.seq for image in take(camera, 5)]
     assert seqs == [0, 1, 2, 40, 41]
-    assert len(warnings) == 1 and "no image for 3 s" in warnings[0]
+    assert len(warnings) == 1 and "gives no images" in warnings[0]
 
 
 def test_a_device_without_images_is_refused(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "START_S", 0.3)
+    monkeypatch.setattr(live, "START_S", 0.3)
     rgb, _ = messages(3)
     camera = host.camera(lambda: host.played(calibration, rgb, []))
-    with pytest.raises(CameraError, match=r"was opened, but it has given no image with depth for 0\.3 s"), camera:
+    with pytest.raises(CameraError, match=r"was opened, but has given no image for 0\.3 s"), camera:
         pass
 
 
@@ -210,26 +202,20 @@ def test_stop_ends_the_iteration(calibration: Path) -> None:
         assert not list(camera)
 
 
-def test_another_size_than_asked_for_is_an_error(calibration: Path) -> None:
+def test_images_that_are_not_what_was_asked_for_are_an_error(calibration: Path) -> None:
     rgb, _ = messages(1)
     config = host.Config(width=80, height=60, fps=host.FPS)
-    with (
-        host.camera(lambda: host.played(calibration, rgb, None), config=config) as camera,
-        pytest.raises(CameraError, match="64x48, but 80x60 was requested"),
-    ):
-        take(camera, 1)
-
-
-def test_depth_that_is_no_depth_is_an_error(calibration: Path) -> None:
-    rgb, _ = messages(1)
-    start = rgb[0].getTimestamp()
+    camera = host.camera(lambda: host.played(calibration, rgb, None), config=config)
+    with pytest.raises(CameraError, match="64x48, but 80x60 was requested"), camera:
+        pass
     grey = dai.ImgFrame()
     grey.setCvFrame(np.zeros((HEIGHT, WIDTH), np.uint8), dai.ImgFrame.Type.GRAY8)
+    flat = host.stamped(grey, 0, rgb[0].getTimestamp())
     with (
-        host.camera(lambda: host.played(calibration, rgb, [host.stamped(grey, 0, start)])) as camera,
         pytest.raises(CameraError, match="16 bits a pixel, got uint8"),
+        host.camera(lambda: host.played(calibration, rgb, [flat])),
     ):
-        take(camera, 1)
+        pass
 
 
 def damaged(k: int, start: timedelta) -> dai.ImgFrame:
@@ -241,19 +227,8 @@ def damaged(k: int, start: timedelta) -> dai.ImgFrame:
     return host.stamped(frame, k, start)
 
 
-def test_a_damaged_image_is_passed_over_and_told(calibration: Path) -> None:
+def test_damaged_images_are_passed_over(calibration: Path) -> None:
     start = long_ago(4)
     rgb = [rgb_message(0, start), damaged(1, start), damaged(2, start), rgb_message(3, start)]
     with host.camera(lambda: host.played(calibration, rgb, None)) as camera:
-        images = iter(camera)
-        assert [next(images).seq, next(images).seq] == [0, 3]
-
-
-def test_images_that_are_all_damaged_are_an_error(calibration: Path) -> None:
-    start = long_ago(MAX_DAMAGED)
-    rgb = [damaged(k, start) for k in range(MAX_DAMAGED)]
-    with (
-        host.camera(lambda: host.played(calibration, rgb, None)) as camera,
-        pytest.raises(CameraError, match=r"cannot be read: .*enough data"),
-    ):
-        take(camera, 1)
+        assert [image.seq for image in take(camera, 2)] == [0, 3]

@@ -151,7 +151,7 @@ def test_a_pair_that_is_not_side_by_side_and_a_film_of_another_size_are_refused(
         stereo(film.path, str(tmp_path / "turned.toml"))
     small = pairs.write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
     camera = stereo(small, pairs.write_pair(tmp_path / "pair.toml"))
-    with pytest.raises(CameraError, match="gives images of 480x180, and the pair was calibrated at 480x360"), camera:
+    with pytest.raises(CameraError, match="gives images of 480x180, and the pair was calibrated at 960x360"), camera:
         pass
 
 

@@ -314,7 +314,7 @@ def test_a_driver_that_hangs_is_told_apart_from_a_camera_that_is_waited_for(mach
         turns()  # those of before do not count
         return eventually(turns, 1.0)
 
-    with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path), beats=theirs) as node:
+    with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path, stall_s=1.0), beats=theirs) as node:
         node.until(lambda m: isinstance(m, Status) and m.state == "starting" and bool(m.degraded))
         assert goes_on(), "it waits for a camera that has never been there"
         machine.plug(sensor, 0)
