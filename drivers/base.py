@@ -109,6 +109,7 @@ class PoseSource:
     def __init__(self) -> None:
         self._warnings: tuple[str, ...] = ()
         self._counters: Counter[str] = Counter()
+        self._camera: tuple[str, CameraIntrinsics] | None = None  # the only one that is followed, where there is one
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -129,6 +130,17 @@ class PoseSource:
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose of an image, in the order of capture; None where it is not known (lost, too old): no frame then."""
         raise NotImplementedError
+
+    def _expect_one_camera(self, image: CameraImage) -> None:
+        """Raise ``CameraError`` where an image is of another camera or size than the first one."""
+        camera = (image.camera_id, image.intrinsics)
+        self._camera = self._camera or camera
+        if camera != self._camera:
+            raise CameraError(
+                f"odometry follows camera '{self._camera[0]}' at {self._camera[1].width}x{self._camera[1].height}; an "
+                f"image of '{image.camera_id}' at {image.intrinsics.width}x{image.intrinsics.height} came: give each "
+                "camera a pose source of its own, and do not change its resolution"
+            )
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
         """New poses of past images where a loop was closed, once after each change; to be called after each ``pose``.

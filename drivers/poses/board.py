@@ -26,11 +26,7 @@ MIN_FLIP_RATIO = 1.5  # a flat board's mirrored pose must fit so much worse
 
 
 def make_board(config: BoardPoses) -> Any:
-    """The cv2.aruco board of a config; ``generateImage`` of it is what to print.
-
-    Raises:
-        ConfigError: OpenCV has no such dictionary, or it holds too few markers.
-    """
+    """The cv2.aruco board of a config; ``ConfigError`` where OpenCV has no such dictionary, or one too small."""
     name = config.dictionary or ("DICT_5X5_100" if config.pattern == "charuco" else "DICT_APRILTAG_36h11")
     known = {n: v for n, v in vars(cv2.aruco).items() if n.startswith("DICT_")}
     if name not in known:
@@ -80,14 +76,7 @@ def sheet_png(config: BoardPoses) -> bytes:
 
 
 class BoardFinder:
-    """Finds the corners of a board in images; also where calibration looks for them.
-
-    Args:
-        config: The board.
-
-    Raises:
-        ConfigError: a board that cannot be.
-    """
+    """Finds the corners of a board in images; ``ConfigError`` where there can be no such board."""
 
     def __init__(self, config: BoardPoses) -> None:
         self._board = make_board(config)
@@ -107,27 +96,21 @@ class BoardFinder:
             corners, ids, _, _ = self._detector.detectBoard(gray)
         else:
             corners, ids, _ = self._detector.detectMarkers(gray)
-        if ids is None or not len(ids):
+        points = pixels = None
+        if ids is not None and len(ids):
+            points, pixels = self._board.matchImagePoints(corners, ids)
+        if points is None or pixels is None:  # no markers, or of other boards
             return np.zeros((0, 3)), np.zeros((0, 2))
-        points, pixels = self._board.matchImagePoints(corners, ids)
-        if points is None or not len(points):
-            return np.zeros((0, 3)), np.zeros((0, 2))  # markers of other boards
         return np.asarray(points, np.float64).reshape(-1, 3), np.asarray(pixels, np.float64).reshape(-1, 2)
 
 
 class BoardPoseSource(PoseSource):
-    """Finds the board in every image.
-
-    Args:
-        config: The board, and where it is.
+    """Finds the board in every image; ``ConfigError`` where there can be no such board.
 
     Attributes:
         counters: Images without a pose: "no_board" (too few corners seen), "inexact" (reprojection error), "ambiguous"
             (the mirrored pose fits nearly as well), "uncertain" (the corners leave the position open:
             the board is too small in the image).
-
-    Raises:
-        ConfigError: a board that cannot be.
     """
 
     def __init__(self, config: BoardPoses) -> None:
@@ -146,8 +129,9 @@ class BoardPoseSource(PoseSource):
             return self._refuse("no_board", "its corners allow no pose")
         (error_px, pose), others = solutions[0], solutions[1:]
         if error_px > MAX_ERROR_PX:
-            detail = f"its corners are off by {error_px:.1f} px; check its sizes and the camera's"
-            return self._refuse("inexact", detail)
+            return self._refuse(
+                "inexact", f"its corners are off by {error_px:.1f} px; check its sizes and the camera's"
+            )
         corner_px = max(error_px, MIN_CORNER_SIGMA_PX)
         if others and others[0][0] < MIN_FLIP_RATIO * corner_px:
             return self._refuse("ambiguous", "its mirrored pose fits as well; show it larger, or from the side")

@@ -162,8 +162,7 @@ class KeyframeGraph:
         """With more than ``MAX_KEYFRAMES``, let the younger of the two go that are nearest to each other, never the
         newest, which is in use. Its edges become those of the other one, as both stand now.
 
-        Returns:
-            Numbers of the one that has gone and of its heir, and T_heir_gone (4, 4).
+        Returns: numbers of the one that has gone and of its heir, and T_heir_gone (4, 4).
         """
         if len(self.frames) <= MAX_KEYFRAMES:
             return None
@@ -258,8 +257,7 @@ class LoopCloser:
     def work(self, optimize: bool) -> Mapping[int, Float64] | None:
         """Optimise, if allowed and there is something new, else look at one candidate.
 
-        Returns:
-            New poses of the keyframes by number, for the graph to be moved to; None where they stay.
+        Returns: new poses of the keyframes by number, for the graph to be moved to; None where they stay.
         """
         frames = self._graph.frames
         if self._new and optimize:
@@ -329,18 +327,15 @@ class LoopCloser:
             moved = {"moved_m": round(moved_m, 3), "turned_deg": round(turned_deg, 1)}
             _log.info("loop_refused", keyframes=(edge.a, edge.b), **moved)
             return
-        if moved_m < _SMALL_M and turned_deg < _SMALL_DEG:
-            self._take(edge)
-            return
-        kept = [e for e in self._waiting if e.a in poses and e.b in poses and edge.b - e.b <= _PATIENCE]
-        self._counters["loops_refused"] += len(self._waiting) - len(kept)
-        other = next((e for e in kept if e.b != edge.b and self._agree(e, edge)), None)
-        if other is None:
-            kept.append(edge)
-        else:
-            self._take(edge, other)
-            kept.remove(other)
-        self._waiting = kept
+        taken = [edge]
+        if moved_m >= _SMALL_M or turned_deg >= _SMALL_DEG:
+            kept = [e for e in self._waiting if e.a in poses and e.b in poses and edge.b - e.b <= _PATIENCE]
+            self._counters["loops_refused"] += len(self._waiting) - len(kept)
+            other = next((e for e in kept if e.b != edge.b and self._agree(e, edge)), None)
+            taken = [] if other is None else [edge, other]
+            self._waiting = [*kept, edge] if other is None else [e for e in kept if e is not other]
+        self._graph.edges.extend(taken)
+        self._new.extend(taken)
 
     def _agree(self, one: Edge, other: Edge) -> bool:
         """Whether two loops move the same place to the same place."""
@@ -348,10 +343,6 @@ class LoopCloser:
         motions = [poses[e.a] @ e.T_a_b @ invert_pose(poses[e.b]) for e in (one, other)]
         moved_m, turned_deg = apart(motions[0] @ poses[other.b], motions[1] @ poses[other.b])
         return moved_m < _AGREE_M and turned_deg < _AGREE_DEG
-
-    def _take(self, *edges: Edge) -> None:
-        self._graph.edges.extend(edges)
-        self._new.extend(edges)
 
     def _close(self) -> Mapping[int, Float64] | None:
         before, new = self._graph.poses, [e for e in self._new if e in self._graph.edges]
@@ -398,12 +389,7 @@ class PoseTrail:
                 given.keyframe, given.T_keyframe_camera = heir, T_heir_gone @ given.T_keyframe_camera
 
     def correction(self, T_world_keyframe: Mapping[int, Float64], final: bool) -> CorrectedWorld | None:
-        """All poses as the keyframes stand now, if that moves one visibly.
-
-        Args:
-            T_world_keyframe: (4, 4) of the keyframes that are kept, by number.
-            final: No more poses will come.
-        """
+        """All poses as the keyframes, (4, 4) by number, stand now, if that moves one visibly; ``final``: once more."""
         if not self._given:
             return None
         before = np.array([g.T_world_camera for g in self._given])

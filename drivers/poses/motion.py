@@ -27,7 +27,7 @@ class StampedPose:
 
 
 class PoseTrack:
-    """The last poses of something that moves, at any time in between. Not for several threads at once.
+    """The last ``keep`` poses of something that moves, at any time in between. Not for several threads at once.
 
     Args:
         keep: Samples kept.
@@ -53,12 +53,8 @@ class PoseTrack:
         return True
 
     def at(self, stamp_ns: int) -> StampedPose | Miss:
-        """The pose at a moment, or why it is missing.
-
-        Returns:
-            "empty": no samples; "before": earlier than the first one that is kept; "gap": between two that are too far
-            apart; "stale": too long after the last one.
-        """
+        """The pose at a moment, or why it is missing: "empty": no samples; "before": earlier than the first one that
+        is kept; "gap": between two that are too far apart; "stale": too long after the last one."""
         if not self._samples:
             return "empty"
         stamps = [s.stamp_ns for s in self._samples]
@@ -77,9 +73,8 @@ class PoseTrack:
 
     def _ahead(self, stamp_ns: int) -> StampedPose | Miss:
         last = self._samples[-1]
-        if stamp_ns - last.stamp_ns > self._max_ahead_ns:
-            return "stale"
-        if len(self._samples) < 2 or last.stamp_ns - self._samples[-2].stamp_ns > self._max_gap_ns:
+        alone = len(self._samples) < 2 or last.stamp_ns - self._samples[-2].stamp_ns > self._max_gap_ns
+        if alone or stamp_ns - last.stamp_ns > self._max_ahead_ns:
             return "stale"  # one pose alone shows no motion
         # From poses that are not close together: of two that are, the noise would be taken for motion.
         earlier = [s for s in self._samples if last.stamp_ns - s.stamp_ns <= self._max_gap_ns][:-1]

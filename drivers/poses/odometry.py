@@ -13,8 +13,8 @@ Same images, same poses and corrections, bit for bit.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -81,22 +81,20 @@ _PAUSE_NS = 2_000_000_000  # between two corrections: each is work for the map
 _log = get_logger(__name__)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class _View:
-    """An image, thinned out; its corners are found when they are needed."""
+    """An image, thinned out."""
 
     stamp_ns: int
     rgb: UInt8
     depth_m: Float32
     intrinsics: CameraIntrinsics
     levels: tuple[Level, ...]
-    found: Features | None = None
 
-    @property
+    @cached_property
     def features(self) -> Features:
-        if self.found is None:
-            self.found = find_features(self.rgb, self.depth_m, FEATURES)
-        return self.found
+        """Its corners, found when they are needed."""
+        return find_features(self.rgb, self.depth_m, FEATURES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,9 +110,6 @@ class _Found:
 class OdometryPoseSource(PoseSource):
     """Follows one RGB-D camera. Not for several threads at once, but any may read ``counters`` and ``warnings``.
 
-    Args:
-        config: How.
-
     Attributes:
         counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made;
             "new_sessions" after the first; with ``loop_closure`` "loops_closed" and "loops_refused".
@@ -123,7 +118,6 @@ class OdometryPoseSource(PoseSource):
     def __init__(self, config: OdometryPoses) -> None:
         super().__init__()
         self._config = config
-        self._camera: tuple[str, CameraIntrinsics] | None = None
         # That of another process, or of this one after it, is another world.
         self._world = time.monotonic_ns() if can_be_found(config) else 0
         self._corrected: CorrectedWorld | None = None
@@ -145,12 +139,13 @@ class OdometryPoseSource(PoseSource):
         self._unsure_m = 0.0  # how far the last pose may be off along what no point shows
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
-        """Pose of the next image; None while lost.
-
-        Raises:
-            CameraError: the camera has no depth, or images of another camera come in between.
-        """
-        self._check(image)
+        """Pose of the next image; None while lost. ``CameraError``: it has no depth, or is of another camera."""
+        if image.depth_m is None and self._camera is None:
+            raise CameraError(
+                f"camera '{image.camera_id}' has no depth: from its images alone the scale of its motion cannot be "
+                f"known, and no map be made; {WAYS_OUT}"
+            )
+        self._expect_one_camera(image)
         self._close_loops(image.stamp_ns)
         view = self._view(image)
         if view is None:
@@ -183,11 +178,6 @@ class OdometryPoseSource(PoseSource):
 
         The motion has changed at once, or the view lies on nothing. Sliding along a surface shows in a fit that is
         worse than those before; a pattern that repeats itself, in a motion that corners do not show.
-
-        Args:
-            view: The image.
-            found: Where it was found so far.
-            expected: Poses by corners and the last motion.
         """
         results = [] if found is None else [found]
         last = self._past[-1]
@@ -226,43 +216,24 @@ class OdometryPoseSource(PoseSource):
         if poses is None:
             return
         self._closed_ns = self._closed_ns if stamp_ns is None else stamp_ns
-        self._past = [replace(past, T=self._moved(past.T, poses)) for past in self._past]
+        nearest = [self._graph.near(past.T, 1)[0] for past in self._past]
+        moves = [poses[k.number] @ invert_pose(k.target.T_world_camera) for k in nearest]
+        self._past = [replace(past, T=move @ past.T) for move, past in zip(moves, self._past, strict=True)]
         self._graph.move(poses)
         self._corrected = self._trail.correction(self._graph.poses, final=False) or self._corrected
 
-    def _moved(self, T_world_camera: Float64, poses: Mapping[int, Float64]) -> Float64:
-        nearest = self._graph.near(T_world_camera, 1)[0]
-        return poses[nearest.number] @ invert_pose(nearest.target.T_world_camera) @ T_world_camera
-
-    def _check(self, image: CameraImage) -> None:
-        camera = (image.camera_id, image.intrinsics)
-        if self._camera is None:
-            if image.depth_m is None:
-                raise CameraError(
-                    f"camera '{image.camera_id}' has no depth: from its images alone the scale of its motion cannot be "
-                    f"known, and no map be made; {WAYS_OUT}"
-                )
-            self._camera = camera
-        if camera != self._camera:
-            raise CameraError(
-                f"odometry follows camera '{self._camera[0]}' at {self._camera[1].width}x{self._camera[1].height}; an "
-                f"image of '{image.camera_id}' at {image.intrinsics.width}x{image.intrinsics.height} came: give each "
-                "camera a pose source of its own, and do not change its resolution"
-            )
-
     def _view(self, image: CameraImage) -> _View | None:
         """None without enough depth."""
-        stride = max(1, round(image.intrinsics.width / WIDTH))
         if image.depth_m is None:
             return None
+        stride = max(1, round(image.intrinsics.width / WIDTH))
         intrinsics = thin_intrinsics(image.intrinsics, stride, stride // 2)
         depth = thin_depth(image.depth_m, stride, DEPTH_MAX_M)
         if float((depth > 0).mean()) < _LEAST_DEPTH:
             return None
         size = (intrinsics.width, intrinsics.height)
         rgb = np.asarray(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        levels = make_levels(depth, intrinsics)
-        return _View(image.stamp_ns, rgb, depth, intrinsics, levels)
+        return _View(image.stamp_ns, rgb, depth, intrinsics, make_levels(depth, intrinsics))
 
     def _begin(self, view: _View) -> PoseEstimate:
         pose = matrix(self._config.T_world_start)
@@ -331,17 +302,8 @@ class OdometryPoseSource(PoseSource):
     def _go_on(
         self, view: _View, pose: Float64, flat: tuple[Float64, Float64], guess: Float64
     ) -> tuple[Float64, float]:
-        """Where the points show nothing: turn and position there as corners of the last image say, else as guessed.
-
-        Args:
-            view: The image.
-            pose: As aligned.
-            flat: Projections on turns and shifts of the camera, in its own axes, of which no point shows anything.
-            guess: What the alignment began with.
-
-        Returns:
-            The pose, and how far it may be off in these directions, metres.
-        """
+        """The aligned pose with the turns and shifts that no point shows (projections ``flat``, in the camera's axes)
+        as corners of the last image say, else as guessed; and how far it may be off there, metres."""
         corners = None if self._lost else self._corner_motion(view)
         last = self._past[-1].T
         wanted = guess if corners is None else last @ corners

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import Self
 
 import msgspec
 import numpy as np
@@ -28,6 +28,8 @@ FAR = 2.0  # times what is allowed: a jump, whatever comes after it
 # A camera's first frames are held back until this many of their poses in a row agree with each other: a single wrong
 # pose, such as a robot's before it knows where it is, is no place to continue from.
 INIT_CONSENSUS = 5
+
+Judged = list[tuple[PosedFrame, str, str]]  # frames in the order of capture: why each is left out (counter, sentence)
 
 _log = get_logger(__name__)
 
@@ -71,6 +73,8 @@ class PosedCamera:
         self._last_ns: dict[str, int] = {}
         self._trouble = ""
         self._corrected: CorrectedWorld | None = None
+        self.can_wait = camera.can_wait
+        self.stop = camera.stop
 
     @property
     def info(self) -> StreamInfo:
@@ -92,11 +96,6 @@ class PosedCamera:
         return (*self._camera.warnings, *self._poses.warnings, *((self._trouble,) if self._trouble else ()))
 
     @property
-    def can_wait(self) -> bool:
-        """The camera's."""
-        return self._camera.can_wait
-
-    @property
     def last_poll_time(self) -> float:
         """The camera's; it comes round no more while a pose is awaited that never comes."""
         return self._camera.last_poll_time
@@ -115,10 +114,6 @@ class PosedCamera:
             self._camera.__exit__(*error)
         finally:
             self._poses.__exit__(*error)
-
-    def stop(self) -> None:
-        """End the iteration soon, from any thread or signal handler."""
-        self._camera.stop()
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
         """As of ``PoseSource``, with poses of the camera; frames given from then on are of the corrected world."""
@@ -141,11 +136,25 @@ class PosedCamera:
             world, outlier_filter = self._filters.get(image.camera_id, (0, None))
             if outlier_filter is None or world != estimate.world:
                 if outlier_filter is not None:
-                    yield from self._passed(outlier_filter.abandon())
+                    why = "the camera began another world before its first poses were sure"
+                    yield from self._passed(outlier_filter.give_up(why))
                 needed = 1 if estimate.source in EXACT else INIT_CONSENSUS
                 outlier_filter = PoseOutlierFilter(self._checks.max_speed_m_s, needed)
                 self._filters[image.camera_id] = estimate.world, outlier_filter
-            yield from self._passed(outlier_filter.take(_frame(image, estimate)))
+            frame = PosedFrame(
+                stamp_ns=image.stamp_ns,
+                seq=image.seq,
+                camera_id=image.camera_id,
+                rgb=image.rgb,
+                depth_m=image.depth_m,
+                label=None,
+                intrinsics=image.intrinsics,
+                T_world_camera=np.asarray(estimate.T_world_camera, np.float64),
+                pose_source=estimate.source,
+                pose_sigma=float(estimate.sigma),
+                world=estimate.world,
+            )
+            yield from self._passed(outlier_filter.take(frame))
         for _, outlier_filter in self._filters.values():
             yield from self._passed(outlier_filter.end())
 
@@ -179,14 +188,14 @@ class PosedCamera:
             return self._refuse(image, "not_rotation", f"its pose has an uncertainty of {estimate.sigma} m")
         return estimate
 
-    def _passed(self, result: FilterResult) -> Iterator[PosedFrame]:
-        for frame, reason, why in result.refused:
-            self._refuse(frame, reason, why)
-        if result.passed:
-            self._trouble = ""
-        for frame in result.passed:
-            self._counts["frames"] += 1
-            yield frame
+    def _passed(self, judged: Iterable[tuple[PosedFrame, str, str]]) -> Iterator[PosedFrame]:
+        for frame, reason, why in judged:
+            if reason:
+                self._refuse(frame, reason, why)
+            else:
+                self._trouble = ""
+                self._counts["frames"] += 1
+                yield frame
 
     def _refuse(self, image: CameraImage | PosedFrame, reason: str, detail: str) -> None:
         """Count it; log it at each power of two."""
@@ -197,36 +206,14 @@ class PosedCamera:
             _log.warning("image_left_out", reason=reason, count=count, detail=self._trouble)
 
 
-def _frame(image: CameraImage, estimate: PoseEstimate) -> PosedFrame:
-    return PosedFrame(
-        stamp_ns=image.stamp_ns,
-        seq=image.seq,
-        camera_id=image.camera_id,
-        rgb=image.rgb,
-        depth_m=image.depth_m,
-        label=None,
-        intrinsics=image.intrinsics,
-        T_world_camera=np.asarray(estimate.T_world_camera, np.float64),
-        pose_source=estimate.source,
-        pose_sigma=float(estimate.sigma),
-        world=estimate.world,
-    )
-
-
-class FilterResult(NamedTuple):
-    """What becomes of a frame, and of those that were held back before it."""
-
-    passed: list[PosedFrame]  # frames to give, in the order of capture
-    # frames to leave out, each with the counter's name and why: "outliers" cannot have been reached from poses that are
-    # believed; "uninitialized" did not agree with those after it while none was believed
-    refused: list[tuple[PosedFrame, str, str]]
-
-
 class PoseOutlierFilter:
     """Which poses of one camera are believed: the first ones once some in a row agree, then those within reach.
 
     What is within reach grows with the time since the last pose that passed. A source that has jumped far and
     continues from there must not pass because of that; one that jumps back may.
+
+    Frames are refused as "outliers", which cannot have been reached from poses that are believed, or "uninitialized",
+    which did not agree with those after them while none was believed; "" = it passes.
 
     Args:
         max_speed_m_s: Of the camera.
@@ -238,44 +225,45 @@ class PoseOutlierFilter:
         self._needed = needed
         self._held: list[PosedFrame] = []  # first frames, each of which can have been reached from the one before
         self._contradicted = False  # others were given up before these
-        self._last: StampedPose | None = None  # that was believed; None while first frames are held back
+        self._last: StampedPose | None = None  # the last one that passed, or is held back
         self._elsewhere: StampedPose | None = None  # the last refused pose of those that go on from a far jump
 
-    def take(self, frame: PosedFrame) -> FilterResult:
-        """Judge the next frame."""
+    def take(self, frame: PosedFrame) -> Judged:
+        """Judge the next frame, and with it those that were held back."""
         sample = StampedPose(frame.stamp_ns, frame.T_world_camera)
-        if self._last is not None:
+        if not self._needed and self._last is not None:
             why = self._refusal(self._last, sample)
-            return FilterResult([], [(frame, "outliers", why)]) if why else FilterResult([frame], [])
-        before = self._held[-1] if self._held else None
-        jump = before is not None and self._jump(StampedPose(before.stamp_ns, before.T_world_camera), sample)
-        refused = self._give_up(f"the first poses do not agree with each other: {jump}") if jump else []
+            return [(frame, "outliers" if why else "", why)]
+        jump = self._jump(self._last, sample) if self._held and self._last is not None else ""
+        refused = self.give_up(f"the first poses do not agree with each other: {jump}") if jump else []
         self._held.append(frame)
+        self._last = sample
         if len(self._held) < self._needed:
-            return FilterResult([], refused)
-        passed, self._held, self._last = self._held, [], sample
-        return FilterResult(passed, refused)
+            return refused
+        self._needed = 0
+        return refused + self._pass_held()
 
     def follow(self, motion: Float64) -> None:
         """The world of the poses to come is another one: ``motion`` (4, 4) takes the last pose there."""
-        if self._last is not None:
+        if self._last is not None and not self._needed:
             self._last = replace(self._last, T=motion @ self._last.T)
         if self._elsewhere is not None:
             self._elsewhere = replace(self._elsewhere, T=motion @ self._elsewhere.T)
 
-    def end(self) -> FilterResult:
+    def end(self) -> Judged:
         """No more will come: what is held back passes where no pose has contradicted it."""
         if self._contradicted:
-            return FilterResult([], self._give_up("too few of the last poses agree with each other"))
-        return FilterResult(self._held, [])
+            return self.give_up("too few of the last poses agree with each other")
+        return self._pass_held()
 
-    def abandon(self) -> FilterResult:
-        """The world of the poses has ended: what is held back is left out."""
-        return FilterResult([], self._give_up("the camera began another world before its first poses were sure"))
-
-    def _give_up(self, why: str) -> list[tuple[PosedFrame, str, str]]:
+    def give_up(self, why: str) -> Judged:
+        """What is held back is left out."""
         held, self._held, self._contradicted = self._held, [], True
         return [(frame, "uninitialized", why) for frame in held]
+
+    def _pass_held(self) -> Judged:
+        held, self._held = self._held, []
+        return [(frame, "", "") for frame in held]
 
     def _refusal(self, last: StampedPose, sample: StampedPose) -> str:
         """Why a pose is refused; empty where it passes."""

@@ -80,12 +80,23 @@ class TopicPoseSource(PoseSource):
         return tuple(text for text in (self._message_trouble, self._image_trouble) if text)
 
     def __enter__(self) -> Self:
-        """Connect.
-
-        Raises:
-            CameraError: not an endpoint.
-        """
-        socket = self._connect()
+        """Connect; ``CameraError`` where it is not an endpoint."""
+        socket = zmq.Context.instance().socket(zmq.SUB)
+        try:
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.setsockopt(zmq.RCVHWM, 1000)
+            socket.setsockopt(zmq.MAXMSGSIZE, MAX_PART_BYTES)
+            socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+            socket.subscribe(self._config.topic.encode())
+            if self._identity is not None:
+                secure_client(socket, self._identity)
+            socket.connect(self._config.endpoint)
+        except (zmq.ZMQError, TransportError) as error:
+            socket.close(linger=0)
+            raise CameraError(
+                f"pose topic {self._config.endpoint}: cannot be subscribed to: {error}; endpoints read ipc://PATH or "
+                "tcp://HOST:PORT"
+            ) from error
         self._closed.clear()
         self._thread = threading.Thread(target=self._run, args=(socket,), name="pose topic", daemon=True)
         self._thread.start()
@@ -95,7 +106,6 @@ class TopicPoseSource(PoseSource):
         self._closed.set()
         if self._thread is not None:
             self._thread.join()
-            self._thread = None
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose at the image's stamp; None, with the reason in ``warnings``, where the messages do not give it."""
@@ -122,25 +132,6 @@ class TopicPoseSource(PoseSource):
         self._counters[found] += 1
         return None
 
-    def _connect(self) -> zmq.Socket[bytes]:
-        socket = zmq.Context.instance().socket(zmq.SUB)
-        try:
-            socket.setsockopt(zmq.LINGER, 0)
-            socket.setsockopt(zmq.RCVHWM, 1000)
-            socket.setsockopt(zmq.MAXMSGSIZE, MAX_PART_BYTES)
-            socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
-            socket.subscribe(self._config.topic.encode())
-            if self._identity is not None:
-                secure_client(socket, self._identity)
-            socket.connect(self._config.endpoint)
-        except (zmq.ZMQError, TransportError) as error:
-            socket.close(linger=0)
-            raise CameraError(
-                f"pose topic {self._config.endpoint}: cannot be subscribed to: {error}; endpoints read ipc://PATH or "
-                "tcp://HOST:PORT"
-            ) from error
-        return socket
-
     def _run(self, socket: zmq.Socket[bytes]) -> None:
         with socket:
             while not self._closed.is_set():
@@ -148,7 +139,7 @@ class TopicPoseSource(PoseSource):
                     self._take(*receive_bounded(socket, max_parts=2, max_bytes=2 * MAX_POSE_BYTES))
 
     def _take(self, parts: list[bytes], trouble: str) -> None:
-        """A message, or why it is not kept as a whole."""
+        """A message, or why it is not kept as a whole; one that cannot be used costs itself and nothing else."""
         try:
             if trouble:
                 raise CodecError(trouble)
@@ -171,7 +162,7 @@ class TopicPoseSource(PoseSource):
             self._changed.notify_all()
 
     def _drop(self, reason: str, detail: str) -> None:
-        """A message that cannot be used costs itself and nothing else; logged at each power of two."""
+        """Count a message that cannot be used; log it at each power of two."""
         self._message_trouble = f"a message of {self._config.endpoint} was dropped: {detail}"
         self._counters[reason] += 1
         count = self._counters[reason]

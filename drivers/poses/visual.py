@@ -20,7 +20,6 @@ from semantic_mapper.bundle.scale import ScaleEstimator, floor_height
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import VisualPoses, gives_metres, matrix
-from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import camera_matrix, interpolate_pose, invert_pose, transform
 from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.localization.features import match_features, pose_from_points
@@ -69,7 +68,6 @@ class VisualPoseSource(PoseSource):
         super().__init__()
         self._config = config
         self._reference = reference
-        self._camera: tuple[str, CameraIntrinsics] | None = None
         self._odometry: VisualOdometry | None = None
         self._checks = PictureChecker()
         self._estimator = ScaleEstimator()
@@ -114,7 +112,8 @@ class VisualPoseSource(PoseSource):
         Raises:
             CameraError: images of another camera or size come in between.
         """
-        odometry = self._follow(image)
+        self._expect_one_camera(image)
+        odometry = self._odometry = self._odometry or VisualOdometry(image.intrinsics, self._counters)
         reference = None if self._reference is None else self._reference.pose(image)
         self._checks.look(image.rgb)
         was_lost = odometry.lost
@@ -140,19 +139,6 @@ class VisualPoseSource(PoseSource):
             self._way += float(np.linalg.norm(pose[:3, 3] - self._last[:3, 3]))
         self._last = pose
         return PoseEstimate(pose, "visual", _DRIFT * self._way)
-
-    def _follow(self, image: CameraImage) -> VisualOdometry:
-        camera = (image.camera_id, image.intrinsics)
-        if self._odometry is None:
-            self._camera = camera
-            self._odometry = VisualOdometry(image.intrinsics, self._counters)
-        if camera != self._camera:
-            raise CameraError(
-                f"visual odometry follows one camera at one size; an image of '{image.camera_id}' at "
-                f"{image.intrinsics.width}x{image.intrinsics.height} came in between: give each camera a pose source "
-                "of its own, and do not change its resolution"
-            )
-        return self._odometry
 
     def _scaled(self, odometry: VisualOdometry, pose: Float64, reference: Float64 | None) -> Float64:
         """The pose once what is known of the scale, and of where the world begins, is brought into the map."""
@@ -264,8 +250,7 @@ class VisualOdometry:
     def rescale(self, factor: float, T_before: Float64, T_after: Float64, *, everything: bool) -> None:
         """Change the unit: what was at pose ``T_before`` is at ``T_after``, distances from it times ``factor``.
 
-        Args:
-            everything: Places for finding back, too; those that the map has left stay where they are otherwise.
+        ``everything``: places for finding back, too, that the map has left; they stay where they are otherwise.
         """
 
         def moved(pose: Float64) -> Float64:
@@ -289,8 +274,7 @@ class VisualOdometry:
     def floor_below(self, up: Float64) -> float | None:
         """How far the cameras of the last keyframes are above the floor that they see; None where they see none.
 
-        Args:
-            up: (3,) unit direction in the present world.
+        ``up``: (3,) unit direction in the present world.
         """
         if not self._map.points:
             return None
@@ -369,8 +353,7 @@ class VisualOdometry:
     def _place(self, image: UInt8, tracks: Tracks, pose: Float64) -> _Place:
         mask, points = self._map.known(tracks)
         kept, descriptors = _describe(image, tracks.pixels[mask])
-        ids, pixels = tracks.ids[mask][kept], tracks.pixels[mask][kept]
-        return _Place(pose, Tracks(ids, pixels), points[kept], descriptors)
+        return _Place(pose, Tracks(tracks.ids[mask][kept], tracks.pixels[mask][kept]), points[kept], descriptors)
 
     def _relocalise(self, image: UInt8) -> Float64 | None:
         """Look for the keyframes that a lost picture resembles; go on from the best one."""
