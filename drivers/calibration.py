@@ -100,30 +100,27 @@ def load_calibration(path: Path) -> CameraIntrinsics:
     Raises:
         ConfigError: missing, of another form, or with impossible values.
     """
-    k = _load_yaml(path) if path.suffix.lower() in _YAML else _intrinsics(_load_file(path), path)
-    if not (0 < k.cx < k.width and 0 < k.cy < k.height):
-        raise ConfigError(
-            f"{path}: the principal point ({k.cx:g}, {k.cy:g}) is outside of the {k.width}x{k.height} image"
-        )
-    return k
+    file = None if path.suffix.lower() in _YAML else _load_file(path)
+    try:
+        k = _load_yaml(path) if file is None else _intrinsics(file)
+        if not (0 < k.cx < k.width and 0 < k.cy < k.height):
+            raise ConfigError(f"the principal point ({k.cx:g}, {k.cy:g}) is outside of the {k.width}x{k.height} image")
+        return k
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (FrameError, YAMLError, ValueError, RecursionError) as error:  # ValueError: ConfigError, UTF-8, msgspec
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(f"{path}: {reason}" + (f"; {WANTED}" if file is None else "")) from error
 
 
 def load_mount(path: Path) -> Float64 | None:
-    """T_rig_camera (4, 4) of a calibration file; None where it has none.
-
-    Raises:
-        ConfigError: see ``load_calibration``, or the matrix is no rigid transform.
-    """
+    """T_rig_camera (4, 4) of a calibration file; None where it has none. ``ConfigError`` as of ``load_calibration``."""
     rows = None if path.suffix.lower() in _YAML else _load_file(path).T_rig_camera
     return None if rows is None else rigid_matrix(rows, f"{path}: T_rig_camera")
 
 
 def rigid_matrix(rows: Matrix, where: str) -> Float64:
-    """Rows -> (4, 4).
-
-    Raises:
-        ConfigError: no rigid transform.
-    """
+    """Rows -> (4, 4); ``ConfigError`` where they are no rigid transform."""
     T = np.array(rows, np.float64)
     try:
         check_pose(T, where)
@@ -135,16 +132,13 @@ def rigid_matrix(rows: Matrix, where: str) -> Float64:
 def save_calibration(
     path: Path, measured: CameraIntrinsics, T_rig_camera: Float64 | None, about: Mapping[str, str | float]
 ) -> None:
-    """Write a calibration file, TOML, that reads back to the same numbers.
+    """Write a calibration file, TOML, that reads back to the same numbers; ``OSError`` where it cannot be written.
 
     Args:
         path: Replaced if it is there.
         measured: With distortion.
         T_rig_camera: (4, 4) where the camera is on a rig.
         about: When, how, how well: for people.
-
-    Raises:
-        OSError: it cannot be written.
     """
     lines = _lens_lines(measured)
     if isinstance(measured, FisheyeIntrinsics):
@@ -170,18 +164,12 @@ def load_stereo(path: Path) -> StereoCalibration:
     except ConfigError as error:
         raise ConfigError(f"{error}; `semantic-mapper calibrate --stereo` makes the file of a pair") from error
     if (left.width, left.height) != (right.width, right.height):
-        raise ConfigError(
-            f"{path}: the left images are {left.width}x{left.height}, the right ones {right.width}x{right.height}"
-        )
+        raise ConfigError(f"{path}: the left and the right images have different sizes")
     return StereoCalibration(left, right, rigid_matrix(file.T_right_left, f"{path}: T_right_left"), file.swapped)
 
 
 def save_stereo(path: Path, pair: StereoCalibration, about: Mapping[str, str | float]) -> None:
-    """Write the file of a pair, TOML, that reads back to the same numbers.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the file of a pair, TOML, that reads back to the same numbers; ``OSError`` where it cannot be written."""
     lines = [f"swapped = {str(pair.swapped).lower()}", *_matrix_lines("T_right_left", pair.T_right_left)]
     _write(path, [*lines, "", "[left]", *_lens_lines(pair.left), "", "[right]", *_lens_lines(pair.right)], about)
 
@@ -204,12 +192,7 @@ def _write(path: Path, lines: list[str], about: Mapping[str, str | float]) -> No
 
 
 def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraIntrinsics | None:
-    """The calibration that a driver was given; None where the user wants images for calibrating.
-
-    Args:
-        path: Of the file; empty = none.
-        uncalibrated: Whether the user wants images without one.
-        camera: For the message.
+    """The calibration that a driver was given as a file; None where the user wants images for calibrating.
 
     Raises:
         CameraError: neither, or both; says the ways out.
@@ -269,15 +252,11 @@ class Rectifier:
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _intrinsics(file: CalibrationFile, path: Path) -> CameraIntrinsics:
-    try:
-        if not file.fisheye and len(file.distortion) in COEFFICIENTS:
-            return CameraIntrinsics(file.fx, file.fy, file.cx, file.cy, file.width, file.height, file.distortion)
-        model = "fisheye" if file.fisheye else "opencv"
-        k = (file.fx, file.fy, file.cx, file.cy)
-        return lens_intrinsics(model, file.distortion, k, (file.width, file.height))
-    except (ConfigError, FrameError) as error:
-        raise ConfigError(f"{path}: {error}") from error
+def _intrinsics(file: CalibrationFile) -> CameraIntrinsics:
+    k, size = (file.fx, file.fy, file.cx, file.cy), (file.width, file.height)
+    if not file.fisheye and len(file.distortion) in COEFFICIENTS:
+        return CameraIntrinsics(*k, *size, file.distortion)
+    return lens_intrinsics("fisheye" if file.fisheye else "opencv", file.distortion, k, size)
 
 
 def _load_file(path: Path) -> CalibrationFile:
@@ -289,34 +268,16 @@ def _load_file(path: Path) -> CalibrationFile:
 # OpenCV's FileStorage, and Kalibr's camera chain.
 
 _Side = Annotated[int, msgspec.Meta(ge=1, le=1 << 14)]
-_Nine = Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)]
-
-
-class _Nines(msgspec.Struct):
-    data: _Nine
-
-
-class _Numbers(msgspec.Struct):
-    data: list[float]
+_MESSAGE = {"width": "image_width", "height": "image_height", "k": "camera_matrix", "d": "distortion_coefficients"}
 
 
 class _CameraInfo(msgspec.Struct):
-    """As ``camera_calibration`` and ``camera_info_manager`` write it."""
+    """ROS's file; in the message keys are shorter (``_MESSAGE``), in ROS 1 with capitals."""
 
     image_width: _Side
     image_height: _Side
-    camera_matrix: _Nines
-    distortion_coefficients: _Numbers
-    distortion_model: str = ""
-
-
-class _CameraInfoMessage(msgspec.Struct):
-    """As the message is printed."""
-
-    width: _Side
-    height: _Side
-    k: _Nine
-    d: list[float]
+    camera_matrix: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)]
+    distortion_coefficients: list[float]
     distortion_model: str = ""
     binning_x: int = 0
     binning_y: int = 0
@@ -325,39 +286,31 @@ class _CameraInfoMessage(msgspec.Struct):
 
 class _KalibrCamera(msgspec.Struct):
     camera_model: str
-    intrinsics: list[float]
+    intrinsics: Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
     distortion_model: str
     distortion_coeffs: list[float]
     resolution: tuple[_Side, _Side]
 
 
 def _load_yaml(path: Path) -> CameraIntrinsics:
-    """Read ROS's or Kalibr's calibration.
-
-    Raises:
-        ConfigError: missing, no YAML, of another form, several cameras, or a lens that is not undone.
-    """
     plain = _read_yaml(path)
-    try:
-        if "camera_matrix" in plain:
-            info = msgspec.convert(plain, _CameraInfo)
-            K, lens = info.camera_matrix.data, info.distortion_coefficients.data
-            return _from_matrix(K, info.distortion_model, lens, (info.image_width, info.image_height))
-        lowered = {key.lower(): value for key, value in plain.items()}  # ROS 1 writes K and D
-        if "k" in lowered:
-            message = msgspec.convert(lowered, _CameraInfoMessage)
-            if message.binning_x > 1 or message.binning_y > 1 or any(message.roi.values()):
-                raise ConfigError("has binning or a region of interest, which is not read: calibrate it whole")
-            return _from_matrix(message.k, message.distortion_model, message.d, (message.width, message.height))
-        return _kalibr(plain)
-    except (msgspec.ValidationError, ConfigError, FrameError) as error:
-        raise ConfigError(f"{path}: {error}; {WANTED}") from error
+    check_values(plain, "its values")
+    lowered = {_MESSAGE.get(key.lower(), key.lower()): value for key, value in plain.items()}
+    return _camera_info(lowered) if "camera_matrix" in lowered else _kalibr(plain)
 
 
-def _from_matrix(K: list[float], model: str, lens: list[float], size: tuple[int, int]) -> CameraIntrinsics:
+def _camera_info(plain: Mapping[str, Any]) -> CameraIntrinsics:
+    flat = {
+        key: value["data"] if isinstance(value, dict) and "data" in value else value for key, value in plain.items()
+    }
+    info = msgspec.convert(flat, _CameraInfo)
+    if info.binning_x > 1 or info.binning_y > 1 or any(info.roi.values()):
+        raise ConfigError("has binning or a region of interest, which is not read: calibrate it whole")
+    K = info.camera_matrix
     if any(K[i] for i in (1, 3, 6, 7)):
         raise ConfigError("the camera matrix has skew, which is not undone; calibrate without it")
-    return lens_intrinsics(model, lens, (K[0], K[4], K[2], K[5]), size)
+    size = (info.image_width, info.image_height)
+    return lens_intrinsics(info.distortion_model, info.distortion_coefficients, (K[0], K[4], K[2], K[5]), size)
 
 
 def _kalibr(plain: Mapping[str, Any]) -> CameraIntrinsics:
@@ -366,33 +319,21 @@ def _kalibr(plain: Mapping[str, Any]) -> CameraIntrinsics:
         raise ConfigError(f"holds the cameras {', '.join(cameras)}; keep the one that is meant in a file of its own")
     camera = msgspec.convert(plain[cameras[0]] if cameras else plain, _KalibrCamera)
     if camera.camera_model != "pinhole":
-        raise ConfigError(
-            f"camera_model '{camera.camera_model}' is not read, only pinhole: calibrate with pinhole-equi"
-        )
-    if len(camera.intrinsics) != 4:
-        raise ConfigError(f"intrinsics has {len(camera.intrinsics)} numbers, not fx fy cx cy")
+        raise ConfigError(f"camera_model '{camera.camera_model}' is not read: calibrate with pinhole-equi")
     fx, fy, cx, cy = camera.intrinsics
     return lens_intrinsics(camera.distortion_model, camera.distortion_coeffs, (fx, fy, cx, cy), camera.resolution)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     yaml = YAML(typ="safe", pure=True)
-    try:
-        text = read_regular(path, MAX_FILE_BYTES).decode("utf-8-sig")
-        text, of_opencv = re.subn(r"\A%YAML:1\.0\s*|!!opencv-matrix", "", text)  # as OpenCV's FileStorage writes it
-        if any(isinstance(event, AliasEvent) for event in yaml.parse(text)):  # of these, a short file makes a long one
-            raise ConfigError("has aliases (*), which no calibration needs")
-        documents: list[Any] = [document for document in yaml.load_all(text) if document is not None]
-        if any(document != documents[0] for document in documents):  # `ros2 topic echo` prints many, which are one
-            raise ConfigError("holds several calibrations; keep the one that is meant")
-        plain = documents[0] if documents else None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (YAMLError, ValueError, RecursionError) as error:  # ValueError: ConfigError, UTF-8, endless numbers
-        reason = " ".join(str(error).split())[:300]
-        raise ConfigError(f"{path}: not valid YAML: {reason}; {WANTED}") from error
-    if not isinstance(plain, dict):
-        raise ConfigError(f"{path}: holds no calibration; {WANTED}")
-    check_values(plain, str(path))
-    values = {str(key): value for key, value in cast("dict[Any, Any]", plain).items()}
+    text = read_regular(path, MAX_FILE_BYTES).decode("utf-8-sig")
+    text, of_opencv = re.subn(r"\A%YAML:1\.0\s*|!!opencv-matrix", "", text)  # as OpenCV's FileStorage writes it
+    if any(isinstance(event, AliasEvent) for event in yaml.parse(text)):  # of these, a short file makes a long one
+        raise ConfigError("has aliases (*), which no calibration needs")
+    documents: list[Any] = [document for document in yaml.load_all(text) if document is not None]
+    if any(document != documents[0] for document in documents):  # `ros2 topic echo` prints many, which are one
+        raise ConfigError("holds several calibrations; keep the one that is meant")
+    if not documents or not isinstance(documents[0], dict):
+        raise ConfigError("holds no calibration")
+    values = {str(key): value for key, value in cast("dict[Any, Any]", documents[0]).items()}
     return {"distortion_model": "opencv", **values} if of_opencv else values

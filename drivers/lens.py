@@ -88,14 +88,21 @@ def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
 
     left, right = reach(lens.cx, lens.fx), reach(lens.width - 1 - lens.cx, lens.fx)
     up, down = reach(lens.cy, lens.fy), reach(lens.height - 1 - lens.cy, lens.fy)
+    if left + right <= 0 or up + down <= 0:
+        return _usable(lens, 0.0, 0.0, 0.0, 0.0)
+    focal = max((lens.width - 1) / (left + right), (lens.height - 1) / (up + down))
+    cx = (lens.width - 1) / 2 + focal * (left - right) / 2
+    cy = (lens.height - 1) / 2 + focal * (up - down) / 2
+    return _usable(lens, focal, focal, cx, cy)
+
+
+def _usable(lens: CameraIntrinsics, fx: float, fy: float, cx: float, cy: float) -> CameraIntrinsics:
+    """The ideal camera of a lens."""
     try:
-        focal = max((lens.width - 1) / (left + right), (lens.height - 1) / (up + down))
-        cx = (lens.width - 1) / 2 + focal * (left - right) / 2
-        cy = (lens.height - 1) / 2 + focal * (up - down) / 2
-        return CameraIntrinsics(focal, focal, cx, cy, lens.width, lens.height)
-    except (FrameError, ZeroDivisionError) as error:
+        return CameraIntrinsics(fx, fy, cx, cy, lens.width, lens.height)
+    except FrameError as error:
         raise ConfigError(
-            f"the fisheye lens {lens.distortion} leaves no usable image ({error}); calibrate the camera again"
+            f"the lens distortion {lens.distortion} leaves no usable image: {error}; calibrate the camera again"
         ) from error
 
 
@@ -105,23 +112,15 @@ def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float32,
     Raises:
         ConfigError: the lens leaves no image that a pinhole camera could have made.
     """
-    K, lens, size = (
-        camera_matrix(measured),
-        np.array(measured.distortion, np.float64),
-        (measured.width, measured.height),
-    )
+    K, lens = camera_matrix(measured), np.array(measured.distortion, np.float64)
+    size = (measured.width, measured.height)
     if isinstance(measured, FisheyeIntrinsics):
         ideal = ideal_fisheye_view(measured)
         x, y = cv2.fisheye.initUndistortRectifyMap(K, lens, np.eye(3), camera_matrix(ideal), size, cv2.CV_32FC1)
         return ideal, np.asarray(x, np.float32), np.asarray(y, np.float32)
     new, _ = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
     fx, fy, cx, cy = (float(v) for v in (new[0, 0], new[1, 1], new[0, 2], new[1, 2]))
-    try:
-        ideal = CameraIntrinsics(fx, fy, cx, cy, *size)
-    except FrameError as error:
-        raise ConfigError(
-            f"the lens distortion {measured.distortion} leaves no usable image: {error}; calibrate the camera again"
-        ) from error
+    ideal = _usable(measured, fx, fy, cx, cy)
     x, y = cv2.initUndistortRectifyMap(K, lens, np.eye(3), new, size, cv2.CV_32FC1)
     return ideal, np.asarray(x, np.float32), np.asarray(y, np.float32)
 

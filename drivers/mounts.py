@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,48 +14,35 @@ from semantic_mapper.types import Float64
 OTHER_FILES = ("oak", "stereo")  # kinds whose `calibration` is a file of another form
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Mount:
-    """A camera's place on a rig."""
-
-    T_rig_camera: Float64 | None  # (4, 4); None where nobody has said
-    requested: bool  # whether the settings name it; a calibration file just has it
-    camera: str  # for messages
-
-    def for_poses(self, poses: PoseConfig) -> Float64 | None:
-        """T_rig_camera where poses are those of the rig; None where they are the camera's own.
-
-        Raises:
-            ConfigError: it is needed and not known, or requested and without effect.
-        """
-        if poses_of_rig(poses):
-            if self.T_rig_camera is None:
-                raise ConfigError(
-                    f"{self.camera}: its poses are those of a rig, and nothing says where it sits there; give "
-                    "T_rig_camera, or a calibration file that has one (`semantic-mapper calibrate` with all cameras)"
-                )
-            return self.T_rig_camera
-        if self.requested:
-            raise ConfigError(
-                f'{self.camera}: has a T_rig_camera, but its poses (kind "{poses.kind}") are the camera\'s own; of a '
-                'rig they are with T_base_rig (kind "topic") or T_world_rig (kind "fixed")'
-            )
-        return None
-
-
-def mount_of(rows: Matrix | None, kind: str, config: Mapping[str, Any], camera: str) -> Mount:
-    """What is known of a camera's place.
+def mount_for(
+    poses: PoseConfig, rows: Matrix | None, kind: str, config: Mapping[str, Any], camera: str
+) -> Float64 | None:
+    """T_rig_camera (4, 4) where poses are those of a rig; None where they are the camera's own.
 
     Args:
-        rows: Of the settings.
+        poses: Settings of their source.
+        rows: T_rig_camera of the camera's settings.
         kind: Of the camera; ``config``: its driver's settings, which may name a calibration file.
         camera: For messages.
 
     Raises:
-        ConfigError: no rigid transform, or the file cannot be read.
+        ConfigError: it is needed and not known, requested and without effect, no rigid transform, or the file cannot be
+            read.
     """
+    if not poses_of_rig(poses):
+        if rows is None:
+            return None
+        raise ConfigError(
+            f'{camera}: has a T_rig_camera, but its poses (kind "{poses.kind}") are the camera\'s own; of a '
+            'rig they are with T_base_rig (kind "topic") or T_world_rig (kind "fixed")'
+        )
     if rows is not None:
-        return Mount(rigid_matrix(rows, f"{camera}: T_rig_camera"), True, camera)
+        return rigid_matrix(rows, f"{camera}: T_rig_camera")
     file = config.get("calibration", "")
-    known = load_mount(Path(file)) if file and kind not in OTHER_FILES else None
-    return Mount(known, False, camera)
+    mount = load_mount(Path(file)) if file and kind not in OTHER_FILES else None
+    if mount is None:
+        raise ConfigError(
+            f"{camera}: its poses are those of a rig, and nothing says where it sits there; give "
+            "T_rig_camera, or a calibration file that has one (`semantic-mapper calibrate` with all cameras)"
+        )
+    return mount

@@ -15,7 +15,7 @@ import structlog
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
-from semantic_mapper.drivers.mounts import Mount, mount_of
+from semantic_mapper.drivers.mounts import mount_for
 from semantic_mapper.drivers.poses.config import PoseChecks, begins_world, can_be_found, gives_metres
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
@@ -96,27 +96,20 @@ def make_source(live: LiveCamera) -> PosedCamera:
         ConfigError, CameraError, DependencyError: see ``run_live_camera``.
     """
     config, where = table_of(live.config, "camera.config")
-    camera = open_camera(live.kind, config, live.id, where)
-    mount = mount_of(live.T_rig_camera, live.kind, config, f"camera '{live.id}'")
-    return with_poses(camera, table_of(live.poses, "camera.poses")[0], mount)
+    return with_poses(open_camera(live.kind, config, live.id, where), live, config)
 
 
-def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> PosedCamera:
+def with_poses(camera: Camera, live: LiveCamera, driver: dict[str, Any]) -> PosedCamera:
     """A camera whose frames get their poses from the source that a config names; its ``checks`` say what is refused.
 
     Raises:
         ConfigError, CameraError: see ``run_live_camera``.
     """
-    config = dict(config)
+    config = dict(table_of(live.poses, "camera.poses")[0])
     checks = convert_config(config.pop("checks", {}), PoseChecks, "poses: checks")
     poses = read_pose_config(config)
-    return PosedCamera(
-        camera,
-        make_poses(poses),
-        checks=checks,
-        T_rig_camera=mount.for_poses(poses),
-        scale_known=gives_metres(poses),
-    )
+    mount = mount_for(poses, live.T_rig_camera, live.kind, driver, f"camera '{live.id}'")
+    return PosedCamera(camera, make_poses(poses), checks, T_rig_camera=mount, scale_known=gives_metres(poses))
 
 
 def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, stack: ExitStack) -> PosedCamera | None:

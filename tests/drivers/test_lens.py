@@ -122,7 +122,7 @@ def test_calibrations_of_ros_and_kalibr_are_read(tmp_path: Path, text: str, lens
         (KALIBR + KALIBR.replace("cam0", "cam1"), "cameras cam0, cam1"),
         (KALIBR.replace("model: pinhole", "model: omni"), "camera_model 'omni'"),
         (KALIBR.replace("resolution", "size"), "resolution.*fx fy cx cy"),
-        (KALIBR.replace("intrinsics: [", "intrinsics: {"), "not valid YAML.*fx fy cx cy"),
+        (KALIBR.replace("intrinsics: [", "intrinsics: {"), "while parsing.*fx fy cx cy"),
         ("a: &a [1]\nb: *a\n", "aliases"),
         ("- 1\n", "no calibration"),
         (ECHOED + "binning_x: 2\n", "binning"),

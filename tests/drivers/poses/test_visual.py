@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
-from semantic_mapper.drivers.mounts import Mount
 from semantic_mapper.drivers.poses.config import VisualPoses, begins_world
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 from semantic_mapper.drivers.poses.visual import VisualPoseSource, two_views
@@ -14,6 +13,7 @@ from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import look_at, project
 from semantic_mapper.nodes.camera.live import with_poses
+from semantic_mapper.nodes.options import LiveCamera
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float64
 from tests.bundle.rooms import INTRINSICS, truth, walk, way_m
@@ -79,8 +79,7 @@ def test_without_anything_the_poses_are_up_to_scale_and_the_status_says_so() -> 
 
 def test_a_camera_announces_that_its_poses_are_not_in_metres() -> None:
     def announced(**config: object) -> StreamInfo:
-        mount = Mount(None, requested=False, camera="list")
-        return with_poses(ListCamera([]), {"kind": "visual", **config}, mount).info
+        return with_poses(ListCamera([]), LiveCamera(kind="v4l2", poses={"kind": "visual", **config}), {}).info
 
     assert not announced().scale_known and announced().source == "list"
     assert announced(distance_m=2.0).scale_known and announced(scale={"kind": "board"}).scale_known

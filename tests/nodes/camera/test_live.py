@@ -18,7 +18,6 @@ import pytest
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
-from semantic_mapper.drivers.mounts import Mount
 from semantic_mapper.drivers.poses.config import PoseChecks
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
@@ -26,7 +25,7 @@ from semantic_mapper.nodes.camera import live as live_camera
 from semantic_mapper.nodes.camera.node import run_camera
 from semantic_mapper.nodes.launcher.liveness import TURN, HeartbeatWriter
 from semantic_mapper.nodes.node import NodeContext
-from semantic_mapper.nodes.options import CameraOptions
+from semantic_mapper.nodes.options import CameraOptions, LiveCamera
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.transport.messages import EndOfStream, Message, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber
@@ -118,7 +117,7 @@ def running(
 
 @pytest.fixture(autouse=True)
 def _walking(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_camera, "with_poses", lambda camera, config, mount: walking(camera))
+    monkeypatch.setattr(live_camera, "with_poses", lambda camera, live, driver: walking(camera))
     monkeypatch.setattr(live_camera, "STATUS_PERIOD_S", 0.1)
 
 
@@ -209,8 +208,9 @@ def test_loops_are_closed_only_where_the_map_is_told_of_them(
 ) -> None:
     opened: list[dict[str, Any]] = []
 
-    def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> PosedCamera:
-        opened.append(config)
+    def with_poses(camera: Camera, live: LiveCamera, driver: dict[str, Any]) -> PosedCamera:
+        assert isinstance(live.poses, dict)
+        opened.append(live.poses)
         return walking(camera)
 
     monkeypatch.setattr(live_camera, "with_poses", with_poses)
