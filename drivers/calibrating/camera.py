@@ -65,9 +65,7 @@ def calibrate_camera(
         CameraError: the views cover too little, do not fit each other, or leave the focal length open; says which.
     """
     counts = area_counts([v.pixels for v in views], size)
-    early = shortfalls(config, len(views), counts, None)
-    if early:
-        raise _refusal(camera_id, early)
+    _refuse(camera_id, shortfalls(config, len(views), counts, None))
     left_out: list[str] = []
     used = list(views)
     found = _calibrate(used, size, config)
@@ -81,7 +79,15 @@ def calibrate_camera(
         left_out += [used[i].name for i in worst]
         used = [view for i, view in enumerate(used) if i not in worst]
         found = _calibrate(used, size, config)
-    _check(camera_id, found, config)
+    _refuse(camera_id, shortfalls(config, len(found.views), found.counts, found.tilts))
+    _check_error(camera_id, found, config)
+    fraction = max(found.sigmas["fx"] / found.intrinsics.fx, found.sigmas["fy"] / found.intrinsics.fy)
+    if fraction > MAX_FOCAL_SIGMA:
+        lack = (
+            f"the focal length is known to {100 * fraction:.2f} % only (one sigma; {100 * MAX_FOCAL_SIGMA:g} % is "
+            "needed): show the board nearer, and lean it further, in more images"
+        )
+        _refuse(camera_id, (lack,))
     return replace(found, left_out=tuple(left_out))
 
 
@@ -93,21 +99,11 @@ def compare_camera(
     Raises:
         CameraError: no view, or they do not fit.
     """
-    ideal = CameraIntrinsics(
-        intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.width, intrinsics.height
-    )
-    poses: list[Float64] = []
-    residuals: list[Float64] = []
-    used: list[BoardView] = []
-    for view in views:
-        found = board_poses(view.points, ideal_pixels(view.pixels, intrinsics), ideal)
-        if found:
-            poses.append(pose_of_vector(found[0][1]))
-            residuals.append(view.pixels - _project(view.points, found[0][1], intrinsics))
-            used.append(view)
+    ideal = replace(intrinsics, distortion=())
+    used = [(v, p[0][1]) for v in views if (p := board_poses(v.points, ideal_pixels(v.pixels, intrinsics), ideal))]
     if not used:
-        raise _refusal(camera_id, ("the board was seen in none of its images",))
-    result = _gather(intrinsics, False, {}, used, residuals, poses)
+        _refuse(camera_id, ("the board was seen in none of its images",))
+    result = _gather(intrinsics, {}, [view for view, _ in used], [pose for _, pose in used])
     _check_error(camera_id, result, config)
     return result
 
@@ -130,48 +126,35 @@ def _calibrate(views: Sequence[BoardView], size: tuple[int, int], config: Calibr
         _, K, lens, turns, shifts, sigmas, _, _ = cv2.calibrateCameraExtended(
             points, pixels, size, start, np.zeros(5), flags=_FLAGS[config.coefficients]
         )
-    except cv2.error as error:
-        raise CameraError(
-            f"the views allow no calibration: {error.err}; are board and its sizes the right ones?"
-        ) from error
-    distortion = tuple(float(v) for v in np.ravel(lens)[: config.coefficients])
-    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    if not np.isfinite((fx, fy, cx, cy, *distortion)).all() or not (0 < cx < size[0] and 0 < cy < size[1]):
-        raise CameraError(
-            f"the views lead to an impossible camera (fx {fx:.0f}, centre {cx:.0f}, {cy:.0f}); are board and its sizes "
-            "the right ones, and is it flat?"
-        )
-    try:
+        distortion = tuple(float(v) for v in np.ravel(lens)[: config.coefficients])
+        fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        if not (0 < cx < size[0] and 0 < cy < size[1]):
+            raise FrameError(f"its centre is {cx:.0f}, {cy:.0f}")
         intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size, distortion)
-    except FrameError as error:
-        raise CameraError(f"the views lead to an impossible camera: {error}; are board and its sizes right?") from error
+    except (cv2.error, FrameError) as error:
+        raise CameraError(
+            f"the views lead to no possible camera: {error}; are board and its sizes the right ones, and is it flat?"
+        ) from error
     names = ("fx", "fy", "cx", "cy", *COEFFICIENT_NAMES[: config.coefficients])
     sigma_by_name: dict[str, float] = dict(zip(names, (float(v) for v in np.ravel(sigmas)), strict=False))
-    vectors = [
-        np.concatenate((np.ravel(r), np.ravel(t))).astype(np.float64) for r, t in zip(turns, shifts, strict=True)
-    ]
-    residuals = [v.pixels - _project(v.points, pose, intrinsics) for v, pose in zip(views, vectors, strict=True)]
-    return _gather(intrinsics, True, sigma_by_name, views, residuals, [pose_of_vector(v) for v in vectors])
+    poses = list(np.reshape(np.concatenate((turns, shifts), axis=1), (-1, 6)).astype(np.float64))
+    return _gather(intrinsics, sigma_by_name, views, poses)
 
 
 def _gather(
-    intrinsics: CameraIntrinsics,
-    estimated: bool,
-    sigmas: dict[str, float],
-    views: Sequence[BoardView],
-    residuals: Sequence[Float64],
-    poses: Sequence[Float64],
+    intrinsics: CameraIntrinsics, sigmas: dict[str, float], views: Sequence[BoardView], poses: Sequence[Float64]
 ) -> CameraCalibration:
-    errors = tuple(float(np.sqrt((r**2).sum(axis=1).mean())) for r in residuals)
+    """Of views with the poses (6,) of the board in them; without ``sigmas`` the intrinsics are given ones."""
+    residuals = tuple(v.pixels - _project(v.points, pose, intrinsics) for v, pose in zip(views, poses, strict=True))
     return CameraCalibration(
         intrinsics,
-        estimated,
-        float(np.sqrt((np.concatenate(list(residuals)) ** 2).sum(axis=1).mean())),
+        bool(sigmas),
+        float(np.sqrt((np.concatenate(residuals) ** 2).sum(axis=1).mean())),
         sigmas,
         tuple(views),
-        tuple(residuals),
-        errors,
-        np.array([tilt_degrees(T) for T in poses]),
+        residuals,
+        tuple(float(np.sqrt((r**2).sum(axis=1).mean())) for r in residuals),
+        np.array([tilt_degrees(pose_of_vector(pose)) for pose in poses]),
         area_counts([v.pixels for v in views], (intrinsics.width, intrinsics.height)),
     )
 
@@ -182,31 +165,18 @@ def _project(points: Float64, pose: Float64, intrinsics: CameraIntrinsics) -> Fl
     return np.asarray(seen, np.float64).reshape(-1, 2)
 
 
-def _check(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> None:
-    lacks = shortfalls(config, len(found.views), found.counts, found.tilts)
-    if lacks:
-        raise _refusal(camera_id, lacks)
-    _check_error(camera_id, found, config)
-    fraction = max(found.sigmas["fx"] / found.intrinsics.fx, found.sigmas["fy"] / found.intrinsics.fy)
-    if fraction > MAX_FOCAL_SIGMA:
-        lack = (
-            f"the focal length is known to {100 * fraction:.2f} % only (one sigma; {100 * MAX_FOCAL_SIGMA:g} % is "
-            "needed): show the board nearer, and lean it further, in more images"
-        )
-        raise _refusal(camera_id, (lack,))
-
-
 def _check_error(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> None:
     if found.rms_px > config.max_error_px:
         lack = (
             f"corners are off by {found.rms_px:.2f} px (RMS; {config.max_error_px:g} are allowed): check the sizes of "
             "the board, glue it to something flat, hold it still, and use sharp images"
         )
-        raise _refusal(camera_id, (lack,))
+        _refuse(camera_id, (lack,))
 
 
-def _refusal(camera_id: str, lacks: Sequence[str]) -> CameraError:
-    return CameraError(f"camera '{camera_id}' cannot be calibrated from these images: {'; '.join(lacks)}")
+def _refuse(camera_id: str, lacks: Sequence[str]) -> None:
+    if lacks:
+        raise CameraError(f"camera '{camera_id}' cannot be calibrated from these images: {'; '.join(lacks)}")
 
 
 @rendered

@@ -29,23 +29,30 @@ _HUBER_PX = 1.0  # residuals beyond count less
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RigCamera:
+    """Where a camera sits on the rig."""
+
+    T_rig_camera: Float64  # (4, 4); the rig is where its first camera sits
+    moments: int  # at how many it saw the board together with another one
+    # One-sigma uncertainty; 0 of the first camera.
+    position_sigma_m: float
+    turn_sigma_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RigCalibration:
     """A calibrated rig."""
 
-    T_rig_camera: dict[str, Float64]  # (4, 4) by camera; the rig is where the first one sits
+    cameras: dict[str, RigCamera]
     rms_px: float  # of all corners at once
-    instants: dict[str, int]  # by camera: at how many it saw the board together with another one
-    # position_sigma_m, turn_sigma_deg: One-sigma uncertainty by camera; 0 of the first.
-    position_sigma_m: dict[str, float]
-    turn_sigma_deg: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """All that came out."""
 
-    cameras: dict[str, CameraCalibration]  # by name; rig: None where it was not requested
-    rig: RigCalibration | None
+    cameras: dict[str, CameraCalibration]  # by name
+    rig: RigCalibration | None  # None where it was not requested
 
 
 def solve(
@@ -97,45 +104,38 @@ class _Sight:
 def calibrate_rig(
     cameras: Mapping[str, CameraIntrinsics], instants: Sequence[Mapping[str, BoardView]], config: CalibrationConfig
 ) -> RigCalibration:
-    """All cameras and all boards fitted at once (bundle adjustment with the intrinsics as they are).
+    """At least two cameras and all boards fitted at once (bundle adjustment with the intrinsics as they are).
 
     Args:
-        cameras: At least two.
+        cameras: By name.
         instants: See ``views.simultaneous``.
         config: What a result has to be like.
 
     Raises:
         CameraError: cameras that hardly see the board at once, or views that do not fit each other.
     """
-    names = list(cameras)
-    lenses = [cameras[name] for name in names]
+    names, lenses = list(cameras), list(cameras.values())
     sights = _sights(names, lenses, instants)
-    T_rig_camera = _first_guess(names, sights)
-    boards = {s.instant: T_rig_camera[s.camera] @ s.T_camera_board for s in reversed(sights)}
-    fit = _adjust_bundle(lenses, sights, T_rig_camera, boards)
-    if fit.rms_px > config.max_error_px:
+    guess = _first_guess(names, sights)
+    boards = {s.instant: guess[s.camera] @ s.T_camera_board for s in reversed(sights)}
+    poses, rms_px, sigmas = _adjust_bundle(lenses, sights, guess, boards)
+    if rms_px > config.max_error_px:
         raise CameraError(
-            f"the cameras do not agree on where the board is: corners are off by {fit.rms_px:.2f} px (RMS; "
+            f"the cameras do not agree on where the board is: corners are off by {rms_px:.2f} px (RMS; "
             f"{config.max_error_px:g} are allowed). Hold the board still, and check that stamps are of one clock and "
             "that no camera has moved on the rig"
         )
-    turns, positions = (
-        {name: float(np.sqrt((own**2).mean())) for name, own in zip(names, part, strict=True)}
-        for part in (fit.sigmas[:, :3], fit.sigmas[:, 3:])
-    )
-    for name, sigma in positions.items():
-        if sigma > MAX_POSITION_SIGMA_M:
+    found: dict[str, RigCamera] = {}
+    for number, (name, pose) in enumerate(zip(names, poses, strict=True)):
+        turn, position = (float(np.sqrt((part**2).mean())) for part in np.split(sigmas[number], 2))
+        if position > MAX_POSITION_SIGMA_M:
             raise CameraError(
-                f"camera '{name}': its place on the rig is known to {1000 * sigma:.1f} mm only (one sigma; "
+                f"camera '{name}': its place on the rig is known to {1000 * position:.1f} mm only (one sigma; "
                 f"{1000 * MAX_POSITION_SIGMA_M:g} are needed): show the board nearer to both cameras at once"
             )
-    return RigCalibration(
-        dict(zip(names, fit.T_rig_camera, strict=True)),
-        fit.rms_px,
-        {name: sum(s.camera == i for s in sights) for i, name in enumerate(names)},
-        positions,
-        {name: float(np.degrees(sigma)) for name, sigma in turns.items()},
-    )
+        moments = sum(sight.camera == number for sight in sights)
+        found[name] = RigCamera(pose, moments, position, float(np.degrees(turn)))
+    return RigCalibration(found, rms_px)
 
 
 def _sights(
@@ -155,11 +155,7 @@ def _sights(
 
 
 def _first_guess(names: Sequence[str], sights: Sequence[_Sight]) -> list[Float64]:
-    """T_rig_camera along the pairs of cameras that see the board together most often.
-
-    Raises:
-        CameraError: a camera that is in no pair that leads to the first one.
-    """
+    """T_rig_camera along the pairs of cameras that see the board together most often; ``CameraError`` without any."""
     by_instant: dict[int, dict[int, _Sight]] = {}
     for sight in sights:
         by_instant.setdefault(sight.instant, {})[sight.camera] = sight
@@ -189,28 +185,15 @@ def _middle(poses: Sequence[Float64]) -> Float64:
     return stack[int(apart.argmin())]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _BundleFit:
-    """Outcome of the bundle adjustment; ``sigmas`` (C, 6): one sigma of rotation (radians) and position (metres)."""
-
-    T_rig_camera: Float64
-    rms_px: float
-    sigmas: Float64
-
-
 def _adjust_bundle(
     lenses: Sequence[CameraIntrinsics],
     sights: Sequence[_Sight],
     cameras: Sequence[Float64],
     boards: Mapping[int, Float64],
-) -> _BundleFit:
-    """Fit the poses of all cameras but the first and of all boards to the corners seen.
+) -> tuple[Float64, float, Float64]:
+    """Fit the poses of all cameras but the first and of all boards to the corners seen, from a first guess.
 
-    Args:
-        lenses: By camera.
-        sights: What was seen.
-        cameras: First guess, T_rig_camera by camera.
-        boards: First guess, T_rig_board by instant.
+    Returns: T_rig_camera by camera, the RMS error in pixels, and one sigma (C, 6) of turn (radians) and position.
     """
     rows = {instant: len(cameras) + row for row, instant in enumerate(boards)}
     start = np.array([*cameras, *boards.values()])  # (P, 4, 4)
@@ -255,8 +238,5 @@ def _adjust_bundle(
     hessian = (fit.jac.T @ fit.jac).toarray()  # of the robust cost
     covariance = squares / max(1, len(pixels) * 2 - len(guess)) * np.linalg.inv(hessian)
     free = np.sqrt(np.diag(covariance)).reshape(-1, 6)[: len(cameras) - 1]
-    return _BundleFit(
-        poses(fit.x)[: len(cameras)],
-        float(np.sqrt(squares / len(pixels))),
-        np.concatenate((np.zeros((1, 6)), free)),
-    )
+    sigmas = np.concatenate((np.zeros((1, 6)), free))
+    return poses(fit.x)[: len(cameras)], float(np.sqrt(squares / len(pixels))), sigmas

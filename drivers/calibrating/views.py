@@ -69,11 +69,7 @@ class ViewGatherer:
         self.intrinsics: CameraIntrinsics | None = None
 
     def take(self, image: CameraImage, name: str = "") -> bool:
-        """Look at an image; whether its view was kept.
-
-        Raises:
-            CameraError: images of two sizes.
-        """
+        """Look at an image; whether its view was kept. ``CameraError``: images of two sizes."""
         size = (image.intrinsics.width, image.intrinsics.height)
         if self.size not in (None, size):
             raise CameraError(
@@ -156,7 +152,7 @@ def tilt_degrees(T_camera_board: Float64) -> Float64:
 def shortfalls(
     config: CalibrationConfig, views: int, counts: NDArray[np.int64], tilts: Float64 | None
 ) -> tuple[str, ...]:
-    """What is missing for a calibration that can be believed, as sentences that say what to do.
+    """What ``views`` views lack for a calibration that can be believed, as sentences that say what to do.
 
     Args:
         config: What is requested.
@@ -191,13 +187,10 @@ def _stands_still(before: BoardView | None, view: BoardView) -> bool:
     """Whether the corners that both show are where they were."""
     if before is None:
         return False
-    known = {tuple(point): pixel for point, pixel in zip(before.points.tolist(), before.pixels, strict=True)}
-    moves = [
-        float(np.linalg.norm(pixel - known[tuple(point)]))
-        for point, pixel in zip(view.points.tolist(), view.pixels, strict=True)
-        if tuple(point) in known
-    ]
-    return bool(moves) and float(np.median(moves)) <= STEADY_PX
+    shared = (view.points[:, None] == before.points[None]).all(axis=-1)
+    ours, theirs = np.nonzero(shared)
+    moves = np.linalg.norm(view.pixels[ours] - before.pixels[theirs], axis=1)
+    return len(moves) > 0 and float(np.median(moves)) <= STEADY_PX
 
 
 def _signature(view: BoardView, size: tuple[int, int]) -> tuple[Float64, Float64] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -34,38 +35,31 @@ class CalibrationSettings(Config, frozen=True):
 
 
 def write_files(out: Path, found: Calibration, settings: CalibrationSettings) -> list[Path]:
-    """A TOML file and a picture of each camera; returns their paths.
-
-    Raises:
-        ConfigError: a file cannot be written; it is as it was.
-    """
+    """A TOML file and a picture of each camera; returns their paths. ``ConfigError``: a file cannot be written."""
     written: list[Path] = []
     for name, camera in found.cameras.items():
         about = _about(settings) | {"views": len(camera.views), "rms_px": round(camera.rms_px, 4)}
         about |= {f"sigma_{key}": float(f"{sigma:.3g}") for key, sigma in camera.sigmas.items()}
         mount = None
         if found.rig is not None:
-            mount = found.rig.T_rig_camera[name]
+            place = found.rig.cameras[name]
+            mount = place.T_rig_camera
             about["rig"] = f"that of camera {next(iter(found.cameras))}; {', '.join(found.cameras)}"
-            about["rig_position_sigma_mm"] = float(f"{1000 * found.rig.position_sigma_m[name]:.3g}")
-            about["rig_turn_sigma_deg"] = float(f"{found.rig.turn_sigma_deg[name]:.3g}")
+            about["rig_position_sigma_mm"] = float(f"{1000 * place.position_sigma_m:.3g}")
+            about["rig_turn_sigma_deg"] = float(f"{place.turn_sigma_deg:.3g}")
         with _explained(out / f"{name}.toml"):
             save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
-        picture = out / f"{name}.png"
-        _write_picture(picture, name, camera)
-        written += [out / f"{name}.toml", picture]
+        written += [out / f"{name}.toml", _write_picture(out / f"{name}.png", name, camera)]
     return written
 
 
 def write_stereo(out: Path, name: str, found: Calibration, settings: CalibrationSettings) -> list[Path]:
     """One TOML file of both cameras of a pair, and a picture of each; returns their paths.
 
-    The half in which the left camera's image is comes of where the two cameras sit.
-
     Args:
         out: Folder.
         name: Of the pair.
-        found: Cameras left and right, named by the half of the image, with their rig.
+        found: Cameras left and right, named by the half of the image, with their rig, which tells whose half is which.
         settings: Of the calibration.
 
     Raises:
@@ -73,26 +67,23 @@ def write_stereo(out: Path, name: str, found: Calibration, settings: Calibration
     """
     assert found.rig is not None
     left, right = (found.cameras[side] for side in SIDES)
-    T_right_left = invert_pose(found.rig.T_rig_camera[SIDES[1]])
+    place = found.rig.cameras[SIDES[1]]
+    T_right_left = invert_pose(place.T_rig_camera)
     swapped = bool(T_right_left[0, 3] > 0)
     if swapped:
         left, right, T_right_left = right, left, invert_pose(T_right_left)
     about = _about(settings) | {
         "views": min(len(left.views), len(right.views)),
-        "moments": found.rig.instants[SIDES[1]],
+        "moments": place.moments,
         "rms_px": round(found.rig.rms_px, 4),
         "baseline_mm": round(1000 * float(np.linalg.norm(T_right_left[:3, 3])), 3),
-        "sigma_baseline_mm": float(f"{1000 * found.rig.position_sigma_m[SIDES[1]]:.3g}"),
+        "sigma_baseline_mm": float(f"{1000 * place.position_sigma_m:.3g}"),
     }
     file = out / f"{name}.toml"
     with _explained(file):
         save_stereo(file, StereoCalibration(left.intrinsics, right.intrinsics, T_right_left, swapped), about)
-    written = [file]
-    for side, camera in zip(SIDES, (left, right), strict=True):
-        picture = out / f"{name}-{side}.png"
-        _write_picture(picture, f"{name} {side}", camera)
-        written.append(picture)
-    return written
+    sides = zip(SIDES, (left, right), strict=True)
+    return [file, *(_write_picture(out / f"{name}-{side}.png", f"{name} {side}", camera) for side, camera in sides)]
 
 
 def _about(settings: CalibrationSettings) -> dict[str, str | float]:
@@ -104,17 +95,14 @@ def _about(settings: CalibrationSettings) -> dict[str, str | float]:
     }
 
 
-def _write_picture(path: Path, name: str, camera: CameraCalibration) -> None:
+def _write_picture(path: Path, name: str, camera: CameraCalibration) -> Path:
     drawn = draw_calibration(name, camera)
     write_whole(path, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
+    return path
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file, or leave it as it was.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
+    """Write a file, or leave it as it was; ``ConfigError`` where it cannot be written."""
     with _explained(path):
         write_bytes(path, data)
 
@@ -130,41 +118,19 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def report(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int) -> Iterator[Any]:
-    """Tables and lines for people."""
+    """Tables for people; so many of the worst views are named."""
     for name, camera in found.cameras.items():
         yield _camera_table(name, camera, gathered[name], worst)
     if found.rig is not None:
-        table = Table(title="rig", title_justify="left")
-        for title in ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg"):
-            table.add_column(title)
-        for name, T in found.rig.T_rig_camera.items():
-            turned = np.degrees(np.linalg.norm(rotation_vector(T)))
-            place = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
-            sigmas = found.rig.position_sigma_m[name] * 1000, found.rig.turn_sigma_deg[name]
-            moments = str(found.rig.instants[name])
-            table.add_row(name, moments, place, f"{sigmas[0]:.2f}", f"{turned:.2f}", f"{sigmas[1]:.3f}")
-        table.caption = f"{found.rig.rms_px:.3f} px RMS of all corners at once"
+        caption = f"{found.rig.rms_px:.3f} px RMS of all corners at once"
+        titles = ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg")
+        table = Table(*titles, title="rig", title_justify="left", caption=caption)
+        for name, place in found.rig.cameras.items():
+            turned = np.degrees(np.linalg.norm(rotation_vector(place.T_rig_camera)))
+            position = ", ".join(f"{1000 * v:.1f}" for v in place.T_rig_camera[:3, 3])
+            sigmas = f"{1000 * place.position_sigma_m:.2f}", f"{place.turn_sigma_deg:.3f}"
+            table.add_row(name, str(place.moments), position, sigmas[0], f"{turned:.2f}", sigmas[1])
         yield table
-
-
-def report_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: list[Path]) -> dict[str, Any]:
-    """The same for programs."""
-    cameras = {name: _camera_json(camera, gathered[name]) for name, camera in found.cameras.items()}
-    rig = None
-    if found.rig is not None:
-        rig = {
-            "rms_px": found.rig.rms_px,
-            "cameras": {
-                name: {
-                    "T_rig_camera": T.tolist(),
-                    "moments": found.rig.instants[name],
-                    "position_sigma_m": found.rig.position_sigma_m[name],
-                    "turn_sigma_deg": found.rig.turn_sigma_deg[name],
-                }
-                for name, T in found.rig.T_rig_camera.items()
-            },
-        }
-    return {"cameras": cameras, "rig": rig, "files": [str(path) for path in files]}
 
 
 def _values(camera: CameraCalibration) -> dict[str, float]:
@@ -179,8 +145,9 @@ def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, wor
     table.add_column()
     table.add_column(overflow="fold")
     left_out = f"; {len(camera.left_out)} did not fit: {', '.join(camera.left_out)}" if camera.left_out else ""
-    used = f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{left_out}"
-    table.add_row("images", used)
+    table.add_row(
+        "images", f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{left_out}"
+    )
     table.add_row("error", f"{camera.rms_px:.3f} px RMS")
     order = sorted(zip(camera.errors_px, camera.views, strict=True), key=lambda pair: -pair[0])
     table.add_row("worst images", ", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst]))
@@ -189,26 +156,32 @@ def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, wor
     for key, value in _values(camera).items():
         sigma = f" +- {camera.sigmas[key]:.2g}" if key in camera.sigmas else ""
         table.add_row(key, f"{value:.2f}{sigma}" if key in ("fx", "fy", "cx", "cy") else f"{value:.5f}{sigma}")
-    cells = int((camera.counts > 0).sum())
     missing = ", ".join(missing_regions(camera.counts))
-    seen = f"{cells} of {CELLS * CELLS} cells" + (f"; hardly: {missing}" if missing else "")
+    seen = f"{np.count_nonzero(camera.counts)} of {CELLS * CELLS} cells" + (f"; hardly: {missing}" if missing else "")
     table.add_row("image area seen", seen)
     up, side = np.abs(camera.tilts).max(axis=0)
     table.add_row("board leaned", f"up to {up:.0f} degrees up or down, {side:.0f} to a side")
     return table
 
 
-def _camera_json(camera: CameraCalibration, views: ViewGatherer) -> dict[str, Any]:
-    up, side = np.abs(camera.tilts).max(axis=0)
-    return {
-        "size": [camera.intrinsics.width, camera.intrinsics.height],
-        "estimated": camera.estimated,
-        **_values(camera),
-        "sigmas": camera.sigmas,
-        "rms_px": camera.rms_px,
-        "images": {"looked_at": views.images, "with_board": views.seen, "left_out": list(camera.left_out)},
-        "errors_px": {view.name: error for view, error in zip(camera.views, camera.errors_px, strict=True)},
-        "cells_seen": int((camera.counts > 0).sum()),
-        "cells": CELLS * CELLS,
-        "leaned_deg": [float(up), float(side)],
-    }
+def report_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: list[Path]) -> dict[str, Any]:
+    """The same for programs."""
+    cameras, rig = {}, None
+    for name, camera in found.cameras.items():
+        views = gathered[name]
+        cameras[name] = {
+            "size": [camera.intrinsics.width, camera.intrinsics.height],
+            "estimated": camera.estimated,
+            **_values(camera),
+            "sigmas": camera.sigmas,
+            "rms_px": camera.rms_px,
+            "images": {"looked_at": views.images, "with_board": views.seen, "left_out": list(camera.left_out)},
+            "errors_px": {view.name: error for view, error in zip(camera.views, camera.errors_px, strict=True)},
+            "cells_seen": int(np.count_nonzero(camera.counts)),
+            "cells": CELLS * CELLS,
+            "leaned_deg": np.abs(camera.tilts).max(axis=0).tolist(),
+        }
+    if found.rig is not None:
+        places = {n: asdict(p) | {"T_rig_camera": p.T_rig_camera.tolist()} for n, p in found.rig.cameras.items()}
+        rig = {"rms_px": found.rig.rms_px, "cameras": places}
+    return {"cameras": cameras, "rig": rig, "files": [str(path) for path in files]}

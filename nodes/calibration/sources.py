@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from semantic_mapper.drivers.calibration import guess_intrinsics
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo.camera import halves
-from semantic_mapper.errors import CameraError, ConfigError, SemanticMapperError
+from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.options import SOURCE_PATTERN
 from semantic_mapper.nodes.process import StopRequest
@@ -33,12 +34,7 @@ SIDES = ("left", "right")  # of a stereo pair, as its cameras are called
 REPORT_S = 2.0
 SPARE_INSTANTS = 4  # live rigs: beyond those needed
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-_ADDRESSES = {
-    "v4l2": "device",
-    "opencv": "source",
-    "oak": "device",
-    "realsense": "device",
-}  # in the driver's config
+_ADDRESSES = {"v4l2": "device", "opencv": "source", "oak": "device", "realsense": "device"}  # in the driver's config
 _KEEPS_INTRINSICS = ("oak", "realsense")  # rectifies with what its maker has measured
 
 _log = structlog.get_logger(__name__)
@@ -56,22 +52,6 @@ class Source:
     stop: Callable[[], None] = lambda: None  # ends ``images`` soon, from any thread
 
 
-def check_places(texts: Sequence[str]) -> None:
-    """Check that files and folders among the sources are there.
-
-    Raises:
-        ConfigError: one is not, or has no name for a camera.
-    """
-    for text in texts:
-        _, place = _split(text, alone=len(texts) == 1)
-        kind, colon, _ = place.partition(":")
-        if not (colon and kind in _ADDRESSES) and not Path(place).is_file() and not Path(place).is_dir():
-            raise ConfigError(
-                f"{place}: neither a folder of pictures, a log (.mcap) or video that is there, nor a camera as "
-                f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper doctor --cameras` lists them)"
-            )
-
-
 def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
     """Sources as ``[NAME=]PLACE``, see ``calibrate``.
 
@@ -84,8 +64,7 @@ def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
         CameraError, DependencyError: a camera that cannot be opened.
     """
     named = [_split(text, alone=len(texts) == 1) for text in texts]
-    folders = [(name, Path(place)) for name, place in named if Path(place).is_dir()]
-    stems = sorted({f.stem for _, folder in folders for f in _pictures(folder)})
+    stems = sorted({file.stem for _, place in named if Path(place).is_dir() for file in _pictures(Path(place))})
     found: list[Source] = []
     names: list[str] = []
     for name, place in named:
@@ -104,8 +83,7 @@ def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
 
 
 def parse_stereo(texts: Sequence[str], size: str) -> tuple[str, Source]:
-    """The source of a stereo pair that gives both images side by side, as ``[NAME=]PLACE``: its name, and its halves
-    as two cameras, left and right.
+    """A stereo pair that gives both images side by side, as ``[NAME=]PLACE``: its name, and its halves as two cameras.
 
     Args:
         texts: Of the command line.
@@ -134,26 +112,24 @@ def _split(text: str, *, alone: bool) -> tuple[str, str]:
 
 def _camera_source(name: str, place: str, size: str) -> Source:
     kind, colon, address = place.partition(":")
-    if colon and kind in _ADDRESSES:
-        config: dict[str, Any] = {_ADDRESSES[kind]: address}
-        if kind not in _KEEPS_INTRINSICS:
-            config["uncalibrated"] = True
-        if size and kind == "v4l2":
-            config["width"], config["height"] = _read_size(size)
-        live = kind != "opencv" or "://" in address
-        camera = open_camera(kind, config, name, place)
-        return Source(partial(_camera_images, camera), live=live, known=kind in _KEEPS_INTRINSICS, stop=camera.stop)
-    check_places([place])
-    plain = {"source": place, "uncalibrated": True, "pace": "fast"}
-    film = open_camera("opencv", plain, name, place)
-    return Source(partial(_camera_images, film), stop=film.stop)
-
-
-def _read_size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
-    if found is None:
-        raise ConfigError(f"--size {text:.40}: write WIDTHxHEIGHT, such as 1280x720")
-    return int(found[1]), int(found[2])
+    if not colon or kind not in _ADDRESSES:
+        if not Path(place).is_file():
+            raise ConfigError(
+                f"{place}: neither a folder of pictures, a log (.mcap) or video that is there, nor a camera as "
+                f"KIND:ADDRESS with a kind of {', '.join(_ADDRESSES)} (`semantic-mapper doctor --cameras` lists them)"
+            )
+        kind, address = "opencv", place
+    known = kind in _KEEPS_INTRINSICS
+    config: dict[str, Any] = {_ADDRESSES[kind]: address} | ({} if known else {"uncalibrated": True})
+    if kind == "opencv":
+        config["pace"] = "fast"
+    if size and kind == "v4l2":
+        found = re.fullmatch(r"(\d{1,6})x(\d{1,6})", size)
+        if found is None:
+            raise ConfigError(f"--size {size:.40}: write WIDTHxHEIGHT, such as 1280x720")
+        config["width"], config["height"] = int(found[1]), int(found[2])
+    camera = open_camera(kind, config, name, place)
+    return Source(partial(_camera_images, camera), live=not camera.can_wait, known=known, stop=camera.stop)
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -200,9 +176,6 @@ def _log_images(path: Path) -> Iterator[tuple[str, CameraImage]]:
 class Gathering:
     """The views of all cameras.
 
-    Args:
-        board, config: See ``ViewGatherer``.
-
     Attributes:
         cameras: By name, in the order in which they came; ``known``: those whose intrinsics are right as given.
     """
@@ -223,7 +196,7 @@ class Gathering:
         for source in sources:
             if not source.live:
                 with frame_progress("looked at", None, "images") as bar:
-                    self._take_all(source, bar.advance, stop)
+                    self._take_all(source, stop, bar.advance)
         live = [source for source in sources if source.live]
         if live and not stop:
             self._listen(live, stop, seconds, rig=rig)
@@ -240,7 +213,7 @@ class Gathering:
                 )
         return lacks_text
 
-    def _take_all(self, source: Source, advance: Callable[[], None], stop: StopRequest) -> None:
+    def _take_all(self, source: Source, stop: StopRequest, advance: Callable[[], None] = lambda: None) -> None:
         for name, image in source.images():
             self._camera(image.camera_id, source).take(image, name)
             advance()
@@ -257,31 +230,17 @@ class Gathering:
 
     def _listen(self, sources: Sequence[Source], stop: StopRequest, seconds: float, *, rig: bool) -> None:
         """Raises: CameraError: a camera cannot be opened or fails."""
-        errors: list[SemanticMapperError] = []
-
-        def work(source: Source) -> None:
-            try:
-                self._take_all(source, lambda: None, stop)
-            except SemanticMapperError as error:
-                errors.append(error)
-
-        threads = [threading.Thread(target=work, args=(s,), name="calibration", daemon=True) for s in sources]
-        for thread in threads:
-            thread.start()
-        deadline, last_sent = time.monotonic() + seconds, 0.0
-        while not stop and not errors and time.monotonic() < deadline and any(t.is_alive() for t in threads):
-            time.sleep(0.1)
-            if time.monotonic() - last_sent < REPORT_S:
-                continue
-            last_sent = time.monotonic()
-            lacks = self.lacks(rig=rig) if len(self.cameras) >= len(sources) else ["waiting for images"]
-            kept = {name: len(views.kept) for name, views in list(self.cameras.items())}
-            _log.info("views", **kept, lacking="; ".join(lacks) or "nothing")
-            if not lacks:
-                break
-        for source in sources:
-            source.stop()
-        for thread in threads:
-            thread.join(5.0)
-        if errors:
-            raise CameraError(str(errors[0])) from errors[0]
+        deadline = time.monotonic() + seconds
+        with ThreadPoolExecutor(len(sources)) as pool:
+            work = [pool.submit(self._take_all, source, stop) for source in sources]
+            while not stop and time.monotonic() < deadline:
+                done, going = wait(work, REPORT_S, FIRST_EXCEPTION)
+                lacks = self.lacks(rig=rig) if len(self.cameras) >= len(sources) else ["waiting for images"]
+                kept = {name: len(views.kept) for name, views in list(self.cameras.items())}
+                _log.info("views", **kept, lacking="; ".join(lacks) or "nothing")
+                if not lacks or not going or any(each.exception() for each in done):
+                    break
+            for source in sources:
+                source.stop()
+        for each in work:
+            each.result()

@@ -20,7 +20,7 @@ from semantic_mapper.nodes.calibration.report import (
     write_stereo,
     write_whole,
 )
-from semantic_mapper.nodes.calibration.sources import Gathering, check_places, parse_sources, parse_stereo
+from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources, parse_stereo
 from semantic_mapper.nodes.cli.verb import JsonOutput, verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
@@ -56,7 +56,6 @@ def calibrate(
     Example: semantic-mapper calibrate --stereo v4l2:/dev/video0 --size 2560x720 --square-mm 39.6
     Example: semantic-mapper calibrate left=pictures/left right=pictures/right
     """
-    check_places(sources or ())
     settings = board_settings(config, square_mm)
     if board is not None:
         _draw_board(output, settings, board)
@@ -87,11 +86,7 @@ def calibrate(
 
 
 def board_settings(path: Path | None, square_mm: float) -> CalibrationSettings:
-    """Board and settings of a file (None = defaults), with squares of so many millimetres (0 = as it says).
-
-    Raises:
-        ConfigError: the file, or a board that cannot be.
-    """
+    """Board and settings of a file (None = defaults), with squares of so many millimetres (0 = as it says)."""
     settings = load_config(path, CalibrationSettings) if path else CalibrationSettings()
     if square_mm < 0:
         raise ConfigError(f"--square-mm {square_mm:g}: is the side of a square in millimetres")

@@ -70,7 +70,7 @@ def test_a_rig_is_written_into_the_files_of_its_cameras(pictures: Path, tmp_path
     mount = load_mount(tmp_path / "right.toml")
     assert mount is not None and np.allclose(mount, np.eye(4), atol=1e-6)
     assert found.rig is not None
-    np.testing.assert_array_equal(mount, found.rig.T_rig_camera["right"])
+    np.testing.assert_array_equal(mount, found.rig.cameras["right"].T_rig_camera)
     assert load_calibration(tmp_path / "left.toml") == found.cameras["left"].intrinsics
     told = report_json(found, gathered.cameras, files)
     assert json.loads(json.dumps(told)) == told and told["rig"]["cameras"]["left"]["moments"] > 8
