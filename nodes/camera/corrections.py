@@ -21,11 +21,8 @@ _log = structlog.get_logger(__name__)
 
 
 def without_loops(live: LiveCamera) -> tuple[LiveCamera, str]:
-    """A camera whose poses close no loops: the map would not follow, and later frames would not fit it.
-
-    Returns:
-        The camera, and what to tell the user; empty where its poses close none anyway.
-    """
+    """A camera whose poses close no loops, since the map would not follow, and what to tell the user; empty where its
+    poses close none anyway."""
     poses, _ = table_of(live.poses, "camera.poses")
     if poses.get("kind") != "rgbd" or not poses.get("loop_closure", True):
         return live, ""
@@ -39,12 +36,7 @@ def without_loops(live: LiveCamera) -> tuple[LiveCamera, str]:
 
 
 class CorrectionSender:
-    """Sends the newest correction that has not arrived; each one says all that the one before it did.
-
-    Args:
-        endpoint: Where the mapper answers.
-        camera_id: Whose poses they are.
-    """
+    """Sends the mapper the newest correction that has not arrived; each one says all that the one before it did."""
 
     def __init__(self, endpoint: str, camera_id: str) -> None:
         self._endpoint = endpoint
@@ -89,26 +81,20 @@ class CorrectionSender:
                 corrected, self._next = self._next, None
             if corrected is None:
                 return
+            poses = {(self._camera_id, stamp_ns): pose for stamp_ns, pose in corrected.poses.items()}
             try:
-                self._send(corrected)
-            except TransportError as error:  # the mapper starts again, or hangs
-                self._tell(str(error))
-                with self._changed:
+                with MapClient(self._endpoint) as client:
+                    client.correct_poses(poses, until_ns=corrected.until_ns, within_ns=_SAME_FRAME_NS)
+                self._sent += 1
+                self._trouble = ""
+            except SemanticMapperError as error:
+                if not self._trouble:
+                    _log.warning("correction_not_taken", reason=str(error))
+                self._trouble = f"the map does not follow closed loops: {error}"
+                if not isinstance(error, TransportError):
+                    continue  # the mapper refuses; it says what to set
+                with self._changed:  # it starts again, or hangs
                     if self._ended:
                         return
                     self._next = self._next or corrected
                     self._changed.wait_for(lambda: self._ended, RETRY_S)
-            except SemanticMapperError as error:  # it refuses; it says what to set
-                self._tell(str(error))
-
-    def _send(self, corrected: CorrectedWorld) -> None:
-        poses = {(self._camera_id, stamp_ns): pose for stamp_ns, pose in corrected.poses.items()}
-        with MapClient(self._endpoint) as client:
-            client.correct_poses(poses, until_ns=corrected.until_ns, within_ns=_SAME_FRAME_NS)
-        self._sent += 1
-        self._trouble = ""
-
-    def _tell(self, reason: str) -> None:
-        if not self._trouble:
-            _log.warning("correction_not_taken", reason=reason)
-        self._trouble = f"the map does not follow closed loops: {reason}"

@@ -11,15 +11,12 @@ from semantic_mapper.replay.log.sequence import open_log
 
 
 def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions], where: str) -> None:
-    """Refuse frames of one name from two cameras at one node.
+    """Raise ``ConfigError`` for frames of one name from two cameras at one node.
 
     Args:
         reader: Name of the node.
         cameras: Those whose frames it takes, by node name.
         where: For messages.
-
-    Raises:
-        ConfigError: two cameras of one name.
     """
     if len(cameras) < 2:
         return

@@ -27,7 +27,7 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions, LiveCamera, table_of
 from semantic_mapper.nodes.publishing import publish_status
 from semantic_mapper.transport.codec import encode, encode_frame
-from semantic_mapper.transport.messages import EndOfStream, EndReason, NodeState, Parts, Status
+from semantic_mapper.transport.messages import EndOfStream, EndReason, NodeState, Status
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import PosedFrame
 
@@ -56,18 +56,22 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
     live, note = (live, "") if options.corrections else without_loops(live)
     with (
         Publisher(context.endpoint(context.name), policy=policy) as publisher,
-        _StatusReporter(context, publisher, note) as reporter,
+        _LiveNode(context, options, publisher, note) as node,
     ):
         context.heartbeat.ready()  # a camera may be plugged in much later
         with ExitStack() as stack:
-            source = _open(context, live, reporter, stack)
+            source = node.open(live, stack)
             if source is None:
                 return
-            _listeners(context, options, publisher)
-            sender = _correction_sender(context, options, live, stack)
-            reporter.sender = sender
-            with reporter.watching_driver():
-                _publish(context, options, publisher, reporter, source, sender)
+            try:
+                wait_for_listeners(context, publisher)
+            except TransportError as error:  # a camera does not end because one of them does not come
+                _log.warning("some_do_not_listen", reason=str(error))
+            if options.corrections:
+                named = options.corrections
+                endpoint = named if "://" in named else context.endpoint(named)
+                node.sender = stack.enter_context(CorrectionSender(endpoint, live.id))
+            node.publish_all(source)
         context.heartbeat.ending()
         drain(context, publisher)
 
@@ -112,139 +116,22 @@ def with_poses(camera: Camera, live: LiveCamera, driver: dict[str, Any]) -> Pose
     return PosedCamera(camera, make_poses(poses), checks, T_rig_camera=mount, scale_known=gives_metres(poses))
 
 
-def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, stack: ExitStack) -> PosedCamera | None:
-    """An open source, which ``stack`` closes; None where a stop request came first.
-
-    Raises:
-        CameraError: it could not be opened within ``live.open_s``.
-    """
-    began, failures, last_error = time.monotonic(), 0, ""
-    while not context.stop:
-        source = make_source(live)
-        try:
-            with reporter.watching_driver():
-                stack.enter_context(source)
-        except CameraError as error:
-            if live.open_s and time.monotonic() - began > live.open_s:
-                raise
-            if str(error) != last_error:
-                _log.warning("camera_not_open", reason=str(error))
-            last_error = reporter.waiting_for = str(error)
-        else:
-            reporter.watch(source)
-            return source
-        failures += 1
-        _pause(context, min(FIRST_PAUSE_S * 2.0 ** min(failures - 1, 64), MAX_PAUSE_S))
-    return None
-
-
-def _pause(context: NodeContext, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not context.stop and time.monotonic() < deadline:
-        time.sleep(POLL_S)
-
-
-def _listeners(context: NodeContext, options: CameraOptions, publisher: Publisher) -> None:
-    """Give the others time to start; a camera does not end because one of them does not come."""
-    try:
-        wait_for_listeners(context, publisher)
-    except TransportError as error:
-        _log.warning("some_do_not_listen", reason=str(error))
-
-
-def _correction_sender(
-    context: NodeContext, options: CameraOptions, live: LiveCamera, stack: ExitStack
-) -> CorrectionSender | None:
-    """Takes closed loops to the mapper, where the options name one; ``stack`` ends it."""
-    named = options.corrections
-    if not named:
-        return None
-    return stack.enter_context(CorrectionSender(named if "://" in named else context.endpoint(named), live.id))
-
-
-def _publish(
-    context: NodeContext,
-    options: CameraOptions,
-    publisher: Publisher,
-    reporter: _StatusReporter,
-    source: PosedCamera,
-    sender: CorrectionSender | None,
-) -> None:
-    publisher.publish(encode(source.info, sender=context.name))
-    _log.info("publishing", source=source.info.source)
-    reason: EndReason = "error"
-    detail = "the camera node failed"
-    try:
-        for frame in source:
-            if context.stop:
-                break
-            if not _send_frame(context, options, publisher, encode_frame(frame)):
-                break
-            reporter.sent(frame)
-            _correct(source, sender)
-            if options.max_frames and reporter.published >= options.max_frames:
-                break
-        _correct(source, sender, final=True)
-        reason, detail = ("stopped" if context.stop else "end"), ""
-    except CameraError as error:
-        detail = str(error)
-        raise
-    finally:
-        if reason != "error" or not context.restartable:  # else the stream goes on with the process after this one
-            _send_end(publisher, encode(EndOfStream(context.name, reason, reporter.published, detail)))
-        _log.info("published", frames=reporter.published, reason=reason)
-
-
-def _correct(source: PosedCamera, sender: CorrectionSender | None, *, final: bool = False) -> None:
-    """Hand on what closed loops have changed, if anything."""
-    if sender is None:
-        return
-    corrected = source.correction(final)
-    if corrected is not None:
-        sender.put(corrected)
-
-
-def _send_frame(context: NodeContext, options: CameraOptions, publisher: Publisher, parts: Parts) -> bool:
-    """Publish one frame, and wait for readers that must not lose any; False where a stop request came first.
-
-    Raises:
-        TransportError: a reader has had no room for it within ``ack_timeout_s``.
-    """
-    deadline = time.monotonic() + options.ack_timeout_s
-    while not context.stop:
-        try:
-            publisher.publish(parts, SEND_SLICE_S)
-            return True
-        except TransportError as error:
-            if time.monotonic() > deadline:
-                raise TransportError(
-                    f"camera node '{context.name}': a reader has taken no frame for {options.ack_timeout_s:g} s "
-                    "(ack_timeout_s); it hangs, or needs longer than that for one frame"
-                ) from error
-        context.heartbeat.turn()
-    return False
-
-
-def _send_end(publisher: Publisher, parts: Parts) -> None:
-    """Publish the end of the stream; readers without room for it now are reminded of it while the node drains."""
-    with suppress(TransportError):  # the publisher keeps it for ``remind``
-        publisher.publish(parts, SEND_SLICE_S)
-
-
-class _StatusReporter:
-    """Says once a second how the camera is, whatever the camera does, and passes the stop request on to it.
+class _LiveNode:
+    """Publishes the frames; a second thread says once a second how the camera is, whatever the camera does, and passes
+    the stop request on to it.
 
     To the launcher it tells turns of the main loop for as long as no call into the driver hangs.
     """
 
-    def __init__(self, context: NodeContext, publisher: Publisher, note: str = "") -> None:
-        self.published = 0
-        self._notes = (note,) if note else ()  # of the settings; reported with the warnings
-        self.waiting_for = ""  # why the camera could not be opened yet
-        self.sender: CorrectionSender | None = None
+    def __init__(self, context: NodeContext, options: CameraOptions, publisher: Publisher, note: str) -> None:
+        self.sender: CorrectionSender | None = None  # takes closed loops to the mapper
         self._context = context
+        self._options = options
         self._publisher = publisher
-        self._source: PosedCamera | None = None
+        self._note = note  # of the settings; reported with the warnings
+        self._waiting_for = ""  # why the camera could not be opened yet
+        self._source: PosedCamera | None = None  # once it is open
+        self._published = 0
         self._first_seq = self._last_seq = -1
         self._sent_at: float | None = None
         self._in_driver = False
@@ -259,10 +146,96 @@ class _StatusReporter:
     def __exit__(self, *error: object) -> None:
         self._ended.set()
         self._thread.join()
-        self._tell("ended")
+        self._report("ended")
+
+    def open(self, live: LiveCamera, stack: ExitStack) -> PosedCamera | None:
+        """An open source, which ``stack`` closes; None where a stop request came first.
+
+        Raises:
+            CameraError: it could not be opened within ``live.open_s``.
+        """
+        began, pause_s = time.monotonic(), FIRST_PAUSE_S
+        while not self._context.stop:
+            source = make_source(live)
+            try:
+                with self._watching_driver():
+                    stack.enter_context(source)
+            except CameraError as error:
+                if live.open_s and time.monotonic() - began > live.open_s:
+                    raise
+                if str(error) != self._waiting_for:
+                    _log.warning("camera_not_open", reason=str(error))
+                self._waiting_for = str(error)
+            else:
+                self._waiting_for = ""
+                self._source = source
+                return source
+            deadline, pause_s = time.monotonic() + pause_s, min(2 * pause_s, MAX_PAUSE_S)
+            while not self._context.stop and time.monotonic() < deadline:
+                time.sleep(POLL_S)
+        return None
+
+    def publish_all(self, source: PosedCamera) -> None:
+        """Publish frames to the end of the source, or until a stop request, and the end of the stream.
+
+        Raises:
+            CameraError: the camera has failed.
+            TransportError: a reader that must not lose any has taken no frame for ``ack_timeout_s``.
+        """
+        context, publisher = self._context, self._publisher
+        publisher.publish(encode(source.info, sender=context.name))
+        _log.info("publishing", source=source.info.source)
+        reason: EndReason = "error"
+        detail = "the camera node failed"
+        try:
+            with self._watching_driver():
+                for frame in source:
+                    if context.stop or not self._send(frame):
+                        break
+                    self._correct(source)
+                    if self._options.max_frames and self._published >= self._options.max_frames:
+                        break
+                self._correct(source, final=True)
+            reason, detail = ("stopped" if context.stop else "end"), ""
+        except CameraError as error:
+            detail = str(error)
+            raise
+        finally:
+            if reason != "error" or not context.restartable:  # else the stream goes on with the process after this one
+                with suppress(TransportError):  # who has no room for it now is reminded while the node drains
+                    end = EndOfStream(context.name, reason, self._published, detail)
+                    publisher.publish(encode(end), SEND_SLICE_S)
+            _log.info("published", frames=self._published, reason=reason)
+
+    def _correct(self, source: PosedCamera, *, final: bool = False) -> None:
+        """Hand on what closed loops have changed, if anything."""
+        if self.sender is not None and (corrected := source.correction(final)) is not None:
+            self.sender.put(corrected)
+
+    def _send(self, frame: PosedFrame) -> bool:
+        """Publish one frame, and wait for readers that must not lose any; False where a stop request came first."""
+        parts = encode_frame(frame)
+        deadline = time.monotonic() + self._options.ack_timeout_s
+        while not self._context.stop:
+            try:
+                self._publisher.publish(parts, SEND_SLICE_S)
+            except TransportError as error:
+                if time.monotonic() > deadline:
+                    raise TransportError(
+                        f"camera node '{self._context.name}': a reader has taken no frame for "
+                        f"{self._options.ack_timeout_s:g} s (ack_timeout_s); it hangs, or needs longer than that"
+                    ) from error
+                self._context.heartbeat.turn()
+                continue
+            self._first_seq = frame.seq if self._first_seq < 0 else self._first_seq
+            self._last_seq = frame.seq
+            self._published += 1
+            self._sent_at = time.monotonic()
+            return True
+        return False
 
     @contextmanager
-    def watching_driver(self) -> Iterator[None]:
+    def _watching_driver(self) -> Iterator[None]:
         """While it is entered, only a driver that comes round counts as a turn."""
         self._in_driver = True
         try:
@@ -270,58 +243,33 @@ class _StatusReporter:
         finally:
             self._in_driver = False
 
-    def watch(self, source: PosedCamera) -> None:
-        """The camera is open."""
-        self.waiting_for = ""
-        self._source = source
-
-    def sent(self, frame: PosedFrame) -> None:
-        """A frame has been published."""
-        if self._first_seq < 0:
-            self._first_seq = frame.seq
-        self._last_seq = frame.seq
-        self.published += 1
-        self._sent_at = time.monotonic()
-
     def _run(self) -> None:
         last_sent = 0.0
         while not self._ended.wait(POLL_S):
             source = self._source
-            if self._comes_round(source):
+            before, self._last_poll_time = self._last_poll_time, 0.0 if source is None else source.last_poll_time
+            if not self._in_driver or self._last_poll_time != before:
                 self._context.heartbeat.turn()
             if self._context.stop and source is not None:
                 source.stop()
             if time.monotonic() - last_sent >= STATUS_PERIOD_S:
                 last_sent = time.monotonic()
-                self._tell(self._state())
+                warned = bool(self._warnings())
+                running: NodeState = "degraded" if warned else "running"
+                self._report("stopping" if self._context.stop else "starting" if source is None else running)
 
-    def _comes_round(self, source: PosedCamera | None) -> bool:
-        if not self._in_driver:
-            return True
-        before, self._last_poll_time = self._last_poll_time, source.last_poll_time if source is not None else 0.0
-        return self._last_poll_time != before
-
-    def _state(self) -> NodeState:
-        if self._context.stop:
-            return "stopping"
-        if self._source is None:
-            return "starting"
+    def _warnings(self) -> tuple[str, ...]:
+        own = self._source.warnings if self._source is not None else (self._waiting_for,)
         sender = () if self.sender is None else self.sender.warnings
-        return "degraded" if self._source.warnings or sender or self._notes else "running"
+        return tuple(text for text in (*own, *sender, self._note) if text)
 
-    def _tell(self, state: NodeState) -> None:
-        counters = {"published": self.published}
+    def _report(self, state: NodeState) -> None:
+        counters = {"published": self._published}
         if self._first_seq >= 0:
-            counters["missing"] = self._last_seq - self._first_seq + 1 - self.published
-        warnings = (self.waiting_for,) if self.waiting_for else ()
-        if self._source is not None:
-            counters |= self._source.counters
-            warnings = self._source.warnings
-        if self.sender is not None:
-            counters |= self.sender.counters
-            warnings = (*warnings, *self.sender.warnings)
-        warnings = (*warnings, *self._notes)
+            counters["missing"] = self._last_seq - self._first_seq + 1 - self._published
+        for part in (self._source, self.sender):
+            counters |= {} if part is None else part.counters
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
-        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, warnings)
+        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, self._warnings())
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
             publish_status(self._publisher, status, 0.0)

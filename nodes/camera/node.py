@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NoReturn
 
@@ -29,7 +30,9 @@ def run_camera(context: NodeContext, options: CameraOptions) -> None:
     """Publish frames to the end of the source, or until stopped.
 
     Raises:
-        LogError, NodeError, TransportError: see ``_play``.
+        LogError: the log cannot be read.
+        NodeError: lockstep, and the mapper has gone.
+        TransportError: nobody subscribes.
         CameraError, ConfigError: see ``run_live_camera``.
     """
     if options.camera is not None:
@@ -41,14 +44,6 @@ def run_camera(context: NodeContext, options: CameraOptions) -> None:
 
 
 def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
-    """Play a log to its end, or until stopped.
-
-    Raises:
-        LogError: the log cannot be read.
-        NodeError: lockstep, and the mapper has gone.
-        TransportError: nobody subscribes.
-    """
-
     def on_error(error: LogError) -> None:
         _log.error("log_damaged", error=str(error))
 
@@ -62,47 +57,39 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
         source=context.name,
     )
     stopped = threading.Event()
-    with open_log(path, on_error=on_error) as log:
-        policy = "drop" if options.mode == "realtime" else "block"
-        with Publisher(context.endpoint(context.name), policy=policy) as publisher:
-            context.heartbeat.ready()
-            _log.info("playing", log=str(path), frames=len(log), mode=options.mode)
-            watcher = threading.Thread(target=_pass_on_stop, args=(context, stopped), daemon=True)
-            watcher.start()
+    policy = "drop" if options.mode == "realtime" else "block"
+    with (
+        open_log(path, on_error=on_error) as log,
+        Publisher(context.endpoint(context.name), policy=policy) as publisher,
+    ):
+        context.heartbeat.ready()
+        _log.info("playing", log=str(path), frames=len(log), mode=options.mode)
+        threading.Thread(target=_pass_on_stop, args=(context, stopped), daemon=True).start()
+        with ExitStack() as stack:
             acks = None
             if options.mode == "lockstep":
-                acks = LosslessSubscriber(context.endpoint(options.mapper), ACK_TOPICS)
-            total = min(len(log), options.max_frames or len(log))
-            try:
-                if not wait_for_listeners(context, publisher, acks):
-                    _log.info("played", published=0, stopped=True)
-                    return
-                with frame_progress("played", total) as bar:
-                    playback = Playback(context, options.rate)
+                acks = stack.enter_context(LosslessSubscriber(context.endpoint(options.mapper), ACK_TOPICS))
+            if not wait_for_listeners(context, publisher, acks):
+                _log.info("played", published=0, stopped=True)
+                return
+            bar = stack.enter_context(frame_progress("played", min(len(log), options.max_frames or len(log))))
+            playback = Playback(context, options.rate)
 
-                    def on_frame(envelope: Envelope) -> None:
-                        bar.advance()
-                        playback.note_frame(envelope.stamp_ns)
+            def on_frame(envelope: Envelope) -> None:
+                bar.advance()
+                playback.note_frame(envelope.stamp_ns)
 
-                    play_options = dataclasses.replace(play_options, from_stamp_ns=playback.due_stamp_ns())
-                    report = play(log, publisher, acks, play_options, stop=stopped, on_frame=on_frame)
-            finally:
-                if acks is not None:
-                    acks.close()
-            for error in report.errors[len(log.errors) :]:
-                _log.error("frame_left_out", error=str(error))
-            _log.info("played", published=report.published, damaged=len(report.errors), stopped=report.stopped)
-            context.heartbeat.ending()
-            drain(context, publisher)
+            play_options = dataclasses.replace(play_options, from_stamp_ns=playback.due_stamp_ns())
+            report = play(log, publisher, acks, play_options, stop=stopped, on_frame=on_frame)
+        for error in report.errors[len(log.errors) :]:
+            _log.error("frame_left_out", error=str(error))
+        _log.info("played", published=report.published, damaged=len(report.errors), stopped=report.stopped)
+        context.heartbeat.ending()
+        drain(context, publisher)
 
 
 class Playback:
-    """Where a restarted player goes on: where the recording is by now, as a camera would.
-
-    Args:
-        context: Of the camera.
-        rate: How much faster than recorded the log is played.
-    """
+    """Where a restarted player goes on: where the recording is by now, as a camera would; ``rate`` times as fast."""
 
     def __init__(self, context: NodeContext, rate: float) -> None:
         self._context = context
