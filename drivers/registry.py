@@ -15,7 +15,7 @@ import msgspec
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
-from semantic_mapper.errors import ConfigError, DependencyError, SemanticMapperError
+from semantic_mapper.errors import CameraError, ConfigError, DependencyError
 
 KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
 
@@ -36,29 +36,16 @@ class Driver(Protocol):
     Config: type[msgspec.Struct]
 
     def open_camera(self, config: Any, camera_id: str) -> Camera:
-        """A camera that is not open yet; what the config lacks is refused here.
-
-        Raises:
-            CameraError, ConfigError: it cannot work with this config.
-        """
+        """A camera that is not open yet; ``CameraError``, ``ConfigError``: it cannot work with this config."""
         ...
 
     def list_devices(self) -> Sequence[FoundCamera]:
-        """What is connected now; opens nothing for longer than a question.
-
-        Raises:
-            CameraError, DependencyError: it cannot be searched for.
-        """
+        """What is connected now; ``CameraError``, ``DependencyError``: it cannot be searched for."""
         ...
 
 
 def load_driver(kind: str) -> Driver:
-    """The package of a kind.
-
-    Raises:
-        ConfigError: no such kind.
-        DependencyError: it needs something that is not installed.
-    """
+    """The package of a kind; ``ConfigError``: there is none, ``DependencyError``: something is not installed."""
     if kind not in KINDS:
         near = difflib.get_close_matches(kind, KINDS, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(KINDS)}"
@@ -88,18 +75,12 @@ def open_camera(kind: str, config: Mapping[str, Any], camera_id: str, where: str
 
 
 def find_cameras(kinds: Sequence[str] = KINDS) -> tuple[list[FoundCamera], dict[str, str]]:
-    """All cameras that are connected, and why a kind could not be searched for.
-
-    Raises:
-        ConfigError: no such kind.
-    """
+    """All cameras that are connected, and why a kind could not be searched for."""
     found: list[FoundCamera] = []
     unknown: dict[str, str] = {}
     for kind in kinds:
         try:
             found += load_driver(kind).list_devices()
-        except ConfigError:
-            raise
-        except SemanticMapperError as error:
+        except (CameraError, DependencyError) as error:
             unknown[kind] = str(error)
     return found, unknown

@@ -7,6 +7,7 @@ import importlib
 import os
 import re
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -86,34 +87,19 @@ def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> s
             "ports 11490 and 11491"
         )
     what = f"the OAK '{address}' is not connected" if address else "no OAK camera is connected"
-    boards = _usb_boards(sysfs, nodes)
-    locked = [str(node) for node in boards if node.exists() and not os.access(node, os.W_OK)]
-    if locked:
-        return f"{what}, or this user may not open it ({', '.join(locked)}): {UDEV_RULE}; then plug it in again"
-    if boards:
-        return (
-            f"{what}, though there is one on USB ({', '.join(map(str, boards))}): plug it in again, with its own "
-            "cable, into a USB 3 port; `semantic-mapper doctor --cameras` shows the names of those that answer"
-        )
-    return (
-        f"{what}: check its cable and power (USB: a USB 3 port, and `lsusb | grep {USB_VENDOR}` shows it; PoE: "
-        "`device` may be its IP address, which also works through a router). Without permission it does not show "
-        f"either: {UDEV_RULE}"
-    )
-
-
-def _usb_boards(sysfs: Path, nodes: Path) -> list[Path]:
-    """Device files of the vendor's boards on USB."""
-    boards: list[Path] = []
+    boards: list[str] = []
     for vendor in sorted(sysfs.glob("*/idVendor")):
-        try:
-            if vendor.read_text().strip() != USB_VENDOR:
-                continue
-            bus, device = (int((vendor.parent / name).read_text()) for name in ("busnum", "devnum"))
-        except (OSError, ValueError):  # it has been unplugged meanwhile
-            continue
-        boards.append(nodes / f"{bus:03d}" / f"{device:03d}")
-    return boards
+        with suppress(OSError, ValueError):  # it has been unplugged meanwhile
+            if vendor.read_text().strip() == USB_VENDOR:
+                bus, device = (int((vendor.parent / name).read_text()) for name in ("busnum", "devnum"))
+                node = nodes / f"{bus:03d}" / f"{device:03d}"
+                boards.append(f"{node}" if os.access(node, os.W_OK) else f"{node}, which this user may not open")
+    there = f", though there is one on USB ({'; '.join(boards)})" if boards else ""
+    return (
+        f"{what}{there}: plug it in again, with its own cable, into a USB 3 port (PoE: `device` may be its IP address, "
+        "which also works through a router); `semantic-mapper doctor --cameras` shows those that answer. Without "
+        f"permission it does not show either: {UDEV_RULE}"
+    )
 
 
 def _search(address: str = "") -> list[Any]:

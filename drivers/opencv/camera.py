@@ -24,12 +24,7 @@ _log = get_logger(__name__)
 
 
 def open_camera(config: Config, camera_id: str = "camera") -> Camera:
-    """A camera that is opened when it is entered; see ``drivers/registry.py``.
-
-    Raises:
-        CameraError: no source or no calibration is named.
-        ConfigError: the calibration cannot be read.
-    """
+    """A camera that is opened when it is entered; see ``drivers/registry.py``."""
     if not config.source:
         raise CameraError(f'camera \'{camera_id}\': no video is named; give source = "FILE" or source = "rtsp://..."')
     measured = require_calibration(config.calibration, config.uncalibrated, f"video {without_secrets(config.source)}")
@@ -45,13 +40,7 @@ class _FileDevice(CaptureDevice):
 
 
 class VideoFile(Camera):
-    """Plays a file once.
-
-    Args:
-        config: With the file's name.
-        camera_id: What its images are called.
-        measured: Calibration of the camera that took it; None: guessed, said in ``warnings``.
-    """
+    """Plays a file once; its camera's calibration is ``measured``, or a guess, which ``warnings`` says."""
 
     can_wait = True
 

@@ -40,13 +40,13 @@ _NEAR = 4  # keyframes that a new one is aligned to because they should overlap
 _LOOK_ALIKE = 2  # of each slice of places, at most
 _SLICE = 10  # places compared at a time (2 ms each)
 _JOBS = 60  # that wait, at most; the oldest is dropped
-_BOTH_WAYS_M, _BOTH_WAYS_DEG = 0.03, 1.5  # how far the two directions may differ
-_SMALL_M, _SMALL_DEG = 0.08, 3.0  # a loop that moves a keyframe by less needs no other that agrees with it
-_AGREE_M, _AGREE_DEG = 0.15, 4.0  # between two loops that do not
+_BOTH_WAYS = 0.03, 1.5  # metres and degrees by which the two directions may differ
+_SMALL = 0.08, 3.0  # a loop that moves a keyframe by less needs no other that agrees with it
+_AGREE = 0.15, 4.0  # between two loops that do not
 _PATIENCE = 15  # keyframes for which a loop waits for another
 _DRIFT_DEG_M = 1.5  # as ``DRIFT``, of rotation: degrees a metre
 _SLACK_M, _SLACK_DEG = 0.1, 5.0
-_BENT_M, _BENT_DEG = 0.06, 4.0  # loops that bend the chain of keyframes by more are wrong, unless it is known badly
+_BENT = 0.06, 4.0  # loops that bend the chain of keyframes by more are wrong, unless it is known badly
 _FIRM_M = 0.02  # one sigma of the chain's edges that are known well
 _FLOOR_M, _FLOOR_RAD = 0.004, 0.0025  # no motion is known better
 _OPEN_M, _OPEN_RAD = 0.1, 0.05  # along what no point shows
@@ -65,6 +65,12 @@ def apart(T_a: Float64, T_b: Float64) -> tuple[float, float]:
     """Metres and degrees between two poses."""
     moved_m, turned = pose_distance(T_a, T_b)
     return moved_m, float(np.rad2deg(turned))
+
+
+def within(T_a: Float64, T_b: Float64, limits: tuple[float, float]) -> bool:
+    """Whether two poses are apart by less than so many metres and degrees."""
+    moved_m, turned_deg = apart(T_a, T_b)
+    return moved_m < limits[0] and turned_deg < limits[1]
 
 
 def lies_on(found: Fit) -> bool:
@@ -101,12 +107,24 @@ class Edge:
         return self.chain, -float(np.trace(self.covariance[3:, 3:]))
 
 
+@dataclass(slots=True, eq=False)
+class _Given:
+    """A pose that was given: relative to its keyframe, and as of the last correction."""
+
+    stamp_ns: int
+    keyframe: int
+    T_keyframe_camera: Float64
+    T_world_camera: Float64
+
+
 class KeyframeGraph:
-    """Keyframes by number, in the order they were made, and measured motions between them. Deterministic."""
+    """Keyframes by number, in the order they were made, measured motions between them, and the last poses that a camera
+    was given: where keyframes move, they move along. Deterministic."""
 
     def __init__(self) -> None:
         self.frames: dict[int, OdometryKeyframe] = {}
         self.edges: list[Edge] = []
+        self._given: deque[_Given] = deque(maxlen=_GIVEN)  # oldest first
 
     @property
     def poses(self) -> dict[int, Float64]:
@@ -158,14 +176,11 @@ class KeyframeGraph:
                     heapq.heappush(heap, (way + length, variance + more, there))
         return 0.0, 0.0
 
-    def trim(self) -> tuple[int, int, Float64] | None:
+    def trim(self) -> None:
         """With more than ``MAX_KEYFRAMES``, let the younger of the two go that are nearest to each other, never the
-        newest, which is in use. Its edges become those of the other one, as both stand now.
-
-        Returns: numbers of the one that has gone and of its heir, and T_heir_gone (4, 4).
-        """
+        newest, which is in use. Its edges and poses become those of the other one, as both stand now."""
         if len(self.frames) <= MAX_KEYFRAMES:
-            return None
+            return
         numbers, poses = [*self.frames][:-1], np.array([*self.poses.values()])[:-1]
         way, turn = view_distances(poses[:, None], poses[None])
         first, second = most_crowded(np.hypot(way / _REACH_M, turn / _REACH_RAD))
@@ -180,7 +195,9 @@ class KeyframeGraph:
             if edge.a != edge.b:
                 edges.append(edge)
         self.edges = self._strongest(edges)
-        return gone, heir, T_heir_gone
+        for given in self._given:
+            if given.keyframe == gone:
+                given.keyframe, given.T_keyframe_camera = heir, T_heir_gone @ given.T_keyframe_camera
 
     def _strongest(self, edges: list[Edge]) -> list[Edge]:
         """The strongest edges, so that the graph's size has a bound, with those that keep it in one piece (Kruskal)."""
@@ -213,6 +230,25 @@ class KeyframeGraph:
             graph.add(gtsam.BetweenFactorPose3(X(edge.a), X(edge.b), gtsam.Pose3(edge.T_a_b), robust))
         found = minimize(graph, start, _ITERATIONS)
         return {number: found.atPose3(X(number)).matrix() for number in poses}
+
+    def give(self, stamp_ns: int, keyframe: OdometryKeyframe, T_world_camera: Float64) -> None:
+        """A camera is given a pose near a keyframe."""
+        relative = invert_pose(keyframe.target.T_world_camera) @ T_world_camera
+        self._given.append(_Given(stamp_ns, keyframe.number, relative, T_world_camera))
+
+    def correction(self, final: bool) -> CorrectedWorld | None:
+        """All given poses as the keyframes stand now, if that moves one visibly; ``final``: no more will come."""
+        if not self._given:
+            return None
+        keyframes, before = self.poses, np.array([g.T_world_camera for g in self._given])
+        poses = np.array([keyframes[g.keyframe] @ g.T_keyframe_camera for g in self._given])
+        moved_m = float(np.linalg.norm(poses[:, :3, 3] - before[:, :3, 3], axis=1).max())
+        if moved_m < (_LEFT_M if final else _VISIBLE_M):
+            return None
+        for given, pose in zip(self._given, poses, strict=True):
+            given.T_world_camera = pose
+        until_ns, motion = self._given[-1].stamp_ns, poses[-1] @ invert_pose(before[-1])
+        return CorrectedWorld({g.stamp_ns: g.T_world_camera for g in self._given}, until_ns, motion)
 
 
 class LoopCloser:
@@ -309,10 +345,9 @@ class LoopCloser:
         back = None if there is None else align(one, [Target(other, np.eye(4))], invert_pose(there))
         if there is None or back is None:
             return None
-        moved_m, turned_deg = apart(invert_pose(back), there)
         T_a_b = interpolate_pose(there, invert_pose(back), 0.5)
         found = fit(other, Target(one, np.eye(4)), T_a_b)
-        if not lies_on(found) or moved_m > _BOTH_WAYS_M or turned_deg > _BOTH_WAYS_DEG:
+        if not lies_on(found) or not within(invert_pose(back), there, _BOTH_WAYS):
             return None
         return Edge(a, b, T_a_b, _covariance(found))
 
@@ -328,7 +363,7 @@ class LoopCloser:
             _log.info("loop_refused", keyframes=(edge.a, edge.b), **moved)
             return
         taken = [edge]
-        if moved_m >= _SMALL_M or turned_deg >= _SMALL_DEG:
+        if moved_m >= _SMALL[0] or turned_deg >= _SMALL[1]:
             kept = [e for e in self._waiting if e.a in poses and e.b in poses and edge.b - e.b <= _PATIENCE]
             self._counters["loops_refused"] += len(self._waiting) - len(kept)
             other = next((e for e in kept if e.b != edge.b and self._agree(e, edge)), None)
@@ -341,68 +376,21 @@ class LoopCloser:
         """Whether two loops move the same place to the same place."""
         poses = self._graph.poses
         motions = [poses[e.a] @ e.T_a_b @ invert_pose(poses[e.b]) for e in (one, other)]
-        moved_m, turned_deg = apart(motions[0] @ poses[other.b], motions[1] @ poses[other.b])
-        return moved_m < _AGREE_M and turned_deg < _AGREE_DEG
+        return within(motions[0] @ poses[other.b], motions[1] @ poses[other.b], _AGREE)
 
     def _close(self) -> Mapping[int, Float64] | None:
         before, new = self._graph.poses, [e for e in self._new if e in self._graph.edges]
         self._new = []
         poses = self._graph.optimized()
-        for e in self._graph.edges:
-            moved_m, turned_deg = apart(poses[e.a] @ e.T_a_b, poses[e.b])
-            if e.chain and (moved_m > _BENT_M or turned_deg > _BENT_DEG):
-                self._graph.edges = [e for e in self._graph.edges if e not in new]
-                self._counters["loops_refused"] += len(new)
-                _log.warning("loops_refused", count=len(new), reason="they bend what tracking found")
-                return None
+        if any(e.chain and not within(poses[e.a] @ e.T_a_b, poses[e.b], _BENT) for e in self._graph.edges):
+            self._graph.edges = [e for e in self._graph.edges if e not in new]
+            self._counters["loops_refused"] += len(new)
+            _log.warning("loops_refused", count=len(new), reason="they bend what tracking found")
+            return None
         moved_m = max(apart(before[n], pose)[0] for n, pose in poses.items())
         self._counters["loops_closed"] += len(new)
         _log.info("loops_closed", count=len(new), keyframes=len(poses), moved_m=round(moved_m, 3))
         return poses
-
-
-@dataclass(slots=True, eq=False)
-class _Given:
-    """A pose that was given: relative to its keyframe, and as of the last correction."""
-
-    stamp_ns: int
-    keyframe: int
-    T_keyframe_camera: Float64
-    T_world_camera: Float64
-
-
-class PoseTrail:
-    """The last poses that a camera was given, oldest first: where keyframes move, they move along."""
-
-    def __init__(self) -> None:
-        self._given: deque[_Given] = deque(maxlen=_GIVEN)
-
-    def add(self, stamp_ns: int, keyframe: OdometryKeyframe, T_world_camera: Float64) -> None:
-        """A pose is given."""
-        relative = invert_pose(keyframe.target.T_world_camera) @ T_world_camera
-        self._given.append(_Given(stamp_ns, keyframe.number, relative, T_world_camera))
-
-    def hand_over(self, gone: int, heir: int, T_heir_gone: Float64) -> None:
-        """A keyframe is no longer kept: poses relative to it are those of another one from now on."""
-        for given in self._given:
-            if given.keyframe == gone:
-                given.keyframe, given.T_keyframe_camera = heir, T_heir_gone @ given.T_keyframe_camera
-
-    def correction(self, T_world_keyframe: Mapping[int, Float64], final: bool) -> CorrectedWorld | None:
-        """All poses as the keyframes, (4, 4) by number, stand now, if that moves one visibly; ``final``: once more."""
-        if not self._given:
-            return None
-        before = np.array([g.T_world_camera for g in self._given])
-        poses = np.array([T_world_keyframe[g.keyframe] for g in self._given]) @ np.array(
-            [g.T_keyframe_camera for g in self._given]
-        )
-        moved_m = float(np.linalg.norm(poses[:, :3, 3] - before[:, :3, 3], axis=1).max())
-        if moved_m < (_LEFT_M if final else _VISIBLE_M):
-            return None
-        for given, pose in zip(self._given, poses, strict=True):
-            given.T_world_camera = pose
-        until_ns, motion = self._given[-1].stamp_ns, poses[-1] @ invert_pose(before[-1])
-        return CorrectedWorld({g.stamp_ns: g.T_world_camera for g in self._given}, until_ns, motion)
 
 
 def _covariance(found: Fit) -> Float64:

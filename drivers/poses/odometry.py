@@ -29,9 +29,9 @@ from semantic_mapper.drivers.poses.loop_closure import (
     KeyframeGraph,
     LoopCloser,
     OdometryKeyframe,
-    PoseTrail,
     apart,
     lies_on,
+    within,
 )
 from semantic_mapper.drivers.poses.motion import StampedPose
 from semantic_mapper.errors import CameraError
@@ -59,13 +59,12 @@ NEIGHBOURS = 3  # keyframes that a frame is aligned to
 KEYFRAME_M = 0.35  # a new one when moved this far from the nearest, or ...
 KEYFRAME_DEG = 20.0  # ... turned this far, or ...
 KEYFRAME_OVERLAP = 0.55  # ... seeing less than this in common with it, or off its way by another one than before
-MAX_STEP_M, MAX_STEP_DEG = 0.25, 15.0  # a result further from its first guess is wrong
+MAX_STEP = 0.25, 15.0  # metres, degrees: a result further from its first guess is wrong
 FEATURES = 500  # ORB corners an image, for first guesses and for finding back
 RELOCALISE_KEYFRAMES = 20  # tried for each image while lost, in turn
 _LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
-_JUMP_M = 0.06  # from where the last motion leads, where another keyframe is nearest than for the last image
-_JUMP_DEG = 4.0
+_JUMP = 0.06, 4.0  # m, degrees from where the last motion leads, where another keyframe is nearest than before
 _WORSE = 2.5  # times the noise of the fits before: a view that has left the last motion lies on nothing then
 _LEAST_NOISE_M = 0.002
 _NOISE_GAIN = 0.1
@@ -129,7 +128,6 @@ class OdometryPoseSource(PoseSource):
         """Forget all keyframes and poses."""
         self._graph = KeyframeGraph()
         self._closer = LoopCloser(self._graph, self._counters) if closes_loops else None
-        self._trail = PoseTrail()  # stays empty where no loops are closed: nothing moves then
         self._past: list[StampedPose] = []  # the last two poses
         self._before: _View | None = None  # the image of the last pose
         self._images = 0  # with a pose in this world
@@ -160,7 +158,7 @@ class OdometryPoseSource(PoseSource):
         guesses = self._guesses_while_lost(view) if self._lost else self._guesses(view)
         found = next((found for guess in guesses if (found := self._try(view, guess)) is not None), None)
         # A result that is not where the last motion leads may be wrong.
-        if found is None or not (self._lost or _is_close(self._expected(view.stamp_ns), found.T_world_camera)):
+        if found is None or not (self._lost or within(self._expected(view.stamp_ns), found.T_world_camera, _JUMP)):
             found = self._second_look(view, found, guesses)
         if found is None:
             return self._lose_or_begin(view, "it lies on no keyframe")
@@ -186,7 +184,7 @@ class OdometryPoseSource(PoseSource):
             expected = expected if corners is None else [last.T @ corners]
             tried = [self._try(view, guess) for guess in ([last.T] if corners is None else [*expected, last.T])]
             results += [result for result in tried if result is not None]
-            results = [r for r in results if any(_is_close(pose, r.T_world_camera) for pose in expected)]
+            results = [r for r in results if any(within(pose, r.T_world_camera, _JUMP) for pose in expected)]
         best = min(results, key=lambda r: r.fits[0].noise_m, default=None)
         noise_m = max(self._noise_m or NOISE_M, _LEAST_NOISE_M)
         return None if best is None or best.fits[0].noise_m > _WORSE * noise_m else best
@@ -203,7 +201,7 @@ class OdometryPoseSource(PoseSource):
         while final and self._closer is not None and self._closer.busy:
             self._close_loops(None)
         if final:
-            self._corrected = self._trail.correction(self._graph.poses, final) or self._corrected
+            self._corrected = self._graph.correction(final) or self._corrected
         corrected, self._corrected = self._corrected, None
         return corrected
 
@@ -220,7 +218,7 @@ class OdometryPoseSource(PoseSource):
         moves = [poses[k.number] @ invert_pose(k.target.T_world_camera) for k in nearest]
         self._past = [replace(past, T=move @ past.T) for move, past in zip(moves, self._past, strict=True)]
         self._graph.move(poses)
-        self._corrected = self._trail.correction(self._graph.poses, final=False) or self._corrected
+        self._corrected = self._graph.correction(final=False) or self._corrected
 
     def _view(self, image: CameraImage) -> _View | None:
         """None without enough depth."""
@@ -286,10 +284,7 @@ class OdometryPoseSource(PoseSource):
         used = [nearest, *(k for k in others if fit(view.levels, k.target, guess).overlap >= MIN_OVERLAP)]
         targets = [k.target for k in used]
         pose = align(view.levels, targets, guess)
-        if pose is None:
-            return None
-        moved_m, turned_deg = apart(guess, pose)
-        if moved_m > MAX_STEP_M or turned_deg > MAX_STEP_DEG:
+        if pose is None or not within(guess, pose, MAX_STEP):
             return None
         fits = [fit(view.levels, t, pose) for t in targets]
         unsure_m = min(k.unsure_m for k in used)
@@ -319,7 +314,7 @@ class OdometryPoseSource(PoseSource):
     def _accept(self, view: _View, found: _Found) -> PoseEstimate:
         pose, nearest, fits = found.T_world_camera, found.nearest, found.fits
         left_m = 0.0 if self._lost else apart(self._expected(view.stamp_ns), pose)[0]
-        jumped, self._nearest = left_m > _JUMP_M and nearest.number != self._nearest, nearest.number
+        jumped, self._nearest = left_m > _JUMP[0] and nearest.number != self._nearest, nearest.number
         if self._lost:
             self._counters["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
@@ -332,7 +327,7 @@ class OdometryPoseSource(PoseSource):
         if reach.min() > 1 or fits[0].overlap < KEYFRAME_OVERLAP or jumped:
             self._add_keyframe(view, pose, way_m, nearest.number)
         elif self._closer is not None:
-            self._trail.add(view.stamp_ns, nearest, pose)
+            self._graph.give(view.stamp_ns, nearest, pose)
         return self._given(view, pose, _sigma(fits, float(np.hypot(DRIFT * way_m, found.unsure_m))))
 
     def _add_keyframe(self, view: _View, pose: Float64, way_m: float, parent: int | None) -> None:
@@ -345,10 +340,8 @@ class OdometryPoseSource(PoseSource):
         self._graph.frames[number] = keyframe
         if self._closer is not None:
             self._closer.add(keyframe, parent)
-            self._trail.add(view.stamp_ns, keyframe, pose)
-        gone = self._graph.trim()
-        if gone is not None:
-            self._trail.hand_over(*gone)
+            self._graph.give(view.stamp_ns, keyframe, pose)
+        self._graph.trim()
 
     def _lose(self, stamp_ns: int, reason: str) -> None:
         if self._lost_ns is None:
@@ -368,16 +361,11 @@ class OdometryPoseSource(PoseSource):
         self._counters["new_sessions"] += 1
         if is_power_of_two(self._counters["new_sessions"]):
             _log.warning("odometry_begins_new_world", reason=reason, images=self._images)
-        self._corrected = self._trail.correction(self._graph.poses, final=True) or self._corrected
+        self._corrected = self._graph.correction(final=True) or self._corrected
         # The map is of a world that has lasted: it would take no corrections of the next one.
         self._begin_world(closes_loops=self._closer is not None and self._images < _YOUNG)
         self._world += 1
         return self._begin(view)
-
-
-def _is_close(T_a: Float64, T_b: Float64) -> bool:
-    moved_m, turned_deg = apart(T_a, T_b)
-    return moved_m < _JUMP_M and turned_deg < _JUMP_DEG
 
 
 def _sigma(fits: list[Fit], drift_m: float) -> float:

@@ -29,11 +29,7 @@ from semantic_mapper.errors import CameraError, ConfigError
 
 
 def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseConfig:
-    """Plain data -> checked settings of one kind; opens nothing.
-
-    Args:
-        config: ``kind`` ("device", "fixed", "topic", "board", "rgbd", "visual") and its settings, see ``config.py``.
-        where: Names the file or section in errors.
+    """Plain data -> checked settings of one ``kind`` (of ``KINDS``); opens nothing.
 
     Raises:
         ConfigError: no such kind, an unknown or bad setting, or a matrix that is no rigid transform.
@@ -74,11 +70,7 @@ class DevicePoseSource(PoseSource):
     """Takes the poses that the device itself puts into its images."""
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
-        """The image's own pose; None where the device does not know it now, or not yet.
-
-        Raises:
-            CameraError: the camera does not track itself.
-        """
+        """The image's own pose; None where it is not known now. ``CameraError``: the camera does not track itself."""
         if image.own_pose is not None:
             self._warnings = ()
             return image.own_pose
@@ -92,11 +84,7 @@ class DevicePoseSource(PoseSource):
 
 
 class FixedPoseSource(PoseSource):
-    """The same pose for every image.
-
-    Args:
-        config: Which.
-    """
+    """The same pose for every image."""
 
     def __init__(self, config: FixedPose) -> None:
         super().__init__()

@@ -110,10 +110,5 @@ def halves(rgb: UInt8, *, swapped: bool = False) -> tuple[UInt8, UInt8]:
 
 
 def open_camera(config: Config, camera_id: str) -> StereoCamera:
-    """The camera of a config, opened when it is entered; see ``drivers/registry.py``.
-
-    Raises:
-        CameraError: no device or no calibration is named.
-        ConfigError: the calibration cannot be read or cannot be worked with, or a setting of the device is unknown.
-    """
+    """The camera of a config, opened when it is entered; see ``drivers/registry.py``."""
     return StereoCamera(config, camera_id)

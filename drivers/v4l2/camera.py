@@ -24,12 +24,7 @@ _CLOCK = "its buffers carry no stamps of the monotonic clock, so images are stam
 
 
 def open_camera(config: Config, camera_id: str = "camera") -> LiveCamera:
-    """A camera that is opened when it is entered; see ``drivers/registry.py``.
-
-    Raises:
-        CameraError: no device or no calibration is named, or the calibration is for another size than requested.
-        ConfigError: the calibration cannot be read.
-    """
+    """A camera that is opened when it is entered; see ``drivers/registry.py``."""
     if not config.device:
         raise CameraError(
             f"camera '{camera_id}': no device is named; `doctor --cameras` lists what is connected; give its "

@@ -12,7 +12,6 @@ from semantic_mapper.drivers.poses.loop_closure import (
     KeyframeGraph,
     LoopCloser,
     OdometryKeyframe,
-    PoseTrail,
     apart,
 )
 from semantic_mapper.geometry import invert_pose
@@ -89,21 +88,19 @@ def test_one_far_loop_alone_is_not_believed_and_two_that_agree_are(count: int, c
 
 
 def test_poses_that_were_given_move_with_their_keyframes() -> None:
-    trail = PoseTrail()
-    assert trail.correction({}, final=True) is None
-    keyframes = {0: np.eye(4), 1: rigid(shift=(1, 0, 0))}
+    graph = KeyframeGraph()
+    assert graph.correction(final=True) is None
+    graph.frames = {0: bare(0, np.eye(4)), 1: bare(1, rigid(shift=(1, 0, 0)))}
     for stamp, (number, x) in enumerate(((0, 0.0), (0, 0.5), (1, 1.2))):
-        trail.add(stamp, bare(number, keyframes[number]), rigid(shift=(x, 0, 0)))
-    assert trail.correction(keyframes, final=True) is None  # nothing has moved
-    moved = {0: np.eye(4), 1: rigid((0, 0, np.pi / 2), (1, 0.1, 0))}
-    found = trail.correction(moved, final=False)
+        graph.give(stamp, graph.frames[number], rigid(shift=(x, 0, 0)))
+    assert graph.correction(final=True) is None  # nothing has moved
+    graph.move({1: rigid((0, 0, np.pi / 2), (1, 0.1, 0))})
+    found = graph.correction(final=False)
     assert found is not None and found.until_ns == 2
     assert found.poses[1][:3, 3] == pytest.approx((0.5, 0, 0))
     assert found.poses[2][:3, 3] == pytest.approx((1.0, 0.3, 0))
     assert (found.motion @ rigid(shift=(1.2, 0, 0)))[:3, 3] == pytest.approx((1.0, 0.3, 0))
-    assert trail.correction(moved, final=True) is None  # given already
-    trail.hand_over(1, 0, moved[1])
-    assert trail.correction({0: np.eye(4)}, final=True) is None
+    assert graph.correction(final=True) is None  # given already
 
 
 def test_a_loop_takes_the_drift_back_and_one_wrong_one_counts_little() -> None:
@@ -130,13 +127,16 @@ def test_a_loop_takes_the_drift_back_and_one_wrong_one_counts_little() -> None:
 
 def test_the_most_crowded_keyframe_goes_and_old_ones_are_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop_closure, "MAX_KEYFRAMES", 4)
-    graph, gone = KeyframeGraph(), None
+    graph = KeyframeGraph()
     for number, x in enumerate((0.0, 0.3, 0.35, 1.5, 1.8)):
-        assert gone is None
         graph.frames[number] = bare(number, rigid(shift=(x, 0, 0)))
-        gone = graph.trim()
-    assert gone is not None and gone[:2] == (2, 1)  # 0.35 was next to 0.3, and younger
-    assert gone[2][0, 3] == pytest.approx(0.05)
+        graph.give(number, graph.frames[number], rigid(shift=(x, 0, 0)))
+        graph.trim()
+    assert [*graph.frames] == [0, 1, 3, 4]  # 0.35 was next to 0.3, and younger
+    graph.move({1: rigid(shift=(0.3, 1, 0))})
+    moved = graph.correction(final=True)
+    assert moved is not None and moved.poses[2][:3, 3] == pytest.approx((0.35, 1, 0)), "its poses have an heir"
+    graph.move({1: rigid(shift=(0.3, 0, 0))})
     assert [k.number for k in graph.near(rigid(shift=(0.25, 0, 0)), 3)] == [1, 0]
     assert [k.number for k in graph.near(rigid(shift=(1.7, 0, 0)), 2)] == [4, 3]
     assert [k.number for k in graph.near(rigid(shift=(9, 0, 0)), 3)] == [4]
