@@ -26,7 +26,8 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
-from tests.drivers.fake_v4l2 import Sensor, make_machine, write_calibration
+from tests.drivers.fake_v4l2 import Sensor, make_machine
+from tests.drivers.support import write_calibration
 
 AWAY_S = 0.7
 FRAME_NS = 66_666_667

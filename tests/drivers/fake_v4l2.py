@@ -186,10 +186,3 @@ def make_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     monkeypatch.setattr(devices, "DEVICES", made.dev)
     monkeypatch.setattr(devices, "LINKS", (made.by_id,))
     return made
-
-
-def write_calibration(path: Path, width: int = 64, height: int = 48) -> str:
-    path.write_text(
-        f"fx = 60.0\nfy = 60.0\ncx = {(width - 1) / 2}\ncy = {(height - 1) / 2}\nwidth = {width}\nheight = {height}\n"
-    )
-    return str(path)

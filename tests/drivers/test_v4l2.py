@@ -16,9 +16,8 @@ from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.v4l2 import ioctls, list_devices
 from semantic_mapper.errors import CameraError, ConfigError
-from tests.drivers.fake_v4l2 import METADATA, Capture, Machine, Sensor, make_machine, write_calibration
-
-PATIENCE_S = 20.0
+from tests.drivers.fake_v4l2 import METADATA, Capture, Machine, Sensor, make_machine
+from tests.drivers.support import PATIENCE_S, until, write_calibration
 
 
 @pytest.fixture
@@ -29,13 +28,6 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
 def v4l2(named: Path | str, tmp_path: Path, **settings: Any) -> Camera:
     config = {"device": str(named), "calibration": write_calibration(tmp_path / "webcam.toml"), "stall_s": PATIENCE_S}
     return open_camera("v4l2", config | settings, "front", "test")
-
-
-def until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def image_where(images: Iterator[CameraImage], holds: Callable[[CameraImage], bool]) -> CameraImage:

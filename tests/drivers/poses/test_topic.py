@@ -4,7 +4,7 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,10 +20,9 @@ from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.transport.keys import allow, make_keys, secure_server
 from semantic_mapper.transport.pose_message import PoseMessage, encode_pose
+from tests.drivers.support import PATIENCE_S, until
 
 from .images import MS, image, rigid
-
-WAIT_S = 20.0
 
 
 class Robot:
@@ -37,7 +36,7 @@ class Robot:
     def wait(self) -> None:
         """Until somebody has subscribed; others may have left before."""
         while True:
-            assert self.socket.poll(int(WAIT_S * 1e3)), "nobody subscribed"
+            assert self.socket.poll(int(PATIENCE_S * 1e3)), "nobody subscribed"
             if self.socket.recv()[:1] == b"\x01":
                 return
 
@@ -65,17 +64,10 @@ def robot(endpoint: str) -> Iterator[Robot]:
     made.socket.close(linger=0)
 
 
-def eventually(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline, "did not come true"
-        time.sleep(0.005)
-
-
 @contextmanager
 def listening(endpoint: str, robot: Robot, **settings: Any) -> Iterator[TopicPoseSource]:
     # Waiting is generous: what a test expects to come has been sent.
-    wait_s = settings.pop("wait_s", WAIT_S)
+    wait_s = settings.pop("wait_s", PATIENCE_S)
     with TopicPoseSource(TopicPoses(endpoint=endpoint, **settings), wait_s) as source:
         robot.wait()
         yield source
@@ -91,7 +83,7 @@ def test_an_image_gets_the_pose_at_its_stamp_of_where_the_camera_sits(endpoint: 
         base = rigid((0, 0, 1.111), (1.111, 0, 0))
         assert np.allclose(found.T_world_camera, base @ T_base_camera, atol=1e-9)
         assert found.source == "topic" and found.sigma == pytest.approx(0.02)
-        eventually(lambda: source.counters["messages"] == 11)
+        until(lambda: source.counters["messages"] == 11)
         assert source.warnings == ()
 
 
@@ -99,13 +91,13 @@ def test_beyond_the_last_pose_the_motion_goes_on_for_a_while_and_no_longer(endpo
     with listening(endpoint, robot, wait_s=0.0) as source:
         robot.send(1000)
         robot.send(1020)
-        eventually(lambda: source.counters["messages"] == 2)
+        until(lambda: source.counters["messages"] == 2)
         found = source.pose(image(1060 * MS))
         assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.06)
         assert source.pose(image(1071 * MS)) is None and source.counters["stale"] == 1
         assert "0.051 s older" in source.warnings[0] and "clock_offset_ns" in source.warnings[0]
         robot.send(1080)
-        eventually(lambda: source.counters["messages"] == 3)
+        until(lambda: source.counters["messages"] == 3)
         assert source.pose(image(1075 * MS)) is not None and source.warnings == ()
 
 
@@ -120,7 +112,7 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_poses_of_another_clock_are_left_out(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot, wait_s=0.0) as source:
         robot.send(10_051)  # 50 ms ahead may be a prediction
-        eventually(lambda: source.counters["future"] == 1)
+        until(lambda: source.counters["future"] == 1)
         assert source.pose(image(10_000 * MS)) is None
         ahead, empty = source.warnings
         assert "it is stamped 0.051 s ahead" in ahead and "clock_offset_ns" in ahead
@@ -129,7 +121,7 @@ def test_poses_of_another_clock_are_left_out(endpoint: str, robot: Robot) -> Non
             robot.send(ms)
             robot.send(ms - 3000)  # a second publisher, on a clock that is behind
             robot.send(ms + 3_600_000)
-        eventually(lambda: source.counters["future"] == 12)
+        until(lambda: source.counters["future"] == 12)
         assert source.counters["messages"] == source.counters["out_of_order"] == 11
         found = source.pose(image(9860 * MS))
         assert found is not None and found.T_world_camera[0, 3] == pytest.approx(9.86)
@@ -181,8 +173,8 @@ def test_a_robot_with_keys_is_listened_to_and_one_in_its_place_is_not(tmp_path: 
         port = socket.bind_to_random_port("tcp://127.0.0.1")
         settings = TopicPoses(endpoint=f"tcp://127.0.0.1:{port}", server="robot", keys=str(desk.folder))
         with socket, TopicPoseSource(settings) as source:
-            assert bool(socket.poll(int(WAIT_S * 1e3) if heard else 300)) == bool(heard)
+            assert bool(socket.poll(int(PATIENCE_S * 1e3) if heard else 300)) == bool(heard)
             if heard:
                 message = PoseMessage(stamp_ns=5, position=(0, 0, 0), quaternion=(0, 0, 0, 1))
                 socket.send_multipart(encode_pose(message))
-                eventually(lambda: source.counters["messages"] == 1)
+                until(lambda: source.counters["messages"] == 1)

@@ -7,7 +7,6 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable
 from itertools import islice, pairwise
 from typing import Any
 
@@ -26,13 +25,12 @@ from semantic_mapper.errors import CameraError, DependencyError
 from semantic_mapper.types import CameraIntrinsics, UInt8
 from tests.drawn_room import walk_frames
 from tests.drivers.realsense.soft import HEIGHT, SERIAL, WIDTH, Feed, SoftDevice, lens
+from tests.drivers.support import PATIENCE_S, until
 
 try:
     load_realsense()
 except DependencyError as error:  # there are wheels for Linux on x86-64 only
     pytest.skip(str(error), allow_module_level=True)
-
-PATIENCE_S = 20.0
 
 
 @pytest.fixture(autouse=True)
@@ -66,13 +64,6 @@ def camera_of(*found: SoftDevice, **settings: Any) -> LiveCamera:
 
     small = {"width": WIDTH, "height": HEIGHT, "depth_width": WIDTH, "depth_height": HEIGHT}
     return open_camera(convert_config(small | settings, Config, "test"), "front", find)
-
-
-def until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def test_images_have_their_own_depth_and_stamps_on_our_clock() -> None:

@@ -12,7 +12,6 @@ from research.scenes import TEST_SEEDS, camera_path, make_room, render_view
 from semantic_mapper.drivers.calibration import StereoCalibration, save_stereo
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
-HZ = 10
 LEFT = CameraIntrinsics(330.0, 330.0, 239.5, 179.5, 480, 360)
 RIGHT = CameraIntrinsics(334.0, 334.0, 242.0, 177.0, 480, 360)
 BASELINE_M = 0.12
@@ -50,13 +49,3 @@ def room_pairs(scene: object, poses: Sequence[Float64]) -> list[UInt8]:
         both = np.hstack((left, right)).astype(np.float32)
         found.append(np.clip(both + rng.normal(0, 1.5, both.shape), 0, 255).astype(np.uint8))
     return found
-
-
-def write_film(path: Path, images: Sequence[UInt8]) -> Path:
-    height, width = images[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), HZ, (width, height))
-    assert writer.isOpened()
-    for image in images:
-        writer.write(np.ascontiguousarray(image[..., ::-1]))
-    writer.release()
-    return path

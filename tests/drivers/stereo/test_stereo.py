@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,11 @@ from semantic_mapper.drivers.stereo import list_devices
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.types import Float64
-from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine, write_calibration
+from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine
 from tests.drivers.stereo import pairs
+from tests.drivers.support import PATIENCE_S, until, write_calibration, write_film
 
 COUNT = 3
-PATIENCE_S = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Film:
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Film:
     scene, poses = pairs.room_poses(COUNT)
-    path = pairs.write_film(tmp_path_factory.mktemp("film") / "pair.avi", pairs.room_pairs(scene, poses))
+    path = write_film(tmp_path_factory.mktemp("film") / "pair.avi", pairs.room_pairs(scene, poses))
     return Film(path, scene, poses)
 
 
@@ -52,13 +51,6 @@ def images_of(film: Film, calibration: str, **settings: Any) -> list[CameraImage
         assert camera.info.cameras == {"front": images[0].intrinsics}
         assert camera.info.metadata["baseline_m"] == "0.1200" and camera.info.source == "stereo video pair.avi"
     return images
-
-
-def until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def test_the_depth_of_a_room_is_that_of_the_rectified_left_camera(film: Film, tmp_path: Path) -> None:
@@ -104,7 +96,7 @@ def shift(x: float) -> Float64:
 
 
 def test_swapped_halves_are_put_right(film: Film, tmp_path: Path) -> None:
-    other = pairs.write_film(
+    other = write_film(
         tmp_path / "pair.avi",
         [np.hstack(np.hsplit(image, 2)[::-1]) for image in pairs.room_pairs(film.scene, film.poses[:1])],
     )
@@ -149,7 +141,7 @@ def test_a_pair_that_is_not_side_by_side_and_a_film_of_another_size_are_refused(
     save_stereo(tmp_path / "turned.toml", turned, {})
     with pytest.raises(ConfigError, match="the right camera is not next to the left one"):
         stereo(film.path, str(tmp_path / "turned.toml"))
-    small = pairs.write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
+    small = write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
     camera = stereo(small, pairs.write_pair(tmp_path / "pair.toml"))
     with pytest.raises(CameraError, match="gives images of 480x180, and the pair was calibrated at 960x360"), camera:
         pass

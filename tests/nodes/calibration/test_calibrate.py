@@ -23,6 +23,7 @@ from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.drivers.calibrating.boards import BOARD, LENS, picture, shown
+from tests.drivers.support import write_film
 from tests.nodes.support import error_line, run, run_here
 from tests.replay.log.test_recording import files_at_most
 
@@ -91,12 +92,7 @@ def test_a_log_names_its_cameras_itself(tmp_path: Path) -> None:
 
 
 def test_a_live_camera_is_looked_through_until_nothing_is_lacking(tmp_path: Path) -> None:
-    film = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 30, (640, 480))
-    for _, image in shown():
-        for _ in range(2):
-            writer.write(np.ascontiguousarray(image.rgb[..., ::-1]))
-    writer.release()
+    film = write_film(tmp_path / "film.avi", [image.rgb for _, image in shown() for _ in range(2)], 30)
     (source,) = parse_sources([str(film)], "")
     source.live = True
     gathering = Gathering(BOARD, CalibrationConfig())

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -30,10 +29,10 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.transport.messages import EndOfStream, Message, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.types import PosedFrame
-from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine, write_calibration
+from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine
+from tests.drivers.support import PATIENCE_S, write_calibration, write_film
 from tests.nodes.support import eventually
 
-PATIENCE_S = 20.0
 COUNT = 9
 
 
@@ -132,11 +131,7 @@ def v4l2(device: Path, tmp_path: Path, **settings: Any) -> dict[str, Any]:
 
 
 def test_a_video_file_is_published_to_its_end(tmp_path: Path) -> None:
-    film = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
-    for index in range(COUNT):
-        writer.write(np.full((48, 64, 3), (0, 0, 20 * index), np.uint8))
-    writer.release()
+    film = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), (20 * k, 0, 0), np.uint8) for k in range(COUNT)])
     config = tmp_path / "film.toml"
     config.write_text(f'source = "{film}"\ncalibration = "{write_calibration(tmp_path / "lens.toml")}"\n')
     with running({"camera": {"kind": "opencv", "config": str(config), "poses": {"kind": "walk"}}}) as node:
@@ -155,14 +150,10 @@ def test_a_video_file_is_published_to_its_end(tmp_path: Path) -> None:
 
 def long_film(tmp_path: Path) -> dict[str, Any]:
     """60 images, as quickly as they are taken; a third of them is without a pose."""
-    writer = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20, (320, 240))
     noise = np.random.default_rng(1).integers(0, 255, (240, 320, 3), np.uint8)
-    for _ in range(60):
-        writer.write(noise)
-    writer.release()
-    lens = tmp_path / "lens.toml"
-    lens.write_text("fx = 300.0\nfy = 300.0\ncx = 159.5\ncy = 119.5\nwidth = 320\nheight = 240\n")
-    config = {"source": str(tmp_path / "film.avi"), "calibration": str(lens), "pace": "fast"}
+    film = write_film(tmp_path / "film.avi", [noise] * 60)
+    lens = write_calibration(tmp_path / "lens.toml", 320, 240)
+    config = {"source": str(film), "calibration": lens, "pace": "fast"}
     return {"camera": {"kind": "opencv", "config": config, "poses": {"kind": "walk"}}}
 
 
@@ -235,11 +226,7 @@ def test_a_camera_that_cannot_be_found_again_must_not_come_back_in_another_world
 
 def test_frames_get_the_poses_that_the_launch_file_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()  # of the walking camera
-    film = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
-    for _ in range(COUNT):
-        writer.write(np.full((48, 64, 3), 90, np.uint8))
-    writer.release()
+    film = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), 90, np.uint8)] * COUNT)
     pose = np.eye(4)
     pose[:3, 3] = 1.0, -2.0, 0.5
     camera = {
@@ -261,11 +248,7 @@ def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restartable: bool
 ) -> None:
     monkeypatch.undo()  # of the walking camera
-    film = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
-    for _ in range(COUNT):
-        writer.write(np.full((48, 64, 3), 90, np.uint8))
-    writer.release()
+    film = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), 90, np.uint8)] * COUNT)
     config = {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")}
     poses = {"kind": "device"}  # a video gives no pose of its own
     monkeypatch.setattr(live_camera, "check_world", lambda *_: None)
@@ -335,15 +318,6 @@ def test_a_driver_that_hangs_is_told_apart_from_a_camera_that_is_waited_for(mach
     assert node.error is None
     os.close(beats)
     os.close(theirs)
-
-
-def test_a_camera_that_is_not_there_yet_is_waited_for(machine: Machine, tmp_path: Path) -> None:
-    with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path)) as node:
-        waiting = node.until(lambda m: isinstance(m, Status) and m.state == "starting" and bool(m.degraded))
-        assert isinstance(waiting, Status) and "is it plugged in" in waiting.degraded[0]
-        machine.plug(Sensor(), 0)
-        node.until(lambda m: isinstance(m, PosedFrame))
-    assert node.error is None
 
 
 def test_patience_with_a_camera_can_be_limited(machine: Machine, tmp_path: Path) -> None:
