@@ -10,12 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from semantic_mapper.drivers.calibrating.camera import (
-    CameraCalibration,
-    calibrate_camera,
-    compare_camera,
-    ideal_pixels,
-)
+from semantic_mapper.drivers.calibrating.camera import CameraCalibration, calibrate_camera, compare_camera, ideal_pixels
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer, simultaneous
 from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector

@@ -17,6 +17,7 @@ from semantic_mapper.types import CameraIntrinsics, FisheyeIntrinsics
 from tests.small import tiny_frames
 
 K, SIZE = (150.0, 152.0, 158.0, 121.0), (320, 240)
+BENT = CameraIntrinsics(300.0, 305.0, 158.0, 122.0, *SIZE, (-0.28, 0.09, 0.001, -0.0005, 0.0))
 FISHEYE = FisheyeIntrinsics(*K, *SIZE, (0.06, -0.02, 0.008, -0.002))
 
 
@@ -56,20 +57,24 @@ def test_other_lenses_are_refused_by_name(model: str, given: tuple[float, ...], 
         lens_intrinsics(model, given, K, SIZE)
 
 
-def test_points_of_a_fisheye_lie_where_its_rectified_camera_projects_them() -> None:
-    points = np.array([(x, y, 2.0) for x in (-1.6, 0.1, 1.7) for y in (-1.1, 0.2, 1.0)])
-    seen = cv2.fisheye.projectPoints(
-        points[:, None], np.zeros(3), np.zeros(3), camera_matrix(FISHEYE), np.array(FISHEYE.distortion)
-    )[0][:, 0]
-    rectify = Rectifier(FISHEYE)
+def test_points_lie_where_the_rectified_camera_projects_them() -> None:
+    """Each is drawn as a spot where the lens shows it, found in the rectified image, and compared."""
+    points = np.array([(x, y, 2.0) for x in (-0.9, 0.1, 0.85) for y in (-0.65, 0.2, 0.6)])
+    eye = np.zeros(3)
+    plain, fisheye = (camera_matrix(lens) for lens in (BENT, FISHEYE))
+    seen_plain, _ = cv2.projectPoints(points, eye, eye, plain, np.array(BENT.distortion))
+    seen_fisheye, _ = cv2.fisheye.projectPoints(points[:, None], eye, eye, fisheye, np.array(FISHEYE.distortion))
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
-    for pixel, point in zip(seen, points, strict=True):
-        spot = 255 * np.exp(-((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2) / 18)
-        light = rectify(np.repeat(spot[..., None], 3, axis=2).astype(np.uint8))[..., 0].astype(np.float64)
-        found = np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
-        assert np.abs(found - project(point[None], rectify.intrinsics)[0]).max() < 0.3
-    inside = [rectify.nearest(np.ones(SIZE[::-1], np.float32))[y, x] for y in (0, -1) for x in (0, -1)]
-    assert inside == [1.0] * 4  # no pixel is made up
+    for lens, seen in ((BENT, seen_plain), (FISHEYE, seen_fisheye)):
+        rectify = Rectifier(lens)
+        assert rectify.intrinsics.distortion == ()
+        for pixel, point in zip(np.asarray(seen).reshape(-1, 2), points, strict=True):
+            spot = 255 * np.exp(-((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2) / 18)
+            light = rectify(np.repeat(spot[..., None], 3, axis=2).astype(np.uint8))[..., 0].astype(np.float64)
+            found = np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
+            assert np.abs(found - project(point[None], rectify.intrinsics)[0]).max() < 0.3
+        inside = [rectify.nearest(np.ones(SIZE[::-1], np.float32))[y, x] for y in (0, -1) for x in (0, -1)]
+        assert inside == [1.0] * 4  # no pixel is made up
 
 
 def test_a_frame_with_a_fisheye_is_refused() -> None:

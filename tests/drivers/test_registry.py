@@ -20,18 +20,10 @@ def test_an_unknown_kind_is_told_with_those_that_there_are(kind: str, says: str)
     assert says in str(caught.value)
 
 
-def test_a_kind_whose_packages_are_missing_says_so_and_the_others_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(
-        sys.modules, "semantic_mapper.drivers.oak", None
-    )  # what an import of it then raises is an ImportError
-    with pytest.raises(DependencyError, match="kind 'oak' cannot be used here"):
-        load_driver("oak")
-    found, unknown = find_cameras(("oak", "opencv"))
-    assert found == [] and list(unknown) == ["oak"]
-
-
-def test_a_kind_that_cannot_search_is_told_and_the_others_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    broken, whole = ModuleType("semantic_mapper.drivers.oak"), ModuleType("semantic_mapper.drivers.v4l2")
+def test_a_kind_that_cannot_be_used_or_searched_for_says_so_and_the_others_are_listed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    broken, whole = ModuleType("semantic_mapper.drivers.realsense"), ModuleType("semantic_mapper.drivers.v4l2")
 
     def cannot() -> list[FoundCamera]:
         raise CameraError("the bus is gone")
@@ -39,9 +31,12 @@ def test_a_kind_that_cannot_search_is_told_and_the_others_are_listed(monkeypatch
     camera = FoundCamera("v4l2", "HD Webcam", "/dev/video0")
     vars(broken)["list_devices"] = cannot
     vars(whole)["list_devices"] = lambda: [camera]
-    monkeypatch.setitem(sys.modules, "semantic_mapper.drivers.oak", broken)
-    monkeypatch.setitem(sys.modules, "semantic_mapper.drivers.v4l2", whole)
-    assert find_cameras(("oak", "v4l2")) == ([camera], {"oak": "the bus is gone"})
+    for name, module in (("oak", None), ("realsense", broken), ("v4l2", whole)):  # None: its import fails
+        monkeypatch.setitem(sys.modules, f"semantic_mapper.drivers.{name}", module)
+    with pytest.raises(DependencyError, match="kind 'oak' cannot be used here"):
+        load_driver("oak")
+    found, unknown = find_cameras(("oak", "realsense", "v4l2"))
+    assert found == [camera] and list(unknown) == ["oak", "realsense"] and unknown["realsense"] == "the bus is gone"
 
 
 def test_a_camera_is_made_of_plain_settings_that_are_checked() -> None:

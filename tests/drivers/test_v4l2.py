@@ -60,10 +60,7 @@ def test_images_are_rgb_with_the_stamps_of_their_buffers(machine: Machine, tmp_p
     assert stamps == sorted(set(stamps))
 
 
-def test_stamps_of_another_clock_are_replaced_by_the_time_of_arrival_and_told(
-    machine: Machine,
-    tmp_path: Path,
-) -> None:
+def test_stamps_of_another_clock_are_replaced_by_the_time_of_arrival_and_told(machine: Machine, tmp_path: Path) -> None:
     device = machine.plug(Sensor(clock=time.time), 0)
     with v4l2(device, tmp_path) as camera:
         before_ns = time.monotonic_ns()
@@ -149,9 +146,7 @@ def test_a_stream_that_stalls_is_told_and_started_anew(machine: Machine, tmp_pat
 
 
 def test_a_read_that_hangs_is_told_while_it_hangs(
-    machine: Machine,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tests.drivers.fake_v4l2.SELECT_S", 1.5)
     sensor = Sensor()
@@ -163,9 +158,7 @@ def test_a_read_that_hangs_is_told_while_it_hangs(
 
 
 def test_single_damaged_images_are_gaps_and_no_reason_to_start_anew(
-    machine: Machine,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor = Sensor()
     read = [0]
@@ -258,8 +251,7 @@ def test_listing_names_cameras_by_id_and_leaves_metadata_out(machine: Machine) -
 
 
 def test_stop_ends_the_iteration_from_another_thread_even_while_the_camera_is_gone(
-    machine: Machine,
-    tmp_path: Path,
+    machine: Machine, tmp_path: Path
 ) -> None:
     sensor = Sensor()
     with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
@@ -272,9 +264,7 @@ def test_stop_ends_the_iteration_from_another_thread_even_while_the_camera_is_go
 
 
 def test_a_failure_of_the_reading_thread_is_no_silence(
-    machine: Machine,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
     with v4l2(machine.plug(Sensor(), 0), tmp_path) as camera:

@@ -9,10 +9,8 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import cv2
 import depthai as dai
 import numpy as np
-from mcap.reader import make_reader
 
 from semantic_mapper.drivers.live import LiveCamera
 from semantic_mapper.drivers.oak.camera import open_camera
@@ -139,48 +137,6 @@ def camera(*connections: Callable[[], Sources], config: Config = CONFIG) -> Live
     """The driver's camera on these sources, one after the other; each may raise a ``CameraError``."""
     rest = list(connections)
     return open_camera(config, "front", connect=lambda _: rest.pop(0)())
-
-
-def record(folder: Path, count: int) -> timedelta:
-    """Write what ``replayed`` plays: a video, the stamps of its frames, and depth messages.
-
-    Returns:
-        Stamp of the first frame.
-    """
-    start = long_ago(count)
-    video = cv2.VideoWriter(str(folder / "rgb.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (WIDTH, HEIGHT))
-    assert video.isOpened()
-    for k in range(count):
-        video.write(np.ascontiguousarray(rgb_image(k)[:, :, ::-1]))
-    video.release()
-    for wait_s in (0.5, 2.0, 8.0):  # the recorders do not say when they have written all
-        _record_messages(folder, start, count, wait_s)
-        if all(_messages_in(folder / name) == count for name in ("rgb.mcap", "depth.mcap")):
-            return start
-    raise AssertionError("DepthAI's recorders did not write all messages")
-
-
-def _record_messages(folder: Path, start: timedelta, count: int, wait_s: float) -> None:
-    with dai.Pipeline(False) as pipeline:
-        stamps = pipeline.create(dai.node.RecordMetadataOnly)
-        stamps.setRecordFile(folder / "rgb.mcap")
-        depth = pipeline.create(dai.node.RecordMessage)
-        depth.setRecordFile(folder / "depth.mcap")
-        for message, recorder in ((rgb_message, stamps), (depth_message, depth)):
-            player = pipeline.create(
-                Player, [message(k, start) for k in range(count)], period_s=0.01, ends=False, pipeline=pipeline
-            )
-            player.output.link(recorder.input)
-        pipeline.start()
-        time.sleep(0.01 * count + wait_s)
-        pipeline.stop()
-        pipeline.wait()
-
-
-def _messages_in(path: Path) -> int:
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    return 0 if summary is None or summary.statistics is None else summary.statistics.message_count
 
 
 def replayed(folder: Path, calibration: Path) -> Sources:

@@ -8,13 +8,7 @@ import pytest
 from PIL import Image
 
 from semantic_mapper.drivers.base import CameraImage
-from semantic_mapper.drivers.poses.board import (
-    MARGIN_M,
-    BoardFinder,
-    BoardPoseSource,
-    make_board,
-    sheet_png,
-)
+from semantic_mapper.drivers.poses.board import MARGIN_M, BoardFinder, BoardPoseSource, make_board, sheet_png
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import camera_matrix, invert_pose, look_at
