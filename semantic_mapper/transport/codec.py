@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
-import msgpack
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -25,9 +24,6 @@ from semantic_mapper.transport.images import (
     DepthSpec,
     RgbSpec,
     Uint8Spec,
-    decode_depth,
-    decode_rgb,
-    decode_uint8,
     encode_depth,
     encode_rgb,
     encode_uint8,
@@ -52,7 +48,6 @@ from semantic_mapper.transport.messages import (
     Side,
     Source,
     Stamp,
-    StreamInfo,
     Topic,
     WeightsUpdate,
     Wire,
@@ -71,19 +66,12 @@ _FRAME_SCALARS = "stamp_ns seq camera_id intrinsics pose_source pose_sigma world
 _UPDATE_SCALARS = (
     "stamp_ns seq camera_id fused is_keyframe source_seqs blocks blocks_touched rays samples stage_ms world".split()
 )
-_WeightsBytes = Annotated[int, Meta(ge=1, le=MAX_WEIGHTS_BYTES)]
+_NOT_SENT_AS_0 = "unreadable pseudo_label depth_sigma moving world T_map_world".split()  # most messages need none
+_FramedParts = Annotated[list[Annotated[bytes, Meta(max_length=MAX_PART_BYTES)]], Meta(max_length=MAX_PARTS)]
 _BEYOND = re.compile(r"Expected `float` [<>]= \S+e\+308")  # how msgspec says it
-_NOT_SENT_AS_0 = (  # what most messages do not need
-    "unreadable",
-    "pseudo_label",
-    "depth_sigma",
-    "moving",
-    "world",
-    "T_map_world",
-)
 _Pose = Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)]  # (4, 4) float64 row by row, exact
 
-_Packed = dict[str, tuple[Wire, bytes]]  # images of a message by their fields in the header
+_Packed = dict[str, tuple[Any, bytes]]  # images of a message by their fields in the header: spec and buffer
 
 MessageT = TypeVar("MessageT")
 WireT = TypeVar("WireT")
@@ -103,11 +91,11 @@ class Envelope:
 
     topic: str  # name of the topic ("frame", "map", ...); ``source``: camera id or node
     source: str
-    # stamp_ns, seq: 0 where the message has none.
+    # stamp_ns, seq, world: 0 where the message has none.
     stamp_ns: int = 0
     seq: int = 0
+    world: int = 0
     T_world_camera: tuple[float, ...] = ()  # of a frame, 16 numbers row by row; else empty
-    world: int = 0  # of a frame or map update
     T_map_world: tuple[float, ...] = ()  # of a map update, 16 numbers; empty where it is no motion
     # has_depth, has_label: Of a frame.
     has_depth: bool = False
@@ -122,6 +110,7 @@ class Envelope:
 class FrameHeader(Wire, frozen=True):
     """``PosedFrame`` without its images; buffers: rgb, depth, label, depth_sigma, those that there are."""
 
+    TOPIC: ClassVar = "frame"
     IMAGES: ClassVar = ("rgb", "depth", "label", "depth_sigma")
 
     stamp_ns: CaptureStamp
@@ -140,12 +129,7 @@ class FrameHeader(Wire, frozen=True):
 
     def __post_init__(self) -> None:
         if self.depth_sigma is not None and self.depth is None:
-            raise CodecError(f"{self.name}: has a spread of its depth, and no depth")
-
-    @property
-    def name(self) -> str:
-        """How errors call the frame."""
-        return f"frame of camera '{self.camera_id}' seq={self.seq}"
+            raise CodecError("has a spread of its depth, and no depth")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -156,6 +140,7 @@ class FrameHeader(Wire, frozen=True):
 class MapUpdateHeader(Wire, frozen=True, kw_only=True):
     """``MapUpdate`` without its images; buffers: label, confidence, depth and, where something moves, moving (0, 1)."""
 
+    TOPIC: ClassVar = "map"
     IMAGES: ClassVar = ("label", "confidence", "depth", "moving")
 
     stamp_ns: Stamp
@@ -181,11 +166,6 @@ class MapUpdateHeader(Wire, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.width * self.height > MAX_PIXELS:
             raise CodecError(f"image of {self.width}x{self.height}; at most {MAX_PIXELS} pixels are accepted")
-
-    @property
-    def name(self) -> str:
-        """How errors call the update."""
-        return f"map of camera '{self.camera_id}' seq={self.seq}"
 
     @property
     def size(self) -> tuple[int, int]:
@@ -216,29 +196,15 @@ def header_type(topic: str) -> type[msgspec.Struct]:
 
 def pack_parts(parts: Parts) -> bytes:
     """Multipart message -> one payload, for logs."""
-    return cast(bytes, msgpack.packb([bytes(p) if isinstance(p, memoryview) else p for p in parts], use_bin_type=True))
+    return msgspec.msgpack.encode(parts)
 
 
 def unpack_parts(payload: Buffer) -> list[bytes]:
-    """Inverse of ``pack_parts``.
-
-    Raises:
-        CodecError: not such a payload, or one beyond the size limits.
-    """
+    """Inverse of ``pack_parts``; ``CodecError`` where it is no such payload, or one beyond the size limits."""
     try:
-        parts = msgpack.unpackb(
-            payload,
-            max_array_len=MAX_PARTS,
-            max_bin_len=MAX_PART_BYTES,
-            max_str_len=0,
-            max_map_len=0,
-            max_ext_len=0,
-        )
-    except (ValueError, TypeError, RecursionError, OverflowError, msgpack.UnpackException) as error:
-        raise CodecError(f"payload is not a framed message: {error or type(error).__name__}") from error
-    if not isinstance(parts, list) or not all(isinstance(p, bytes) for p in cast("list[object]", parts)):
-        raise CodecError("payload is not a framed message: expected an array of binaries")
-    return cast("list[bytes]", parts)
+        return msgspec.msgpack.decode(payload, type=_FramedParts)
+    except (ValueError, RecursionError) as error:
+        raise CodecError(f"payload is not a framed message: {error}") from error
 
 
 def to_plain(value: object, what: str) -> Any:
@@ -259,7 +225,7 @@ def pack_header(header: Mapping[str, Any], what: str) -> bytes:
     Raises:
         CodecError: longer than ``MAX_HEADER_BYTES``.
     """
-    packed = cast(bytes, msgpack.packb({"v": PROTOCOL_VERSION, **header}, use_bin_type=True))
+    packed = msgspec.msgpack.encode({"v": PROTOCOL_VERSION, **header})
     if len(packed) > MAX_HEADER_BYTES:
         raise CodecError(f"{what}: cannot be sent: a header of {len(packed)} bytes, at most {MAX_HEADER_BYTES}")
     return packed
@@ -274,15 +240,9 @@ def unpack_header(packed: Buffer, what: str) -> dict[str, Any]:
     if len(packed) > MAX_HEADER_BYTES:
         raise CodecError(f"{what}: header of {len(packed)} bytes, at most {MAX_HEADER_BYTES} are accepted")
     try:
-        header: Any = msgpack.unpackb(
-            packed, max_str_len=1 << 14, max_bin_len=0, max_array_len=MAX_ENTRIES, max_map_len=256, max_ext_len=0
-        )
-    except (ValueError, TypeError, RecursionError, OverflowError, msgpack.UnpackException) as error:
-        # ValueError includes msgpack's StackError and FormatError, and bad UTF-8.
-        raise CodecError(f"{what}: bad header: {error or type(error).__name__}") from error
-    if not isinstance(header, dict):
-        raise CodecError(f"{what}: header must be a map, got {type(header).__name__}")
-    fields = cast("dict[str, Any]", header)
+        fields = msgspec.msgpack.decode(packed, type=dict[str, Any])
+    except (ValueError, RecursionError) as error:  # ValueError includes bad UTF-8
+        raise CodecError(f"{what}: bad header: {error}") from error
     version = fields.pop("v", None)
     if version is True or version != PROTOCOL_VERSION:
         raise CodecError(
@@ -325,31 +285,22 @@ def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str =
     Raises:
         CodecError: a value that cannot be sent: out of bounds, NaN, or of the wrong type.
     """
-    match message:
-        case PosedFrame():
-            return encode_frame(message, options)
-        case MapUpdate():
-            return _encode_map_update(message, options)
-        case LabelledKeyframe():
-            return _encode_keyframe(message, options)
-        case WeightsUpdate():
-            what = f"weights {message.version} of '{message.node}'"
-            if len(message.data) > MAX_WEIGHTS_BYTES:
-                raise CodecError(
-                    f"{what}: a file of {len(message.data)} bytes; at most {MAX_WEIGHTS_BYTES} can be sent"
-                )
-            header = to_plain(message, what)
-            check_header(header, WeightsUpdate, what)
-            packed = pack_header({**header, "bytes": len(message.data)}, what)
-            return [topic_bytes("weights", message.node), packed, message.data]
-        case _:
-            row = _ROWS[type(message)]
-            source = getattr(message, row.source) if row.source else sender
-            what = f"{row.name} of '{source}'"
-            header = to_plain(message, what)
-            if isinstance(message, StreamInfo) and message.label_set is not None:
-                header["label_set"] = to_plain(LabelSetForm.of(message.label_set), what)
-            return [topic_bytes(row.name, source), _pack(header, row.message, what)]
+    if isinstance(message, PosedFrame):
+        return encode_frame(message, options)
+    if isinstance(message, MapUpdate):
+        return _encode_map_update(message, options)
+    row = _ROWS[type(message)]
+    source = getattr(message, row.source) if row.source else sender
+    what, header, buffers = f"{row.name} of '{source}'", message, []
+    if isinstance(message, LabelledKeyframe):
+        header = KeyframeHeader(source, message.teacher, message.label_set)
+        buffers = encode_frame(message.frame, options)[1:]
+    elif isinstance(message, WeightsUpdate):
+        buffers = [message.data]
+    parts = [topic_bytes(row.name, source), _pack(header, what), *buffers]
+    if isinstance(message, LabelledKeyframe):
+        _open(parts)  # is it too large, or without labels?
+    return parts
 
 
 def encode_frame(
@@ -366,11 +317,8 @@ def encode_frame(
     Raises:
         CodecError: NaN in the pose, or a camera id that a topic cannot hold.
     """
-    if encoded_rgb is None:
-        encoding, rgb = options.rgb, encode_rgb(frame.rgb, options.rgb, options.jpeg_quality)
-    else:
-        encoding, rgb = encoded_rgb.encoding, encoded_rgb.data
-    packed: _Packed = {"rgb": (RgbSpec(encoding, len(rgb)), rgb)}
+    rgb = encoded_rgb.data if encoded_rgb else encode_rgb(frame.rgb, options.rgb, options.jpeg_quality)
+    packed: _Packed = {"rgb": (RgbSpec(encoded_rgb.encoding if encoded_rgb else options.rgb, len(rgb)), rgb)}
     if frame.depth_m is not None:
         packed["depth"] = encode_depth(frame.depth_m, options.depth_scale)
     if frame.label is not None:
@@ -381,9 +329,34 @@ def encode_frame(
         T_world_camera=tuple(frame.T_world_camera.ravel().tolist()),
         pseudo_label=frame.label_is_pseudo and frame.label is not None,
         **{name: getattr(frame, name) for name in _FRAME_SCALARS},
-        **{name: cast(Any, spec) for name, (spec, _) in packed.items()},
+        **{name: spec for name, (spec, _) in packed.items()},
     )
-    return [topic_bytes("frame", frame.camera_id), _pack_header_of(header), *(data for _, data in packed.values())]
+    return _parts(header, packed)
+
+
+def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
+    what = f"map of camera '{update.camera_id}' seq={update.seq}"
+    for image in (update.confidence, update.depth_m, update.moving):
+        if image is not None and image.shape != update.label.shape:
+            raise CodecError(f"{what}: an image {image.shape} must have the size of label, {update.label.shape}")
+    if not bool(np.all((update.confidence >= 0) & (update.confidence <= 1 + 1e-5))):
+        raise CodecError(f"{what}: confidence must lie in [0, 1]")
+    packed: _Packed = {
+        "label": encode_uint8(update.label),
+        "confidence": encode_uint8(np.rint(np.minimum(update.confidence, 1) * 255).astype(np.uint8)),
+        "depth": encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options.depth_scale),
+    }
+    if update.moving is not None and update.moving.any():
+        packed["moving"] = encode_uint8(update.moving.astype(np.uint8))
+    is_motion = not np.array_equal(update.T_map_world, np.eye(4))
+    header = MapUpdateHeader(
+        width=update.label.shape[1],
+        height=update.label.shape[0],
+        T_map_world=tuple(update.T_map_world.ravel().tolist()) if is_motion else None,
+        **{name: getattr(update, name) for name in _UPDATE_SCALARS},
+        **{name: spec for name, (spec, _) in packed.items()},
+    )
+    return _parts(header, packed)
 
 
 def with_label(parts: Parts, pseudo_label: UInt8 | None) -> list[bytes]:
@@ -412,25 +385,22 @@ def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
     Raises:
         CodecError: no frame, or its colour image is damaged.
     """
-    header, buffers = _open_as(FrameHeader, parts)
+    header, buffers = _open_frame(parts)
     if header.rgb.encoding == options.rgb:
         return [bytes(part) for part in parts]
-    rgb = _decode_image(header, "rgb", header.rgb, buffers[0])
-    data = encode_rgb(rgb, options.rgb, options.jpeg_quality)
+    data = encode_rgb(_decode_images(header, buffers, ("rgb",))["rgb"], options.rgb, options.jpeg_quality)
     return _with_images(parts, {"rgb": (RgbSpec(options.rgb, len(data)), data)})
 
 
 def _with_images(parts: Parts, packed: _Packed, *, without: str = "", **fields: Any) -> list[bytes]:
     """A frame with some other images and fields, and without one image that is not given again."""
-    header, buffers = _open_as(FrameHeader, parts)
-    specs = _specs(header)
-    images: _Packed = {name: (specs[name], bytes(data)) for name, data in zip(specs, buffers, strict=True)}
-    images.pop(without, None)
-    images |= packed
-    changed = {name: images[name][0] if name in images else None for name in FrameHeader.IMAGES}
-    header = msgspec.structs.replace(header, **changed, **fields)
-    kept = [images[name][1] for name in FrameHeader.IMAGES if name in images]
-    return [bytes(parts[0]), _pack_header_of(header), *kept]
+    header, buffers = _open_frame(parts)
+    kept = {name: (spec, bytes(data)) for (name, spec), data in zip(_specs(header).items(), buffers, strict=True)}
+    kept.pop(without, None)
+    kept |= packed
+    specs = {name: kept[name][0] if name in kept else None for name in header.IMAGES}
+    header = msgspec.structs.replace(header, **specs, **fields)
+    return _parts(header, {name: kept[name] for name in header.IMAGES if name in kept})
 
 
 def decode(parts: Parts) -> Message:
@@ -444,10 +414,17 @@ def decode(parts: Parts) -> Message:
         case FrameHeader():
             return _decode_frame(header, buffers)
         case MapUpdateHeader():
-            return _decode_map_update(header, buffers)
+            images, T = _decode_images(header, buffers), header.T_map_world
+            return MapUpdate(
+                label=images["label"],
+                confidence=images["confidence"].astype(np.float32) / np.float32(255),
+                depth_m=images["depth"],
+                moving=images["moving"] > 0 if "moving" in images else None,
+                T_map_world=np.eye(4) if T is None else np.array(T, np.float64).reshape(4, 4),
+                **{name: getattr(header, name) for name in _UPDATE_SCALARS},
+            )
         case KeyframeHeader():
-            frame = _open_as(FrameHeader, buffers)
-            return LabelledKeyframe(_decode_frame(*frame), header.label_set, header.teacher)
+            return LabelledKeyframe(_decode_frame(*_open_frame(buffers)), header.label_set, header.teacher)
         case WeightsUpdate() if digest_of(header.data) != header.digest:
             raise CodecError(
                 f"weights {header.version} of '{header.node}': the file is not the one that its digest names"
@@ -465,9 +442,7 @@ def decode_as(kind: type[MessageT], parts: Parts) -> MessageT:
     row, _ = read_topic(parts)
     if row.message is not kind:
         raise CodecError(f"expected a {kind.__name__}, got a message of topic '{row.name}'")
-    message = decode(parts)
-    assert isinstance(message, kind)
-    return message
+    return cast(MessageT, decode(parts))
 
 
 def read_envelope(parts: Parts) -> Envelope:
@@ -477,40 +452,47 @@ def read_envelope(parts: Parts) -> Envelope:
         CodecError: not one of ours, or damaged.
     """
     row, header, buffers = _open(parts)
-    _, source = read_topic(parts)
     if isinstance(header, KeyframeHeader):
-        header, _ = _open_as(FrameHeader, buffers)
-    stamp_ns, seq, world = (getattr(header, name, 0) for name in ("stamp_ns", "seq", "world"))
-    envelope = Envelope(row.name, source, stamp_ns, seq, world=world)
-    match header:
-        case MapUpdateHeader():
-            return replace(envelope, T_map_world=header.T_map_world or ())
-        case FrameHeader():
-            return replace(
-                envelope,
-                T_world_camera=header.T_world_camera,
-                has_depth=header.depth is not None,
-                has_label=header.label is not None,
-                rgb_encoding=header.rgb.encoding,
-                depth_scale=header.depth.scale if header.depth else 0.0,
-                has_computed_depth=header.depth_sigma is not None,
-                has_pseudo_label=header.pseudo_label and header.label is not None,
-            )
-        case _:
-            return envelope
+        header, _ = _open_frame(buffers)
+    common = {name: getattr(header, name, 0) for name in ("stamp_ns", "seq", "world")}
+    source = read_topic(parts)[1]
+    if not isinstance(header, FrameHeader):
+        return Envelope(row.name, source, **common, T_map_world=getattr(header, "T_map_world", None) or ())
+    return Envelope(
+        row.name,
+        source,
+        **common,
+        T_world_camera=header.T_world_camera,
+        has_depth=header.depth is not None,
+        has_label=header.label is not None,
+        rgb_encoding=header.rgb.encoding,
+        depth_scale=header.depth.scale if header.depth else 0.0,
+        has_computed_depth=header.depth_sigma is not None,
+        has_pseudo_label=header.pseudo_label and header.label is not None,
+    )
 
 
-def _pack(header: dict[str, Any], kind: type[object], what: str) -> bytes:
+def _parts(header: _ImageHeader, packed: _Packed) -> list[bytes]:
+    topic = topic_bytes(header.TOPIC, header.camera_id)
+    return [topic, _pack(header, _name(header)), *(data for _, data in packed.values())]
+
+
+def _name(header: _ImageHeader) -> str:
+    return f"{header.TOPIC} of camera '{header.camera_id}' seq={header.seq}"
+
+
+def _pack(header: object, what: str) -> bytes:
     """A header, checked as its reader will check it."""
+    fields = to_plain(header, what)
+    if (labels := getattr(header, "label_set", None)) is not None:
+        fields["label_set"] = to_plain(LabelSetForm.of(labels), what)
     for name in _NOT_SENT_AS_0:
-        if header.get(name, 1) in (0, None):
-            del header[name]
-    _read(header, kind, what)
-    return pack_header(header, what)
-
-
-def _pack_header_of(header: _ImageHeader) -> bytes:
-    return _pack(to_plain(header, header.name), type(header), header.name)
+        if fields.get(name, 1) in (0, None):
+            del fields[name]
+    _read(fields, type(header), what)
+    if isinstance(header, WeightsUpdate):
+        fields["bytes"] = len(header.data)
+    return pack_header(fields, what)
 
 
 def _read(header: Mapping[str, Any], kind: type[WireT], what: str) -> WireT:
@@ -533,54 +515,59 @@ def _open(parts: Parts) -> tuple[Topic, Any, Parts]:
     what, buffers = f"{row.name} message", parts[2:]
     fields = unpack_header(parts[1], what)
     if row.message is WeightsUpdate:  # the size of the file stands in the place of the file
-        size = check_header(fields.get("bytes"), cast("type[int]", _WeightsBytes), f"{what}: bytes")
-        _check_sizes(buffers, [size], what)
+        if len(buffers) != 1 or fields.get("bytes") != len(buffers[0]) or len(buffers[0]) > MAX_WEIGHTS_BYTES:
+            raise CodecError(f"{what}: the header announces a file of other bytes, or of more than {MAX_WEIGHTS_BYTES}")
         fields["bytes"], buffers = bytes(buffers[0]), ()
     header = cast(Any, _read(fields, _HEADERS.get(row.name, row.message), what))
     if row.source and getattr(header, row.source) != source:
         raise CodecError(f"topic '{row.name}/{source}/' carries a message of '{getattr(header, row.source)}'")
     if isinstance(header, KeyframeHeader):
         return row, header, _open_keyframe(header, parts)
-    sizes = [spec.bytes for spec in _specs(header).values()] if isinstance(header, _ImageHeader) else []
-    _check_sizes(buffers, sizes, getattr(header, "name", what))
+    sizes: list[int] = []
+    if isinstance(header, _ImageHeader):
+        what, sizes = _name(header), [spec.bytes for spec in _specs(header).values()]
+    if (actual := [len(buffer) for buffer in buffers]) != sizes:
+        raise CodecError(f"{what}: the header announces buffers of {sizes} bytes, got {actual}")
     return row, header, buffers
 
 
-def _check_sizes(buffers: Parts, sizes: list[int], what: str) -> None:
-    actual = [len(buffer) for buffer in buffers]
-    if actual != sizes:
-        raise CodecError(f"{what}: the header announces buffers of {sizes} bytes, got {actual}")
-
-
-def _open_as(kind: type[WireT], parts: Parts) -> tuple[WireT, Parts]:
+def _open_frame(parts: Parts) -> tuple[FrameHeader, Parts]:
     row, header, buffers = _open(parts)
-    if not isinstance(header, kind):
-        raise CodecError(f"expected a {kind.__name__}, got the header of topic '{row.name}'")
+    if not isinstance(header, FrameHeader):
+        raise CodecError(f"expected a frame, got a message of topic '{row.name}'")
     return header, buffers
 
 
-def _specs(header: _ImageHeader) -> dict[str, Any]:
+def _open_keyframe(header: KeyframeHeader, parts: Parts) -> Parts:
+    """The parts of its frame, whose header and sizes are checked; it is bounded as a whole, packed and unpacked, as
+    learners keep dozens of them."""
+    what = f"keyframe of camera '{header.camera_id}'"
+    inner = [topic_bytes("frame", header.camera_id), *parts[2:]]
+    if len(inner) < 2:
+        raise CodecError(f"{what}: has no frame")
+    frame, _ = _open_frame(inner)
+    if frame.label is None:
+        raise CodecError(f"{what}: has no label image, so that there is nothing to learn from it")
+    height, width = frame.size
+    if width * height > MAX_KEYFRAME_PIXELS:
+        raise CodecError(f"{what}: image of {width}x{height}; a keyframe has at most {MAX_KEYFRAME_PIXELS} pixels")
+    if (size := sum(map(len, parts))) > MAX_KEYFRAME_BYTES:
+        raise CodecError(f"{what}: {size} bytes in all; a keyframe has at most {MAX_KEYFRAME_BYTES}")
+    return inner
+
+
+def _specs(header: _ImageHeader) -> dict[str, RgbSpec | DepthSpec | Uint8Spec]:
     """How the images of a message are packed, by name, in the order of its buffers."""
-    found = {name: getattr(header, name) for name in header.IMAGES}
-    return {name: spec for name, spec in found.items() if spec is not None}
+    return {name: spec for name in header.IMAGES if (spec := getattr(header, name)) is not None}
 
 
-def _decode_images(header: _ImageHeader, buffers: Parts) -> dict[str, Any]:
-    specs = _specs(header)
+def _decode_images(header: _ImageHeader, buffers: Parts, names: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
+    """Those of these names; without any, all that there are."""
     return {
-        name: _decode_image(header, name, spec, data) for (name, spec), data in zip(specs.items(), buffers, strict=True)
+        name: spec.decode(data, header.size, f"{_name(header)}: {name}")
+        for (name, spec), data in zip(_specs(header).items(), buffers, strict=True)
+        if not names or name in names
     }
-
-
-def _decode_image(header: _ImageHeader, name: str, spec: RgbSpec | DepthSpec | Uint8Spec, data: Buffer) -> NDArray[Any]:
-    what = f"{header.name}: {name}"
-    match spec:
-        case RgbSpec():
-            return decode_rgb(data, spec.encoding, *header.size, what)
-        case DepthSpec():
-            return decode_depth(spec, data, header.size, what)
-        case Uint8Spec():
-            return decode_uint8(data, header.size, what)
 
 
 def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
@@ -594,73 +581,3 @@ def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
         label_is_pseudo=header.pseudo_label and header.label is not None,
         **{name: getattr(header, name) for name in _FRAME_SCALARS},
     )
-
-
-def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
-    height, width = update.label.shape
-    what = f"map of camera '{update.camera_id}' seq={update.seq}"
-    images = {"confidence": update.confidence, "depth_m": update.depth_m, "moving": update.moving}
-    for name, image in images.items():
-        if image is not None and image.shape != (height, width):
-            raise CodecError(f"{what}: {name} {image.shape} must have the size of label, {update.label.shape}")
-    if not bool(np.all((update.confidence >= 0) & (update.confidence <= 1 + 1e-5))):
-        raise CodecError(f"{what}: confidence must lie in [0, 1]")
-    packed: _Packed = {
-        "label": encode_uint8(update.label),
-        "confidence": encode_uint8(np.rint(np.minimum(update.confidence, 1) * 255).astype(np.uint8)),
-        "depth": encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options.depth_scale),
-    }
-    if update.moving is not None and update.moving.any():
-        packed["moving"] = encode_uint8(update.moving.astype(np.uint8))
-    is_motion = not np.array_equal(update.T_map_world, np.eye(4))
-    header = MapUpdateHeader(
-        width=width,
-        height=height,
-        T_map_world=tuple(update.T_map_world.ravel().tolist()) if is_motion else None,
-        **{name: getattr(update, name) for name in _UPDATE_SCALARS},
-        **{name: cast(Any, spec) for name, (spec, _) in packed.items()},
-    )
-    return [topic_bytes("map", update.camera_id), _pack_header_of(header), *(data for _, data in packed.values())]
-
-
-def _decode_map_update(header: MapUpdateHeader, buffers: Parts) -> MapUpdate:
-    images, T = _decode_images(header, buffers), header.T_map_world
-    return MapUpdate(
-        label=images["label"],
-        confidence=images["confidence"].astype(np.float32) / np.float32(255),
-        depth_m=images["depth"],
-        moving=images["moving"] > 0 if "moving" in images else None,
-        T_map_world=np.eye(4) if T is None else np.array(T, np.float64).reshape(4, 4),
-        **{name: getattr(header, name) for name in _UPDATE_SCALARS},
-    )
-
-
-def _encode_keyframe(keyframe: LabelledKeyframe, options: CodecOptions) -> list[bytes]:
-    frame = keyframe.frame
-    what = f"keyframe of camera '{frame.camera_id}' seq={frame.seq}"
-    if frame.label is None:
-        raise CodecError(f"{what}: has no label image, so that there is nothing to learn from it")
-    labels = to_plain(LabelSetForm.of(keyframe.label_set), what)
-    header = {"camera_id": frame.camera_id, "teacher": keyframe.teacher, "label_set": labels}
-    packed = _pack(header, KeyframeHeader, what)
-    parts = [topic_bytes("keyframe", frame.camera_id), packed, *encode_frame(frame, options)[1:]]
-    _open(parts)  # is it too large?
-    return parts
-
-
-def _open_keyframe(header: KeyframeHeader, parts: Parts) -> Parts:
-    """The parts of its frame, whose header and sizes are checked; it is bounded as a whole, packed and unpacked, as
-    learners keep dozens of them."""
-    inner = [topic_bytes("frame", header.camera_id), *parts[2:]]
-    if len(inner) < 2:
-        raise CodecError(f"keyframe of camera '{header.camera_id}': has no frame")
-    frame, _ = _open_as(FrameHeader, inner)
-    what = f"keyframe of camera '{frame.camera_id}' seq={frame.seq}"
-    if frame.label is None:
-        raise CodecError(f"{what}: has no label image")
-    height, width = frame.size
-    if width * height > MAX_KEYFRAME_PIXELS:
-        raise CodecError(f"{what}: image of {width}x{height}; a keyframe has at most {MAX_KEYFRAME_PIXELS} pixels")
-    if (size := sum(map(len, parts))) > MAX_KEYFRAME_BYTES:
-        raise CodecError(f"{what}: {size} bytes in all; a keyframe has at most {MAX_KEYFRAME_BYTES}")
-    return inner

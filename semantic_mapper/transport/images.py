@@ -1,7 +1,8 @@
 """Images of messages as buffers: colour, depth, labels, confidence; and how the header says each is packed.
 
 Depth and labels are packed without loss: differences along rows, byte planes, zstd. Sizes are checked before anything
-is decoded; of colour images they, and whether the file is complete, are read from the file's own marks.
+is decoded; of colour images they, and whether the file is complete, are read from the file's own marks. What is
+damaged, or not of the (height, width) that is expected, is a ``CodecError``.
 """
 
 from __future__ import annotations
@@ -50,6 +51,21 @@ class RgbSpec(Wire, frozen=True):
     encoding: ImageEncoding
     bytes: PartBytes
 
+    def decode(self, data: Buffer, size: tuple[int, int], what: str) -> UInt8:
+        """(H, W, 3) uint8 RGB."""
+        height, width = size
+        if self.encoding == "raw":
+            if len(data) != 3 * height * width:
+                raise CodecError(f"{what}: raw {width}x{height} must have {3 * height * width} bytes, got {len(data)}")
+            return np.frombuffer(data, np.uint8).reshape(height, width, 3).copy()
+        try:
+            rgb, found = decode_image_file(bytes(data), size)
+        except CodecError as error:
+            raise CodecError(f"{what}: {error}") from error
+        if found != self.encoding:
+            raise CodecError(f"{what}: the header announces {self.encoding}, the data are {found}")
+        return rgb
+
 
 class DepthSpec(Wire, frozen=True):
     """How a depth buffer is packed; ``scale`` in units a metre for uint16, else 0."""
@@ -58,12 +74,29 @@ class DepthSpec(Wire, frozen=True):
     bytes: PartBytes
     scale: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
 
+    def decode(self, data: Buffer, size: tuple[int, int], what: str) -> Float32:
+        """(H, W) metres."""
+        is_units = self.encoding == "u16_delta_planes_zstd"
+        if is_units and np.float32(self.scale) <= 0:
+            raise CodecError(f"{what}: scale of depth must be positive, got {self.scale}")
+        itemsize = 2 if is_units else 4
+        planes = np.frombuffer(zstd_decompress(data, itemsize * size[0] * size[1], what), np.uint8)
+        values = np.ascontiguousarray(planes.reshape(itemsize, -1).T)
+        if not is_units:
+            return values.view("<f4").reshape(size).astype(np.float32, copy=False)
+        delta = values.view("<u2").reshape(size)
+        return depth_from_uint16(np.cumsum(delta, axis=1, dtype=np.uint16), self.scale)
+
 
 class Uint8Spec(Wire, frozen=True):
     """How a buffer of class ids, of a mask or of confidence in 255ths is packed."""
 
     encoding: Literal["u8_zstd"]
     bytes: PartBytes
+
+    def decode(self, data: Buffer, size: tuple[int, int], what: str) -> UInt8:
+        """(H, W)."""
+        return np.frombuffer(zstd_decompress(data, size[0] * size[1], what), np.uint8).reshape(size).copy()
 
 
 def zstd_compress(data: Buffer) -> bytes:
@@ -75,28 +108,20 @@ def zstd_compress(data: Buffer) -> bytes:
 
 
 def zstd_decompress(data: Buffer, size: int, what: str) -> bytes:
-    """Decompress exactly ``size`` bytes.
-
-    Raises:
-        CodecError: damaged, or not of that size.
-    """
+    """Decompress exactly ``size`` bytes; ``CodecError`` where the data are damaged or not of that size."""
     try:
         announced = zstandard.frame_content_size(data)
-        if announced != size:
-            raise CodecError(f"{what}: compressed data announce {announced} bytes, the header means {size}")
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
+        if announced == size:
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
     except (zstandard.ZstdError, ValueError) as error:
-        if isinstance(error, CodecError):
-            raise
         raise CodecError(f"{what}: cannot be decompressed: {error}") from error
+    raise CodecError(f"{what}: compressed data announce {announced} bytes, the header means {size}")
 
 
 def depth_from_uint16(raw: NDArray[np.uint16], scale: float) -> Float32:
-    """Sensor units -> metres, ``raw / scale`` in float32. Every importer and driver must use this one.
+    """Sensor units (H, W), 0 = no measurement -> metres, ``raw / scale`` in float32, with ``scale`` units a metre.
 
-    Args:
-        raw: (H, W) uint16, 0 = no measurement.
-        scale: Units a metre, e.g. 1000.
+    Every importer and driver must use this one.
     """
     return raw.astype(np.float32) / np.float32(scale)
 
@@ -126,24 +151,6 @@ def encode_depth(depth_m: Float32, scale: float) -> tuple[DepthSpec, bytes]:
     return DepthSpec("u16_delta_planes_zstd", len(data), float(scale)), data
 
 
-def decode_depth(spec: DepthSpec, data: Buffer, size: tuple[int, int], what: str) -> Float32:
-    """Inverse of ``encode_depth``.
-
-    Raises:
-        CodecError: damaged, or not of ``size`` (height, width).
-    """
-    is_units = spec.encoding == "u16_delta_planes_zstd"
-    if is_units and np.float32(spec.scale) <= 0:
-        raise CodecError(f"{what}: scale of depth must be positive, got {spec.scale}")
-    itemsize = 2 if is_units else 4
-    planes = np.frombuffer(zstd_decompress(data, itemsize * size[0] * size[1], what), np.uint8)
-    values = np.ascontiguousarray(planes.reshape(itemsize, -1).T)
-    if not is_units:
-        return values.view("<f4").reshape(size).astype(np.float32, copy=False)
-    delta = values.view("<u2").reshape(size)
-    return depth_from_uint16(np.cumsum(delta, axis=1, dtype=np.uint16), spec.scale)
-
-
 def _compress_planes(values: NDArray[np.generic]) -> bytes:
     """The first bytes of all elements, then the second ones, and so on."""
     return zstd_compress(values.view(np.uint8).reshape(-1, values.itemsize).T.tobytes())
@@ -155,21 +162,8 @@ def encode_uint8(image: UInt8) -> tuple[Uint8Spec, bytes]:
     return Uint8Spec("u8_zstd", len(data)), data
 
 
-def decode_uint8(data: Buffer, size: tuple[int, int], what: str) -> UInt8:
-    """Inverse of ``encode_uint8``: (H, W).
-
-    Raises:
-        CodecError: damaged, or not of ``size`` (height, width).
-    """
-    return np.frombuffer(zstd_decompress(data, size[0] * size[1], what), np.uint8).reshape(size).copy()
-
-
 def encode_rgb(rgb: UInt8, encoding: ImageEncoding, jpeg_quality: int) -> bytes:
-    """(H, W, 3) uint8 RGB -> bytes. "raw" and "png" are lossless.
-
-    Raises:
-        CodecError: OpenCV cannot encode it.
-    """
+    """(H, W, 3) uint8 RGB -> bytes; "raw" and "png" are lossless. ``CodecError`` where OpenCV cannot encode it."""
     if encoding == "raw":
         return np.ascontiguousarray(rgb).tobytes()  # a copy: the caller may reuse its buffer while zmq still sends
     if encoding == "png":
@@ -183,30 +177,11 @@ def encode_rgb(rgb: UInt8, encoding: ImageEncoding, jpeg_quality: int) -> bytes:
     return data.tobytes()
 
 
-def decode_rgb(data: Buffer, encoding: ImageEncoding, height: int, width: int, what: str = "rgb") -> UInt8:
-    """Bytes -> (H, W, 3) uint8 RGB.
-
-    Raises:
-        CodecError: damaged, cut off, or of another size than (height, width).
-    """
-    if encoding == "raw":
-        if len(data) != 3 * height * width:
-            raise CodecError(f"{what}: raw {width}x{height} must have {3 * height * width} bytes, got {len(data)}")
-        return np.frombuffer(data, np.uint8).reshape(height, width, 3).copy()
-    try:
-        rgb, found = decode_image_file(bytes(data), (height, width))
-    except CodecError as error:
-        raise CodecError(f"{what}: {error}") from error
-    if found != encoding:
-        raise CodecError(f"{what}: the header announces {encoding}, the data are {found}")
-    return rgb
-
-
 def decode_image_file(data: bytes, expected: tuple[int, int] | None = None) -> tuple[UInt8, Literal["png", "jpeg"]]:
-    """A JPEG or PNG file -> (H, W, 3) uint8 RGB and its encoding.
+    """A JPEG or PNG file, of the ``expected`` (height, width) if given -> (H, W, 3) uint8 RGB and its encoding.
 
     Raises:
-        CodecError: neither, damaged, cut off, or not of the ``expected`` (height, width).
+        CodecError: neither, damaged, cut off, or of another size.
     """
     encoding, size = sniff_image(data)
     if expected is not None and size != expected:

@@ -89,11 +89,7 @@ class LabelSetForm(Wire, frozen=True):
         return cls(labels.name, classes, labels.ignore_id)
 
     def to_label_set(self) -> LabelSet:
-        """The core type.
-
-        Raises:
-            LabelError: a class or id twice, or a class that is the ignore id.
-        """
+        """The core type; ``LabelError`` where a class or id stands twice, or a class is the ignore id."""
         ids, names, colors = zip(*((c.id, c.name, c.color) for c in self.classes), strict=True)
         return LabelSet(self.name, ids, names, colors, self.ignore_id)
 
@@ -134,8 +130,13 @@ class Status(Wire, frozen=True):
     degraded: Annotated[tuple[Sentence, ...], Meta(max_length=_MAX_SENTENCES)] = ()
 
     def __post_init__(self) -> None:
+        most = sys.float_info.max
         counters = [(_sendable(name, _WORD), min(max(n, 0), MAX_COUNT)) for name, n in self.counters.items()]
-        ages = [(_sendable(name, _WORD), _finite(age)) for name, age in self.ages_s.items() if not math.isnan(age)]
+        ages = [
+            (_sendable(name, _WORD), min(max(age, -most), most))
+            for name, age in self.ages_s.items()
+            if not math.isnan(age)
+        ]
         force_setattr(self, "counters", dict(counters[:_MAX_NUMBERS]))
         force_setattr(self, "ages_s", dict(ages[:_MAX_NUMBERS]))
         force_setattr(self, "degraded", tuple(_sendable(text, _SENTENCE) for text in self.degraded[:_MAX_SENTENCES]))
@@ -177,8 +178,13 @@ class LabelledKeyframe(Wire, frozen=True, eq=False):
     label_set: LabelSet  # what its ids mean
     teacher: Word = ""  # who labelled it, for people ("label tool", "log kitchen.mcap")
 
+    @property
+    def camera_id(self) -> str:
+        """Of the frame."""
+        return self.frame.camera_id
+
     def __post_init__(self) -> None:
-        force_setattr(self, "teacher", self.teacher[:128])
+        force_setattr(self, "teacher", self.teacher[:_WORD])
 
 
 class WeightsUpdate(Wire, frozen=True):
@@ -234,10 +240,6 @@ def _sendable(text: str, length: int) -> str:
     return text[:length].encode(errors="replace").decode()
 
 
-def _finite(number: float) -> float:
-    return min(max(number, -sys.float_info.max), sys.float_info.max)
-
-
 def digest_of(data: Buffer) -> str:
     """SHA-256, hexadecimal."""
     return hashlib.sha256(data).hexdigest()
@@ -275,11 +277,7 @@ TOPICS = {
 
 
 def topic_bytes(name: str, source: str) -> bytes:
-    """Topic as it stands on the wire, ``name/source/``.
-
-    Raises:
-        CodecError: the source has characters that a topic cannot hold.
-    """
+    """Topic as it stands on the wire, ``name/source/``; ``CodecError`` where it cannot hold the source's letters."""
     if not re.match(SOURCE_PATTERN, source):
         raise CodecError(
             f"'{source}' cannot be the name of a camera or node: use 1 to 64 letters, digits and any of _ . : -"
@@ -292,25 +290,17 @@ def subscription(name: str, source: str | None = None) -> bytes:
     return f"{name}/".encode() if source is None else topic_bytes(name, source)
 
 
-def parse_topic(topic: bytes) -> tuple[Topic, str]:
-    """Topic on the wire -> its row of the table and the source.
-
-    Raises:
-        CodecError: not one of ours.
-    """
-    if len(topic) <= MAX_TOPIC_BYTES:
-        words = topic.decode("ascii", errors="replace").split("/")
-        if len(words) == 3 and words[0] in TOPICS and re.match(SOURCE_PATTERN, words[1]) and not words[2]:
-            return TOPICS[words[0]], words[1]
-    raise CodecError(f"unknown topic {topic[:40]!r}; topics read '<name>/<source>/' with a name of {', '.join(TOPICS)}")
+def parse_topic(topic: Buffer) -> tuple[Topic, str]:
+    """Topic on the wire -> its row of the table and the source; ``CodecError`` where it is not one of ours."""
+    start = bytes(topic[: MAX_TOPIC_BYTES + 1])
+    name, _, rest = start.decode("ascii", errors="replace").partition("/")
+    if len(start) <= MAX_TOPIC_BYTES and name in TOPICS and rest.endswith("/") and re.match(SOURCE_PATTERN, rest[:-1]):
+        return TOPICS[name], rest[:-1]
+    raise CodecError(f"unknown topic {start[:40]!r}; topics read '<name>/<source>/' with a name of {', '.join(TOPICS)}")
 
 
 def read_topic(parts: Parts) -> tuple[Topic, str]:
-    """Topic and source of a message.
-
-    Raises:
-        CodecError: too few or too many parts, or an unknown topic.
-    """
+    """Topic and source of a message; ``CodecError`` where it has too few or too many parts, or an unknown topic."""
     if not 2 <= len(parts) <= MAX_PARTS:
         raise CodecError(f"a message has 2 to {MAX_PARTS} parts, got {len(parts)}")
-    return parse_topic(bytes(parts[0][: MAX_TOPIC_BYTES + 1]))
+    return parse_topic(parts[0])

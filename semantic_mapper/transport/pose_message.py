@@ -12,10 +12,8 @@ machine). Position, in metres, and quaternion are of frame ``child`` in frame ``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Any, cast
+from typing import Annotated
 
-import msgpack
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -23,7 +21,7 @@ from msgspec import Meta
 from semantic_mapper.errors import CodecError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.transport.codec import check_header, pack_header, to_plain, unpack_header
-from semantic_mapper.transport.messages import Buffer, CaptureStamp, Finite, Wire
+from semantic_mapper.transport.messages import CaptureStamp, Finite, Parts, Wire
 from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64
 
 MAX_POSE_BYTES = 2048
@@ -48,9 +46,7 @@ class PoseMessage(Wire, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         length = float(np.linalg.norm(self.quaternion))
         if not abs(length - 1) <= QUATERNION_TOLERANCE:  # NaN, too
-            raise CodecError(
-                f"{_WHAT}: the quaternion [x, y, z, w] has length {length:.3g}, not 1; what it turns by is not defined"
-            )
+            raise CodecError(f"{_WHAT}: the quaternion [x, y, z, w] has length {length:.3g}, not 1: it is no rotation")
 
     @property
     def matrix(self) -> Float64:
@@ -59,36 +55,23 @@ class PoseMessage(Wire, frozen=True, kw_only=True):
 
 
 def encode_pose(message: PoseMessage, topic: str = "pose") -> list[bytes]:
-    """Message -> [topic, msgpack].
-
-    Raises:
-        CodecError: a value that cannot be sent, such as NaN or a quaternion that is not of unit length.
-    """
+    """Message -> [topic, msgpack]; ``CodecError`` where a value cannot be sent, such as NaN."""
     header = to_plain(message, _WHAT)
     check_header(header, PoseMessage, _WHAT)
     return [topic.encode(), pack_header(header, _WHAT)]
 
 
-def decode_pose(parts: Sequence[Buffer]) -> PoseMessage:
-    """Inverse of ``encode_pose``; takes JSON, and a payload without topic, too.
-
-    Raises:
-        CodecError: not such a message, or longer than ``MAX_POSE_BYTES``.
-    """
+def decode_pose(parts: Parts) -> PoseMessage:
+    """Inverse of ``encode_pose``; takes JSON, and a payload without topic, too. ``CodecError`` where it is none, or
+    longer than ``MAX_POSE_BYTES``."""
     if not 1 <= len(parts) <= 2:
         raise CodecError(f"{_WHAT}: has one part, or topic and payload; got {len(parts)} parts")
     payload = bytes(parts[-1]) if len(parts[-1]) <= MAX_POSE_BYTES else b""
     if not payload:
         raise CodecError(f"{_WHAT}: of {len(parts[-1])} bytes; 1 to {MAX_POSE_BYTES} are accepted")
     if payload.lstrip()[:1] == b"{":  # no msgpack map begins like that
-        payload = _json_to_msgpack(payload)
+        try:  # so that the same limits and checks hold for both
+            payload = msgspec.msgpack.encode(msgspec.json.decode(payload))
+        except (ValueError, RecursionError, OverflowError) as error:
+            raise CodecError(f"{_WHAT}: not JSON: {error}") from error
     return check_header(unpack_header(payload, _WHAT), PoseMessage, _WHAT)
-
-
-def _json_to_msgpack(payload: bytes) -> bytes:
-    """So that the same limits and checks hold for both."""
-    try:
-        data: Any = msgspec.json.decode(payload)
-        return cast(bytes, msgpack.packb(data, use_bin_type=True))
-    except (ValueError, TypeError, RecursionError, OverflowError) as error:
-        raise CodecError(f"{_WHAT}: not JSON: {error}") from error
