@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError
 from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses, MapPoints
+from semantic_mapper.queries import questions
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
@@ -22,25 +23,12 @@ from semantic_mapper.queries.questions import (
     NAMES,
     QUESTIONS,
     AnswerT,
-    AtRequest,
-    BoxRequest,
-    ChangesRequest,
     Correction,
-    CorrectionRequest,
-    CorrectPosesRequest,
-    DistanceRequest,
-    InfoRequest,
-    InstancesRequest,
     MapInfo,
     MapState,
-    NearestRequest,
-    OccupancyRequest,
     Point,
-    PoseRequest,
-    RaysRequest,
     Request,
     Weights,
-    WeightsRequest,
     decode_answer,
     encode_request,
 )
@@ -96,22 +84,22 @@ class MapClient:
 
     def info(self) -> MapInfo:
         """Size and classes of the map."""
-        return self._ask(InfoRequest())
+        return self._ask(questions.InfoRequest())
 
     def at(self, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
         """What is at points (N, 3), world metres; see ``queries.nearest.at``."""
-        return self._ask(AtRequest(points=as_numbers(points, "points"), radius_m=radius_m))
+        return self._ask(questions.AtRequest(points=as_numbers(points, "points"), radius_m=radius_m))
 
     def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
         """The nearest surface of a class; see ``queries.nearest.nearest``."""
         return self._ask(
-            NearestRequest(class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence)
+            questions.NearestRequest(class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence)
         )
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
         """The first surface that each ray meets; see ``queries.surface.cast_rays``."""
         return self._ask(
-            RaysRequest(
+            questions.RaysRequest(
                 origins=np.atleast_2d(as_numbers(origins, "origins")),
                 directions=np.atleast_2d(as_numbers(directions, "directions")),
                 max_m=max_m,
@@ -120,7 +108,7 @@ class MapClient:
 
     def points_in_box(self, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
         """Surface points in a box; see ``queries.surface.points_in_box``."""
-        return self._ask(BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper")))
+        return self._ask(questions.BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper")))
 
     def instances(self, up: ArrayLike = UP, *, gone: bool = False) -> tuple[Instance, ...]:
         """All things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``.
@@ -128,16 +116,13 @@ class MapClient:
         With ``gone``, behind them also those of earlier answers that have gone since (``Instance.gone_ns``), the latest
         64.
         """
-        return self._ask(InstancesRequest(up=_point(up, "up"), gone=gone)).things()
+        return self._ask(questions.InstancesRequest(up=_point(up, "up"), gone=gone)).things()
 
     def graph(self, up: ArrayLike | None = None) -> SceneGraph:
         """Floors, rooms, doors and things; see ``queries.graph.GraphTracker``.
 
         Computed here, from ``mirror``; the things are those of ``instances``. Ids of rooms stay from call to call of
-        this client, for each ``up``; those of another client may differ.
-
-        Args:
-            up: (3,) direction in the world; found by the floor by default.
+        this client, for each ``up`` ((3,), by default found by the floor); those of another client may differ.
         """
         snapshot = self.mirror().snapshot()
         with self._mirror_lock:
@@ -147,12 +132,12 @@ class MapClient:
 
     def occupancy(self, points: ArrayLike) -> UInt8:
         """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""
-        return self._ask(OccupancyRequest(points=as_numbers(points, "points")))
+        return self._ask(questions.OccupancyRequest(points=as_numbers(points, "points")))
 
     def distance_field(self, lower: ArrayLike, upper: ArrayLike, *, unknown_is_occupied: bool = False) -> DistanceField:
         """Distances to obstacles in a box; see ``queries.occupancy.distance_field``."""
         low, high = _point(lower, "lower"), _point(upper, "upper")
-        return self._ask(DistanceRequest(lower=low, upper=high, unknown_is_occupied=unknown_is_occupied))
+        return self._ask(questions.DistanceRequest(lower=low, upper=high, unknown_is_occupied=unknown_is_occupied))
 
     def mirror(self) -> MapMirror:
         """A mirror of the map in this process, brought up to the present; for many queries, or large ones.
@@ -164,7 +149,7 @@ class MapClient:
             newest = -1
             while True:
                 since = 0 if self._mirror is None else self._mirror.version
-                request = ChangesRequest(since=since, limit=MIRROR_BLOCKS, map_id=self._mirrored)
+                request = questions.ChangesRequest(since=since, limit=MIRROR_BLOCKS, map_id=self._mirrored)
                 state, changes = self._ask_about(request)
                 if self._mirror is None or state.map_id != self._mirrored:
                     info = self.info()
@@ -178,11 +163,9 @@ class MapClient:
                     return self._mirror
 
     def pose(self) -> CameraPose | None:
-        """Where the last frame was taken, in the map; None before the first.
-
-        Its ``T_map_camera`` is None, and ``reason`` says why, while a camera's place in the map is not known.
-        """
-        return self._ask(PoseRequest())
+        """Where the last frame was taken, in the map; None before the first. Its ``T_map_camera`` is None, and ``reason``
+        says why, while a camera's place in the map is not known."""
+        return self._ask(questions.PoseRequest())
 
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None, within_ns: int = 0) -> Correction:
         """Begin to move the map with corrected poses, as a loop closure gives them; mapping continues meanwhile.
@@ -204,7 +187,7 @@ class MapClient:
         keys = [key if isinstance(key, tuple) else ("", key) for key in poses]
         cameras = tuple(dict.fromkeys(camera for camera, _ in keys)) or ("",)
         matrices = [_pose(T, stamp_ns) for (_, stamp_ns), T in zip(keys, poses.values(), strict=True)]
-        request = CorrectPosesRequest(
+        request = questions.CorrectPosesRequest(
             id=uuid.uuid4().hex,
             cameras=cameras,
             until_ns=until_ns,
@@ -217,19 +200,16 @@ class MapClient:
 
     def correction(self) -> Correction:
         """How far corrections are; ``used`` and ``left_out`` are 0."""
-        return self._ask(CorrectionRequest())
+        return self._ask(questions.CorrectionRequest())
 
     def weights(self) -> Weights:
         """Which weights the mapper uses; ``MapError`` where it takes none while it runs (option `learner`)."""
-        return self._ask(WeightsRequest())
+        return self._ask(questions.WeightsRequest())
 
     def return_to_weights(self, version: int) -> Weights:
-        """Ask the mapper to go back to weights that it has used before; it does so a moment later.
-
-        Raises:
-            MapError: it has never used these, or keeps them no longer.
-        """
-        return self._ask(WeightsRequest(to=version))
+        """Ask the mapper to go back to weights that it has used before, which it does a moment later; ``MapError`` where
+        it has never used these, or keeps them no longer."""
+        return self._ask(questions.WeightsRequest(to=version))
 
     def close(self) -> None:
         """Free the socket. Harmless when repeated."""
@@ -256,11 +236,7 @@ class MapClient:
 
 
 def _point(values: ArrayLike, name: str) -> Point:
-    """Three numbers; what they are worth the other side judges.
-
-    Raises:
-        CodecError: not three.
-    """
+    """Three numbers; what they are worth the other side judges."""
     numbers = as_numbers(values, name)
     if numbers.shape != (3,):
         raise CodecError(f"{name}: expected shape (3,), got {numbers.shape}")
@@ -270,7 +246,8 @@ def _point(values: ArrayLike, name: str) -> Point:
 
 def _pose(T_world_camera: Float64, stamp_ns: int) -> Float64:
     """A pose as numbers; whether it is a rigid transform the other side judges."""
-    pose = as_numbers(T_world_camera, f"corrected pose of stamp {stamp_ns}")
+    what = f"corrected pose of stamp {stamp_ns}"
+    pose = as_numbers(T_world_camera, what)
     if pose.shape != (4, 4):
-        raise ShapeError(f"corrected pose of stamp {stamp_ns}: expected shape (4, 4), got {pose.shape}")
+        raise ShapeError(f"{what}: expected shape (4, 4), got {pose.shape}")
     return pose

@@ -454,7 +454,7 @@ def read_envelope(parts: Parts) -> Envelope:
     row, header, buffers = _open(parts)
     if isinstance(header, KeyframeHeader):
         header, _ = _open_frame(buffers)
-    common = {name: getattr(header, name, 0) for name in ("stamp_ns", "seq", "world")}
+    common: dict[str, Any] = {name: getattr(header, name, 0) for name in ("stamp_ns", "seq", "world")}
     source = read_topic(parts)[1]
     if not isinstance(header, FrameHeader):
         return Envelope(row.name, source, **common, T_map_world=getattr(header, "T_map_world", None) or ())

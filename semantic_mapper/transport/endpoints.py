@@ -1,4 +1,4 @@
-"""Where sockets listen, ``ipc://`` in a folder of the user by default, and where they may connect to.
+"""Where sockets listen, ``ipc://`` in a folder of the user by default, where they may connect to, and how both begin.
 
 Beyond this machine nothing is bound, and nothing connected to, without keys.
 """
@@ -12,7 +12,7 @@ import re
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import IO
@@ -21,18 +21,15 @@ import zmq
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import open_unlinked
-from semantic_mapper.transport.keys import Keys, ServerIdentity
+from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
 
 _umask_lock = threading.Lock()
 _MAX_IPC_PATH = 100  # the kernel takes 107 bytes, lock suffix aside
 
 
 def default_endpoint(name: str, namespace: str = "default") -> str:
-    """``ipc://`` endpoint of a node, the same for all processes of one user.
-
-    Args:
-        name: Of the node ("camera", "mapper").
-        namespace: Keeps two systems on one machine apart.
+    """``ipc://`` endpoint of a node ("camera", "mapper"), the same for all processes of one user; ``namespace`` keeps
+    two systems on one machine apart.
 
     Raises:
         TransportError: a name that is no plain word, or no folder can be made for the sockets.
@@ -63,17 +60,25 @@ def check_bind(endpoint: str, keys: Keys | None = None) -> None:
         TransportError: an address beyond this machine without these, or a transport other than ipc, inproc and tcp.
     """
     transport, _, address = endpoint.partition("://")
-    if transport == "ipc":
-        if address.startswith("@") or len(os.fsencode(address)) > _MAX_IPC_PATH or not address:
-            raise TransportError(
-                f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes; use a shorter one (sockets of "
-                "a launch lie in TMPDIR)"
-            )
-    elif transport == "tcp":
-        if not is_loopback(address):
-            _check_keys(endpoint, keys)
-    elif transport != "inproc":
+    if transport not in ("ipc", "inproc", "tcp"):
         raise TransportError(f"{endpoint}: use ipc://PATH or tcp://127.0.0.1:PORT")
+    if transport == "ipc" and (address[:1] in ("", "@") or len(os.fsencode(address)) > _MAX_IPC_PATH):
+        raise TransportError(
+            f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes; use a shorter one (sockets of "
+            "a launch lie in TMPDIR)"
+        )
+    if transport != "tcp" or is_loopback(address):
+        return
+    if keys is None:
+        raise TransportError(
+            f"{endpoint}: other machines could connect, which needs keys on both sides (`semantic-mapper keys make`, "
+            "then the option `keys`); without them bind tcp://127.0.0.1:PORT, and tunnel it (ssh -L) from elsewhere"
+        )
+    if not keys.peers():
+        raise TransportError(
+            f"{endpoint}: nobody could connect, as {keys.folder} has no peers; add their public keys with "
+            "`semantic-mapper keys allow NAME KEY`"
+        )
 
 
 def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None:
@@ -95,19 +100,6 @@ def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None
         )
 
 
-def _check_keys(endpoint: str, keys: Keys | None) -> None:
-    if keys is None:
-        raise TransportError(
-            f"{endpoint}: other machines could connect, which needs keys on both sides (`semantic-mapper keys make`, "
-            "then the option `keys`); without them bind tcp://127.0.0.1:PORT, and tunnel it (ssh -L) from elsewhere"
-        )
-    if not keys.peers():
-        raise TransportError(
-            f"{endpoint}: nobody could connect, as {keys.folder} has no peers; add their public keys with "
-            "`semantic-mapper keys allow NAME KEY`"
-        )
-
-
 def is_loopback(address: str) -> bool:
     """Of ``HOST:PORT``, or of what else ZeroMQ takes for one (``SOURCE;HOST:PORT``): that is never one of loopback."""
     host = address.rpartition(":")[0].strip("[]")
@@ -119,22 +111,73 @@ def is_loopback(address: str) -> bool:
         return False
 
 
-def bind(socket: zmq.Socket[bytes], endpoint: str, lock: EndpointLock) -> str:
-    """Bind a socket where ``lock`` holds the endpoint; returns the endpoint as ZeroMQ names it.
+class ServerSocket:
+    """A bound socket (``socket``), and its ``endpoint`` as ZeroMQ names it.
 
     The file of an ``ipc://`` socket is this user's alone from the start (mode 0600).
 
+    Args:
+        kind: Of ZeroMQ's.
+        endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one).
+        keys: Encrypt, and let in only their peers; needed where other machines could connect.
+        options: Of the socket.
+
     Raises:
-        TransportError: it cannot be bound; the socket is closed and the lock released then.
+        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines and there are
+            no keys.
     """
+
+    def __init__(
+        self, kind: zmq.SocketType, endpoint: str, keys: Keys | None, options: Mapping[zmq.SocketOption, int]
+    ) -> None:
+        check_bind(endpoint, keys)
+        is_ipc = endpoint.startswith("ipc://")
+        self._lock = _lock_path(endpoint) if is_ipc else None
+        self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        for option, value in options.items():
+            self.socket.setsockopt(option, value)
+        if keys is not None:
+            secure_server(self.socket, keys)
+        try:
+            with _owner_only() if is_ipc else nullcontext():
+                self.socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            self.socket.setsockopt(zmq.LINGER, 0)
+            ServerSocket.close(self)
+            raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
+        self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def close(self) -> None:
+        """Free the endpoint. The lock file stays: unlinking it would let two hold "the" lock."""
+        self.socket.close()
+        if self._lock is not None:
+            self._lock.close()
+
+
+def client_socket(
+    kind: zmq.SocketType,
+    endpoints: Sequence[str],
+    identity: ServerIdentity | None,
+    options: Mapping[zmq.SocketOption, int],
+) -> zmq.Socket[bytes]:
+    """A socket that is ready to be connected to these endpoints.
+
+    Raises:
+        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that is not
+            among the peers.
+    """
+    for endpoint in endpoints:
+        check_connect(endpoint, identity)
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+    for option, value in options.items():
+        socket.setsockopt(option, value)
     try:
-        with _owner_only() if endpoint.startswith("ipc://") else nullcontext():
-            socket.bind(endpoint)
-    except zmq.ZMQError as error:
-        socket.close(linger=0)
-        lock.release()
-        raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
-    return socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        if identity is not None:
+            secure_client(socket, identity)
+    except TransportError:
+        socket.close()
+        raise
+    return socket
 
 
 @contextmanager
@@ -148,37 +191,23 @@ def _owner_only() -> Iterator[None]:
             os.umask(before)
 
 
-class EndpointLock:
-    """Holds an ``ipc://`` path: ZeroMQ would silently take a living publisher's path over from it, or a file's.
+def _lock_path(endpoint: str) -> IO[bytes]:
+    """Hold an ``ipc://`` path: ZeroMQ would silently take a living publisher's path over from it, or a file's.
 
-    The kernel releases the lock when the process ends, however it ends. Other transports need none.
-
-    Raises:
-        TransportError: somebody else holds it, its folder does not exist, or a file is there that is no socket.
+    The kernel releases the lock when the process ends, however it ends.
     """
-
-    def __init__(self, endpoint: str) -> None:
-        self._file: IO[bytes] | None = None
-        if not endpoint.startswith("ipc://"):
-            return
-        path = Path(endpoint.removeprefix("ipc://"))
-        if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
-            raise TransportError(f"{endpoint}: a file is there that is no socket; move it, or choose another path")
-        try:
-            file = os.fdopen(open_unlinked(f"{path}.lock", os.O_RDWR | os.O_CREAT), "rb")
-        except OSError as error:
-            raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.close()
-            raise TransportError(
-                f"{endpoint}: another process listens there already; stop it or choose another endpoint"
-            ) from error
-        self._file = file
-
-    def release(self) -> None:
-        """Let others have it. The lock file stays: unlinking it would let two hold "the" lock."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+    path = Path(endpoint.removeprefix("ipc://"))
+    if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
+        raise TransportError(f"{endpoint}: a file is there that is no socket; move it, or choose another path")
+    try:
+        file = os.fdopen(open_unlinked(f"{path}.lock", os.O_RDWR | os.O_CREAT), "rb")
+    except OSError as error:
+        raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise TransportError(
+            f"{endpoint}: another process listens there already; stop it or choose another endpoint"
+        ) from error
+    return file

@@ -53,11 +53,7 @@ class Keys:
         return f"Keys({str(self.folder)!r}, {self.public.decode()!r})"
 
     def peers(self) -> dict[str, bytes]:
-        """Public keys of the peers by name, as they are in the folder now.
-
-        Raises:
-            TransportError: a file is damaged.
-        """
+        """Public keys of the peers by name, as they are in the folder now; ``TransportError`` where one is damaged."""
         return {path.stem: _load(path)[0] for path in sorted((self.folder / _PEERS).glob("*.key"))}
 
 
@@ -70,11 +66,7 @@ class ServerIdentity:
 
 
 def make_keys(folder: Path) -> Keys:
-    """Make new keys for this machine.
-
-    Raises:
-        TransportError: there are keys already, or the folder cannot be written.
-    """
+    """Make new keys for this machine; ``TransportError`` where there are some, or the folder cannot be written."""
     if (folder / f"{_OWN}.key_secret").exists():
         raise TransportError(f"{folder}: there are keys already; peers know this machine by them. Remove them by hand")
     before = os.umask(0o077)
@@ -90,11 +82,8 @@ def make_keys(folder: Path) -> Keys:
 
 
 def load_keys(folder: Path) -> Keys:
-    """Read the keys of this machine.
-
-    Raises:
-        TransportError: they are missing or damaged, or others could read the secret one.
-    """
+    """The keys of this machine; ``TransportError`` where they are missing or damaged, or others could read the secret
+    one."""
     path = folder / f"{_OWN}.key_secret"
     if not path.is_file():
         raise TransportError(f"{folder}: no keys here; make them with `semantic-mapper keys make --keys {folder}`")
@@ -107,11 +96,8 @@ def load_keys(folder: Path) -> Keys:
 
 
 def allow(folder: Path, name: str, public: str) -> None:
-    """Add a peer by its public key, or change its key; servers that run let it in from now on.
-
-    Raises:
-        TransportError: no name for a file, not a public key, or the folder cannot be written.
-    """
+    """Add a peer by its public key, or change its key; servers that run let it in from now on. ``TransportError`` where
+    the name is none for a file, or the key none."""
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,47}", name):
         raise TransportError(f"'{name}' cannot name a peer: use letters, digits and any of _ . -")
     if not _is_key(public.encode()):
@@ -119,19 +105,13 @@ def allow(folder: Path, name: str, public: str) -> None:
             f"'{public}' is no public key of {_KEY_LETTERS} letters; `semantic-mapper keys show` has it"
         )
     path = folder / _PEERS / f"{name}.key"
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_bytes(path, f'metadata\n    name = {name}\ncurve\n    public-key = "{public}"\n'.encode())
-    except OSError as error:
-        raise TransportError(f"{path}: cannot be written: {error}") from error
+    certificate = f'metadata\n    name = {name}\ncurve\n    public-key = "{public}"\n'
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    write_bytes(path, certificate.encode(), raises=TransportError)
 
 
 def forget(folder: Path, name: str) -> None:
-    """Remove a peer; connections that it has already stay until they end.
-
-    Raises:
-        TransportError: no such peer.
-    """
+    """Remove a peer (``TransportError`` where there is none); connections that it has already stay until they end."""
     path = folder / _PEERS / f"{Path(name).name}.key"  # never the key of this machine itself
     try:
         path.unlink()
@@ -157,11 +137,7 @@ def secure_server(socket: zmq.Socket[bytes], keys: Keys) -> None:
 
 
 def secure_client(socket: zmq.Socket[bytes], identity: ServerIdentity) -> None:
-    """Let a socket, to be connected yet, talk to this server alone.
-
-    Raises:
-        TransportError: the server is not among the peers.
-    """
+    """Let a socket, to be connected yet, talk to this server alone; ``TransportError`` where it is no peer."""
     peers = identity.keys.peers()
     known = {"": identity.keys.public, **peers}
     if identity.server not in known:

@@ -10,44 +10,40 @@ from typing import Self
 import zmq
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
-from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
+from semantic_mapper.transport.endpoints import ServerSocket, client_socket
+from semantic_mapper.transport.keys import Keys, ServerIdentity
 from semantic_mapper.transport.messages import MAX_HEADER_BYTES, MAX_PART_BYTES, MAX_PARTS, Buffer
 from semantic_mapper.transport.sockets import receive_bounded
 
 MAX_REQUEST_BYTES = 10_000_000  # of a part: 65,536 poses, and some room; a client that sends more is cut off
 _QUESTION_PARTS = 5  # who asks, the empty part that REQ sockets put first, and a question's three
 _WAITING = 64  # questions and answers that may wait for each client
+_SERVER_OPTIONS = {
+    zmq.LINGER: 200,
+    zmq.RCVHWM: _WAITING,
+    zmq.SNDHWM: _WAITING,
+    zmq.MAXMSGSIZE: MAX_REQUEST_BYTES,
+}
+_CLIENT_OPTIONS = {
+    zmq.LINGER: 0,
+    zmq.MAXMSGSIZE: MAX_PART_BYTES,
+    zmq.RECONNECT_IVL: 50,
+    zmq.RECONNECT_IVL_MAX: 1000,
+}
 
 
-class QueryServer:
+class QueryServer(ServerSocket):
     """Binds an endpoint, receives questions and sends answers. One thread uses it; any thread may ``wake`` that one.
 
-    A client that does not take its answers loses them; nothing here ever waits for a client.
-
-    Args:
-        endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one, see ``endpoint``).
-        keys: Encrypt, and let in only their peers; needed where other machines could connect.
-
-    Raises:
-        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines and there are
-            no keys.
+    A client that does not take its answers loses them; nothing here ever waits for a client. Arguments and errors as
+    of ``ServerSocket``.
     """
 
     def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
-        check_bind(endpoint, keys)
-        self._endpoint_lock = EndpointLock(endpoint)
-        self._socket = zmq.Context.instance().socket(zmq.ROUTER)
-        self._socket.setsockopt(zmq.LINGER, 200)
-        self._socket.setsockopt(zmq.RCVHWM, _WAITING)
-        self._socket.setsockopt(zmq.SNDHWM, _WAITING)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
-        if keys is not None:
-            secure_server(self._socket, keys)
-        self.endpoint = bind(self._socket, endpoint, self._endpoint_lock)
+        super().__init__(zmq.ROUTER, endpoint, keys, _SERVER_OPTIONS)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._poller = zmq.Poller()
-        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self.socket, zmq.POLLIN)
         self._poller.register(self._wake, zmq.POLLIN)
 
     def wake(self) -> None:
@@ -56,19 +52,16 @@ class QueryServer:
 
     def wait(self, timeout_s: float) -> None:
         """Until there is a question, somebody calls ``wake``, or the time is over."""
-        ready = dict(self._poller.poll(int(timeout_s * 1000)))
-        if self._wake in ready:
+        if self._wake in dict(self._poller.poll(int(timeout_s * 1000))):
             os.eventfd_read(self._wake)
 
     def receive(self) -> tuple[bytes, list[bytes]] | None:
         """Who asks, and the parts of the question; None where nobody does. One that is too large has a part too many,
         or lacks its last ones."""
+        limit = MAX_REQUEST_BYTES + MAX_HEADER_BYTES
         try:
             (sender, *parts), _ = receive_bounded(
-                self._socket,
-                max_parts=_QUESTION_PARTS + 1,
-                max_bytes=MAX_REQUEST_BYTES + MAX_HEADER_BYTES,
-                flags=zmq.NOBLOCK,
+                self.socket, max_parts=_QUESTION_PARTS + 1, max_bytes=limit, flags=zmq.NOBLOCK
             )
         except zmq.Again:
             return None
@@ -77,15 +70,14 @@ class QueryServer:
     def send(self, client: bytes, parts: Sequence[Buffer]) -> None:
         """Answer a client; where it is gone, the answer is, too."""
         try:
-            self._socket.send_multipart([client, b"", *parts], zmq.NOBLOCK, copy=False)
+            self.socket.send_multipart([client, b"", *parts], zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return
 
     def close(self) -> None:
         """Free the endpoint."""
-        self._socket.close()
+        super().close()
         os.close(self._wake)
-        self._endpoint_lock.release()
 
 
 class QuerySocket:
@@ -102,19 +94,12 @@ class QuerySocket:
         identity: Of a server that has keys.
 
     Raises:
-        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
-            is not among the peers.
+        TransportError: see ``client_socket``.
     """
 
     def __init__(
-        self,
-        endpoint: str,
-        *,
-        timeout_s: float,
-        attempts: int,
-        identity: ServerIdentity | None = None,
+        self, endpoint: str, *, timeout_s: float, attempts: int, identity: ServerIdentity | None = None
     ) -> None:
-        check_connect(endpoint, identity)
         self.endpoint = endpoint
         self._timeout_s = timeout_s
         self._attempts = attempts
@@ -146,7 +131,7 @@ class QuerySocket:
         """Free the socket. Harmless when repeated."""
         with self._lock:
             self._closed = True
-            self._socket.close(linger=0)
+            self._socket.close()
 
     def __enter__(self) -> Self:
         return self
@@ -169,24 +154,15 @@ class QuerySocket:
             return None
         finally:  # also after Ctrl-C: a REQ socket that has sent can only wait for that answer
             if not answered:
-                self._socket.close(linger=0)
+                self._socket.close()
                 self._socket = self._connect()
 
     def _connect(self) -> zmq.Socket[bytes]:
-        socket = zmq.Context.instance().socket(zmq.REQ)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.SNDTIMEO, int(self._timeout_s * 1000))
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_PART_BYTES)
-        socket.setsockopt(zmq.RECONNECT_IVL, 50)
-        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        options = {**_CLIENT_OPTIONS, zmq.SNDTIMEO: int(self._timeout_s * 1000)}
+        socket = client_socket(zmq.REQ, [self.endpoint], self._identity, options)
         try:
-            if self._identity is not None:
-                secure_client(socket, self._identity)
             socket.connect(self.endpoint)
-        except TransportError:
-            socket.close(linger=0)
-            raise
         except zmq.ZMQError as error:
-            socket.close(linger=0)
+            socket.close()
             raise TransportError(f"{self.endpoint}: cannot be connected to: {error}") from error
         return socket

@@ -7,7 +7,8 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Literal, Self, cast
 
 import zmq
@@ -16,8 +17,8 @@ from zmq.utils.monitor import recv_monitor_message
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.codec import Envelope, decode, read_envelope
-from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
-from semantic_mapper.transport.keys import Keys, ServerIdentity, secure_client, secure_server
+from semantic_mapper.transport.endpoints import ServerSocket, client_socket
+from semantic_mapper.transport.keys import Keys, ServerIdentity
 from semantic_mapper.transport.messages import (
     MAX_HEADER_BYTES,
     MAX_KEYFRAME_BYTES,
@@ -41,8 +42,18 @@ _LATE_S = 0.1  # subscriptions of one socket come in no order; an end must not a
 _MAX_SUBSCRIPTIONS = 4096  # what an unknown client's subscriptions may cost us
 _MAX_EVENTS = 256  # heard at a time: an unknown client that subscribes without end must not hold up what is published
 _POLL_MS = 50
-# A machine that is gone is found out within 5 s; a process that is gone at once, by the kernel.
-_KEEPALIVE = ((zmq.TCP_KEEPALIVE_IDLE, 2), (zmq.TCP_KEEPALIVE_INTVL, 1), (zmq.TCP_KEEPALIVE_CNT, 3))
+_SUBSCRIBER_OPTIONS = {
+    zmq.LINGER: 0,
+    zmq.RECONNECT_IVL: 50,
+    zmq.RECONNECT_IVL_MAX: 200,  # a node that was restarted is found at once
+    # A machine that is gone is found out within 5 s; a process that is gone at once, by the kernel. Not ZeroMQ's own
+    # heartbeats: they take a reader that does not keep up for a dead peer, and where its queue was full when they cut
+    # the connection, libzmq aborts the process (4.3.5: "Assertion failed: _input_stopped").
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 2,
+    zmq.TCP_KEEPALIVE_INTVL: 1,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+}
 _MAX_SLOTS = 256  # cameras and nodes that a mailbox serves; an unknown client's invented ones stop here
 _GIVEN_UP_S = 0.3  # ZeroMQ says at once whether it tries again
 _TRIES_AGAIN = (zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED)
@@ -55,13 +66,8 @@ log = get_logger(__name__)
 def receive_bounded(
     socket: zmq.Socket[bytes], *, max_parts: int = MAX_PARTS, max_bytes: int = MAX_MESSAGE_BYTES, flags: int = 0
 ) -> tuple[list[bytes], str]:
-    """The next message, all of which is taken off the socket.
-
-    Returns:
-        Its parts and an empty text; of a message beyond the limits those before the first that is too much, and why.
-
-    Raises:
-        zmq.Again: there is no message, and the flags say not to wait.
+    """The parts of the next message, all of which is taken off the socket, and an empty text; of a message beyond the
+    limits the parts before the first that is too much, and why. ``zmq.Again`` where the flags say not to wait.
     """
     parts: list[bytes] = []
     count = size = 0
@@ -87,8 +93,7 @@ class Publisher:
         linger_ms: How long ``close`` waits for the last messages to be delivered.
 
     Raises:
-        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines and there are
-            no keys.
+        TransportError: see ``ServerSocket``.
     """
 
     def __init__(
@@ -100,24 +105,22 @@ class Publisher:
         linger_ms: int = 2000,
         keys: Keys | None = None,
     ) -> None:
-        check_bind(endpoint, keys)
-        self._endpoint_lock = EndpointLock(endpoint)
+        options = {
+            zmq.LINGER: linger_ms,
+            zmq.SNDHWM: hwm,
+            zmq.SNDTIMEO: _SEND_SLICE_MS,
+            zmq.MAXMSGSIZE: 1024,  # subscribers send nothing but subscriptions
+            zmq.XPUB_VERBOSER: 1,  # tell of every (un)subscription, so that they can be counted
+            zmq.XPUB_NODROP: int(policy == "block"),
+        }
+        self._server = ServerSocket(zmq.XPUB, endpoint, keys, options)
+        self._socket, self.endpoint = self._server.socket, self._server.endpoint
         self._mutex = threading.Lock()  # a zmq socket may change threads only across a memory barrier
         self._counts: Counter[bytes] = Counter()
         self._latched: dict[bytes, Parts] = {}
         self._late: dict[bytes, float] = {}  # latched ends that newcomers get yet, and when
         self._owed: list[Parts] = []  # answers to subscriptions that found a full queue
         self._closed = threading.Event()
-        self._socket = zmq.Context.instance().socket(zmq.XPUB)
-        self._socket.setsockopt(zmq.LINGER, linger_ms)
-        self._socket.setsockopt(zmq.SNDHWM, hwm)
-        self._socket.setsockopt(zmq.SNDTIMEO, _SEND_SLICE_MS)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, 1024)  # subscribers send nothing but subscriptions
-        self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # tell of every (un)subscription, so that they can be counted
-        self._socket.setsockopt(zmq.XPUB_NODROP, int(policy == "block"))
-        if keys is not None:
-            secure_server(self._socket, keys)
-        self.endpoint = bind(self._socket, endpoint, self._endpoint_lock)
         self._pump_thread = threading.Thread(target=self._pump, name=f"publisher {endpoint}", daemon=True)
         self._pump_thread.start()
 
@@ -133,16 +136,14 @@ class Publisher:
         topic = bytes(parts[0])
         deadline = time.monotonic() + timeout_s
         while True:
-            with self._mutex:
-                self._check_open()
-                self._drain()
-                if self._try_send(parts):
-                    self._latch(topic, parts)
-                    return
-            self._closed.wait(0.001)  # let other threads have the socket
-            if time.monotonic() > deadline:
-                with self._mutex:
+            with self._in_use():
+                sent, late = self._try_send(parts), time.monotonic() > deadline
+                if sent or late:
                     self._latch(topic, parts)  # who comes later, or is reminded, gets it yet
+            if sent:
+                return
+            self._closed.wait(0.001)  # let other threads have the socket
+            if late:
                 raise TransportError(
                     f"{self.endpoint}: a subscriber of {topic.decode(errors='replace')} has taken nothing for "
                     f"{timeout_s:g} s; it hangs or is too slow for a lossless stream"
@@ -150,9 +151,7 @@ class Publisher:
 
     def remind(self, name: str) -> None:
         """Send the latched messages of a topic once more, for those who had no room for them; waits for nobody."""
-        with self._mutex:
-            self._check_open()
-            self._drain()
+        with self._in_use():
             for topic, parts in self._latched.items():
                 if topic.startswith(subscription(name)):
                     self._try_send(parts, zmq.NOBLOCK)
@@ -160,9 +159,7 @@ class Publisher:
     def subscribers(self, name: str, source: str | None = None) -> int:
         """How many subscriptions a message of this topic reaches."""
         topic = subscription(name, source)
-        with self._mutex:
-            self._check_open()
-            self._drain()
+        with self._in_use():
             return sum(count for prefix, count in self._counts.items() if topic.startswith(prefix))
 
     def wait_for_subscribers(self, name: str, count: int = 1, timeout_s: float = 10.0) -> None:
@@ -187,8 +184,7 @@ class Publisher:
         self._closed.set()
         self._pump_thread.join()
         with self._mutex:
-            self._socket.close()
-        self._endpoint_lock.release()
+            self._server.close()
 
     def __enter__(self) -> Self:
         return self
@@ -196,9 +192,14 @@ class Publisher:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _check_open(self) -> None:
-        if self._closed.is_set():
-            raise TransportError(f"{self.endpoint}: the publisher is closed")
+    @contextmanager
+    def _in_use(self) -> Iterator[None]:
+        """Hold the socket, once what subscribers have sent is heard."""
+        with self._mutex:
+            if self._closed.is_set():
+                raise TransportError(f"{self.endpoint}: the publisher is closed")
+            self._drain()
+            yield
 
     def _pump(self) -> None:
         """Hear subscriptions also while nothing is published."""
@@ -208,9 +209,12 @@ class Publisher:
 
     def _drain(self) -> None:
         owed, self._owed = self._owed, []
-        for parts in owed:
+        now = time.monotonic()
+        due = [topic for topic, at in self._late.items() if at <= now]
+        for parts in (*owed, *(self._latched[topic] for topic in due)):
             self._answer(parts)
-        self._answer_late()
+        for topic in due:
+            del self._late[topic]
         for _ in range(_MAX_EVENTS):
             try:
                 event = self._socket.recv(zmq.NOBLOCK)
@@ -249,12 +253,6 @@ class Publisher:
                 self._latched.pop(ended, None)
                 self._late.pop(ended, None)
 
-    def _answer_late(self) -> None:
-        now = time.monotonic()
-        for topic in [topic for topic, due in self._late.items() if due <= now]:
-            del self._late[topic]
-            self._answer(self._latched[topic])
-
     def _answer(self, parts: Parts) -> None:
         if not self._try_send(parts, zmq.NOBLOCK) and len(self._owed) < _MAX_SUBSCRIPTIONS:
             self._owed.append(parts)
@@ -274,6 +272,13 @@ def _row(topic: bytes) -> Topic | None:
     return TOPICS.get(topic.partition(b"/")[0].decode("ascii", errors="replace"))
 
 
+def _known(topic: str) -> tuple[str, str | None]:
+    name, _, source = topic.partition("/")
+    if name not in TOPICS:
+        raise CodecError(f"no topic '{name}'; there are {', '.join(TOPICS)}")
+    return name, source or None
+
+
 class _Subscriber:
     """A subscriber, as the two below are; any thread may call its methods.
 
@@ -285,20 +290,26 @@ class _Subscriber:
         endpoints: One publisher or several.
         topics: "frame", or "frame/CAMERA" for one source.
         identity: Of publishers that have keys.
-        hwm: Messages that wait in the socket's own queue.
+        hwm: Messages that wait in the socket's own queue; as many wait here before a lossless one makes the publisher
+            wait.
 
     Raises:
-        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that
-            is not among the peers.
+        TransportError: an unknown topic; or see ``client_socket``.
     """
 
     def __init__(
-        self, endpoints: str | Sequence[str], topics: Sequence[str], *, hwm: int = 16, identity: ServerIdentity | None
+        self,
+        endpoints: str | Sequence[str],
+        topics: Sequence[str],
+        *,
+        identity: ServerIdentity | None = None,
+        hwm: int = 16,
     ) -> None:
         self.endpoints = (endpoints,) if isinstance(endpoints, str) else tuple(endpoints)
         self.topics = tuple(topics)
         self.rejected = 0
         self.last_error: CodecError | None = None
+        self._hwm = hwm
         self._changed = threading.Condition()
         # What waits to be read, in order: by topic where messages give way to newer ones, else by serial number. One
         # that replaces another keeps its place, so that an end of stream cannot overtake a frame.
@@ -311,22 +322,21 @@ class _Subscriber:
         self._closed = False
         self._failure: zmq.ZMQError | None = None  # of the thread that takes messages off the socket
         self._max_bytes = max(_OF_TOPIC.get(topic.partition("/")[0], MAX_MESSAGE_BYTES) for topic in self.topics)
-        self._socket = zmq.Context.instance().socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, hwm)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, min(MAX_PART_BYTES, self._max_bytes))
-        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 200)  # a node that was restarted is found at once
-        # Not ZeroMQ's own heartbeats: they take a reader that does not keep up for a dead peer, and where its queue was
-        # full when they cut the connection, libzmq aborts the process (4.3.5: "Assertion failed: _input_stopped").
-        self._socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
-        for option, seconds_or_probes in _KEEPALIVE:
-            self._socket.setsockopt(option, seconds_or_probes)
-        self._connections = _Connections(self._socket)
+        options = {**_SUBSCRIBER_OPTIONS, zmq.RCVHWM: hwm, zmq.MAXMSGSIZE: min(MAX_PART_BYTES, self._max_bytes)}
         try:
-            self._connect()
-        except (zmq.ZMQError, CodecError, TransportError) as error:
-            self._close_socket()
+            prefixes = [subscription(*_known(topic)) for topic in self.topics]
+            self._socket = client_socket(zmq.SUB, self.endpoints, identity, options)
+        except (CodecError, TransportError) as error:
+            raise TransportError(f"cannot subscribe to {self.endpoints}: {error}") from error
+        self._connections = _Connections(self._socket)
+        # Last: publishers hear subscriptions in order, so an answer to this one proves that all others are heard.
+        for prefix in (*prefixes, self._sync_topic):
+            self._socket.subscribe(prefix)
+        try:
+            for endpoint in self.endpoints:
+                self._socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            self._connections.close()
             raise TransportError(f"cannot subscribe to {self.endpoints}: {error}") from error
         self._thread = threading.Thread(target=self._run, name=f"subscriber {self.endpoints}", daemon=True)
         self._thread.start()
@@ -407,21 +417,6 @@ class _Subscriber:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _connect(self) -> None:
-        for endpoint in self.endpoints:
-            check_connect(endpoint, self._identity)
-        if self._identity is not None:
-            secure_client(self._socket, self._identity)
-        for topic in self.topics:
-            name, _, source = topic.partition("/")
-            if name not in TOPICS:
-                raise CodecError(f"no topic '{name}'; there are {', '.join(TOPICS)}")
-            self._socket.subscribe(subscription(name, source or None))
-        # Last: publishers hear subscriptions in order, so an answer to this one proves that all others are heard.
-        self._socket.subscribe(self._sync_topic)
-        for endpoint in self.endpoints:
-            self._socket.connect(endpoint)
-
     def _run(self) -> None:
         try:
             while not self._closed:
@@ -433,7 +428,7 @@ class _Subscriber:
                 self._failure = error
                 self._changed.notify_all()
         finally:
-            self._close_socket()  # by the thread that used it
+            self._connections.close()  # by the thread that used it
 
     def _take(self, parts: list[bytes], trouble: str) -> None:
         if parts[0].startswith(SYNC_PREFIX):
@@ -469,32 +464,12 @@ class _Subscriber:
                 f"{self.endpoints}: nothing is received any more: {self._failure}; subscribe again"
             ) from self._failure
 
-    def _close_socket(self) -> None:
-        self._connections.close()
-        self._socket.close(linger=0)
-
 
 class LosslessSubscriber(_Subscriber):
-    """Gets every message, in order; with a ``Publisher`` of policy "block" none is lost.
-
-    Args:
-        endpoints, topics, identity: See ``_Subscriber``.
-        hwm: Messages that wait here before the publisher is made to wait, and as many in the socket.
-    """
-
-    def __init__(
-        self,
-        endpoints: str | Sequence[str],
-        topics: Sequence[str],
-        *,
-        hwm: int = 16,
-        identity: ServerIdentity | None = None,
-    ) -> None:
-        self._room = hwm
-        super().__init__(endpoints, topics, hwm=hwm, identity=identity)
+    """Gets every message, in order; with a ``Publisher`` of policy "block" none is lost. Arguments: ``_Subscriber``."""
 
     def _put(self, parts: list[bytes], envelope: Envelope) -> None:
-        self._changed.wait_for(lambda: len(self._waiting) < self._room or self._closed)
+        self._changed.wait_for(lambda: len(self._waiting) < self._hwm or self._closed)
         self._serial += 1
         self._waiting[self._serial] = parts
 
@@ -502,17 +477,10 @@ class LosslessSubscriber(_Subscriber):
 class NewestSubscriber(_Subscriber):
     """Gets the newest message of each source: an unread one gives way to the next, and is counted in ``overwritten``.
 
-    Messages whose topic is marked "all" in the table (info, end, ...) never give way.
-
-    Args:
-        endpoints, topics, identity: See ``_Subscriber``.
+    Messages whose topic is marked "all" in the table (info, end, ...) never give way. Arguments: ``_Subscriber``.
     """
 
-    def __init__(
-        self, endpoints: str | Sequence[str], topics: Sequence[str], *, identity: ServerIdentity | None = None
-    ) -> None:
-        self.overwritten = 0
-        super().__init__(endpoints, topics, identity=identity)
+    overwritten = 0
 
     def _put(self, parts: list[bytes], envelope: Envelope) -> None:
         self._serial += 1
@@ -525,11 +493,8 @@ class NewestSubscriber(_Subscriber):
 
 
 class _Connections:
-    """Counts the connections of a socket, and makes those again that ZeroMQ has given up; for the socket's thread.
-
-    Args:
-        socket: Not connected yet.
-    """
+    """Counts the connections of a socket that is not connected yet, and makes those again that ZeroMQ has given up; for
+    the socket's thread."""
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         self._socket = socket
@@ -569,6 +534,7 @@ class _Connections:
                 log.warning("connection_renewed", endpoint=endpoint, renewed=self._renewed)
 
     def close(self) -> None:
-        """Before the socket is closed."""
+        """The socket, too."""
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
+        self._socket.close(linger=0)
