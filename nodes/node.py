@@ -48,15 +48,12 @@ class NodeContext:
     restartable: bool = False  # whether it restarts where it fails
 
     def endpoint(self, name: str) -> str:
-        """Where a node publishes."""
-        return self.endpoints.get(name) or default_endpoint(name)
+        """Where a node publishes; an endpoint is one already."""
+        return name if "://" in name else self.endpoints.get(name) or default_endpoint(name)
 
     def leave_note(self, what: str, text: str) -> None:
-        """Leave word to the process that takes over when this one is killed; in a launch only.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Leave word to the process that takes over when this one is killed; in a launch only. ``OSError`` where it
+        cannot be written."""
         if self.folder is not None:
             write_bytes(self.folder / f"{self.name}.{what}.note", text.encode(), sync="none")
 
@@ -92,23 +89,18 @@ def run_node(
     prepare_process()
     code = 1
     try:
-        job = job or _job_of_arguments()
+        if job is None and len(sys.argv) != 2:
+            example = '{"name": "camera", "options": {"log": "kitchen.mcap"}}'
+            raise ConfigError(f"a node takes one argument, JSON: {example}")
+        job = job or read_job(sys.argv[1])
         structlog.contextvars.bind_contextvars(node=job.name)
         heartbeat = HeartbeatWriter(job.heartbeat_fd)
         heartbeat.start()
         options = convert_config(job.options, kind, f"node '{job.name}'")
         with StopRequest(patient=True, signals=_requests(job, kind)) as stop:
-            context = NodeContext(
-                name=job.name,
-                endpoints=job.endpoints,
-                subscribers=job.subscribers,
-                stop=stop,
-                heartbeat=heartbeat,
-                restarts=job.restarts,
-                folder=Path(job.folder) if job.folder else None,
-                restartable=job.restartable,
-            )
-            losses = work(context, options)
+            folder = Path(job.folder) if job.folder else None
+            launched = (job.restarts, folder, job.restartable)
+            losses = work(NodeContext(job.name, job.endpoints, job.subscribers, stop, heartbeat, *launched), options)
             # A request that comes from here on finds a process that ends anyway, and must not hide how it ended.
             signal.signal(STOP_SIGNAL, signal.SIG_IGN)
         code = stop.exit_code if job.heartbeat_fd >= 0 else 0
@@ -134,21 +126,8 @@ def _requests(job: NodeJob, kind: type[NodeOptions]) -> tuple[signal.Signals, ..
     return (STOP_SIGNAL, signal.SIGINT, signal.SIGTERM)
 
 
-def _job_of_arguments() -> NodeJob:
-    if len(sys.argv) != 2:
-        raise ConfigError('a node takes one argument, JSON: {"name": "camera", "options": {"log": "kitchen.mcap"}}')
-    return read_job(sys.argv[1])
-
-
 def read_job(argument: str) -> NodeJob:
-    """What a node is to do.
-
-    Args:
-        argument: JSON, or "fd:N" of an open file with it.
-
-    Raises:
-        ConfigError: it is neither.
-    """
+    """What a node is to do, of JSON, or "fd:N" of an open file with it; ``ConfigError`` where it is neither."""
     text: str | bytes = argument
     try:
         if argument.startswith(JOB_PREFIX):

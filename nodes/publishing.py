@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import structlog
@@ -21,23 +22,15 @@ _log = structlog.get_logger(__name__)
 
 
 class PartStatus(NamedTuple):
-    """What one part of a node says of itself: counts, and what does not work as it should."""
+    """What one part of a node says of itself: counts, what does not work as it should, and ages in seconds."""
 
     counters: dict[str, int]
     warnings: tuple[str, ...] = ()
+    ages_s: Mapping[str, float] = MappingProxyType({})
 
 
 def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0) -> None:
-    """Publish a status; one that cannot be sent is no reason for a node to end.
-
-    Args:
-        publisher: Of the node.
-        status: What it says.
-        timeout_s: As of ``Publisher.publish``.
-
-    Raises:
-        TransportError: as of ``Publisher.publish``.
-    """
+    """As of ``Publisher.publish``; a status that cannot be sent is no reason for a node to end."""
     try:
         parts = encode(status)
     except CodecError as error:
@@ -47,12 +40,7 @@ def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0
 
 
 class StatusReport:
-    """Publishes how a node is, about once a second.
-
-    Args:
-        node: Its name.
-        publisher: Where.
-    """
+    """Publishes how a node of this name is, about once a second."""
 
     def __init__(self, node: str, publisher: Publisher) -> None:
         self._node = node
@@ -64,12 +52,13 @@ class StatusReport:
         """Whether it is time to."""
         return time.monotonic() - self._last >= STATUS_PERIOD_S
 
-    def publish(
-        self, state: NodeState, counters: Mapping[str, int], ages_s: Mapping[str, float], degraded: tuple[str, ...]
-    ) -> Status:
-        """Publish it now; what was published."""
+    def publish(self, state: NodeState, *parts: PartStatus) -> Status:
+        """Publish it now, all parts together; what was published."""
         self._last = time.monotonic()
-        status = Status(self._node, state, time.monotonic_ns(), dict(counters), dict(ages_s), degraded)
+        counters = {name: count for part in parts for name, count in part.counters.items()}
+        ages_s = {name: age for part in parts for name, age in part.ages_s.items()}
+        warnings = tuple(warning for part in parts for warning in part.warnings if warning)
+        status = Status(self._node, state, time.monotonic_ns(), counters, ages_s, warnings)
         publish_status(self._publisher, status)
         return status
 
@@ -81,10 +70,7 @@ class PublicPublisher(Publisher):
         endpoint: Of the node, among those of its launch.
         public: The fixed one, ``ipc://PATH`` or ``tcp://ADDRESS:PORT``; empty = none.
         keys: Folder of keys: what goes out there is encrypted, and sent to its peers alone; empty = none.
-        linger_ms: See ``Publisher``.
-
-    Raises:
-        TransportError: see ``Publisher``; other machines could reach the second one, and there are no keys.
+        linger_ms: See ``Publisher``, also for errors.
     """
 
     def __init__(self, endpoint: str, public: str, keys: str, *, linger_ms: int = 2000) -> None:

@@ -163,7 +163,7 @@ class MapClient:
                     return self._mirror
 
     def pose(self) -> CameraPose | None:
-        """Where the last frame was taken, in the map; None before the first. Its ``T_map_camera`` is None, and ``reason``
+        """Where the last frame was taken, in the map; None before the first. ``T_map_camera`` is None, and ``reason``
         says why, while a camera's place in the map is not known."""
         return self._ask(questions.PoseRequest())
 
@@ -207,8 +207,11 @@ class MapClient:
         return self._ask(questions.WeightsRequest())
 
     def return_to_weights(self, version: int) -> Weights:
-        """Ask the mapper to go back to weights that it has used before, which it does a moment later; ``MapError`` where
-        it has never used these, or keeps them no longer."""
+        """Ask the mapper to go back to weights that it has used before, which it does a moment later.
+
+        Raises:
+            MapError: it has never used these, or keeps them no longer.
+        """
         return self._ask(questions.WeightsRequest(to=version))
 
     def close(self) -> None:

@@ -68,8 +68,7 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
             except TransportError as error:  # a camera does not end because one of them does not come
                 _log.warning("some_do_not_listen", reason=str(error))
             if options.corrections:
-                named = options.corrections
-                endpoint = named if "://" in named else context.endpoint(named)
+                endpoint = context.endpoint(options.corrections)
                 node.sender = stack.enter_context(CorrectionSender(endpoint, live.id))
             node.publish_all(source)
         context.heartbeat.ending()

@@ -22,7 +22,7 @@ from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.nodes.map_feed import MapFollower, describe_map, thinned
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import FoxgloveOptions, NodeJob
-from semantic_mapper.nodes.publishing import StatusReport
+from semantic_mapper.nodes.publishing import PartStatus, StatusReport
 from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
@@ -53,14 +53,13 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
     """
     from semantic_mapper.nodes.foxglove.server import FoxgloveServer  # an extra, which may be missing
 
-    query = options.query if "://" in options.query else context.endpoint(options.query)
     endpoints = [context.endpoint(name) for name in options.inputs()]
     identity = ServerIdentity(load_keys(Path(options.keys).expanduser())) if options.keys else None
     with ExitStack() as stack:
         server = stack.enter_context(FoxgloveServer(options.port))
         _log.info("serving", foxglove_websocket=server.url)
         publisher = stack.enter_context(Publisher(context.endpoint(context.name)))
-        client = stack.enter_context(MapClient(query, attempts=1, identity=identity))
+        client = stack.enter_context(MapClient(context.endpoint(options.query), attempts=1, identity=identity))
         sender = _MapSender(client, server)
         follower = stack.enter_context(MapFollower(sender.look, options.refresh_s, PAUSE))
         messages = stack.enter_context(NewestSubscriber(endpoints, ("frame", "map", "status", "end")))
@@ -71,8 +70,8 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
             counters = {"frames": sender.frames, "maps": sender.sent["map"], "graphs": sender.sent["graph"]}
             counters |= {"rejected": messages.rejected, "overwritten": messages.overwritten}
             ages = {} if messages.silent_s is None else {"frame": messages.silent_s}
-            degraded = tuple(filter(None, (follower.trouble, sender.no_graph)))
-            server.send_status(report.publish(state, counters, ages, degraded))
+            warnings = (follower.trouble, sender.no_graph)
+            server.send_status(report.publish(state, PartStatus(counters, warnings, ages)))
 
         context.heartbeat.ready()
         while not context.stop and not streams.ended:

@@ -29,14 +29,11 @@ _log = structlog.get_logger(__name__)
 
 
 class LiveCorrection:
-    """Takes requests to correct poses, and rebuilds the map in the time between two frames.
-
-    Args:
-        pipeline: Its map is corrected.
-    """
+    """Takes requests to correct the poses of a pipeline's map, and rebuilds it in the time between two frames."""
 
     def __init__(self, pipeline: MappingPipeline) -> None:
         self._pipeline = pipeline
+        self._corrector = pipeline.corrector
         self._lock = threading.Lock()  # of what requests change
         self._outcomes: dict[str, tuple[int, int]] = {}  # by id of the request, the newest last: poses used, left out
         self._ended = False
@@ -47,28 +44,20 @@ class LiveCorrection:
     @property
     def running(self) -> bool:
         """Whether a correction is under way."""
-        return self._pipeline.corrector.status.running
+        return self._corrector.status.running
 
     def status(self) -> PartStatus:
         """For the mapper's status; no counts where no history is kept."""
-        status = self._pipeline.corrector.status
-        counters: dict[str, int] = {}
-        if self._pipeline.corrector.records:
-            counters = {
-                "corrections": status.completed,
-                "correction_done": status.done,
-                "correction_left": status.left,
-            }
-        failed = (f"the last correction of poses was given up: {status.failure}",) if status.failure else ()
-        return PartStatus(counters, failed)
+        status = self._corrector.status
+        failed = f"the last correction of poses was given up: {status.failure}" if status.failure else ""
+        if not self._corrector.records:
+            return PartStatus({}, (failed,))
+        counters = {"corrections": status.completed, "correction_done": status.done, "correction_left": status.left}
+        return PartStatus(counters, (failed,))
 
     def begin(self, request: CorrectPosesRequest) -> Correction:
-        """Begin a correction, unless this very request has done so before; see ``MapCorrector.start``.
-
-        Raises:
-            CodecError: arrays that do not go together.
-            MapError, PoseError: refused; nothing has changed.
-        """
+        """Begin a correction, unless this very request has done so before; see ``MapCorrector.start``. Where it is
+        refused (``CodecError``, ``MapError``, ``PoseError``), nothing has changed."""
         with self._lock:
             if request.id not in self._outcomes:
                 if self._ended:
@@ -80,16 +69,14 @@ class LiveCorrection:
 
     def describe(self, used: int = 0, left_out: int = 0) -> Correction:
         """Where corrections stand."""
-        status = self._pipeline.corrector.status
-        return Correction(**asdict(status), used=used, left_out=left_out, epoch=self._pipeline.voxel_map.epoch)
+        status = asdict(self._corrector.status)
+        return Correction(**status, used=used, left_out=left_out, epoch=self._pipeline.voxel_map.epoch)
 
     def advance(self, session: MapSession | None, *, mapped: bool) -> None:
         """Go on with a correction, for about the time of one frame; for the mapper's thread, between two frames.
 
-        Args:
-            session: Follows the map once the correction is done.
-            mapped: A frame was mapped since the last call: then the history goes on by as much as it must, which is
-                nothing where there was time to spare before this frame. Otherwise no frame waits.
+        ``session`` follows the map once the correction is done. Where a frame was ``mapped`` since the last call, the
+        history goes on by as much as it must, which is nothing where there was time to spare before; else none waits.
         """
         if session is not None:
             self._odometry_sessions = session.odometry_sessions
@@ -101,13 +88,8 @@ class LiveCorrection:
     def finish(self, session: MapSession, stopped: Callable[[], bool], on_wait: Callable[[], None]) -> None:
         """End a correction that is under way, before the results are written; refuse those that come later.
 
-        Once a stop was requested, it continues for ``STOPPED_S`` at most; what is left then is reported in the
-        log and in ``session.unfinished_correction``.
-
-        Args:
-            session: As for ``advance``.
-            stopped: Whether a stop was requested.
-            on_wait: Called now and then.
+        Once a stop was requested (``stopped``), it continues for ``STOPPED_S`` at most; what is left then is reported
+        in the log and in ``session.unfinished_correction``.
         """
         with self._lock:
             self._ended = True
@@ -118,24 +100,20 @@ class LiveCorrection:
             self._advance(1)
             on_wait()
         self._follow(session)
-        status = self._pipeline.corrector.status
-        if status.running:
-            session.unfinished_correction = (
-                f"the last correction of poses is not in the map: stopped after {status.done} of {status.total} frames"
-            )
-        elif status.failure:
-            session.unfinished_correction = f"the last correction of poses is not in the map: {status.failure}"
-        if session.unfinished_correction:
+        status = self._corrector.status
+        why = f"stopped after {status.done} of {status.total} frames" if status.running else status.failure
+        if why:
+            session.unfinished_correction = f"the last correction of poses is not in the map: {why}"
             _log.error("correction_unfinished", reason=session.unfinished_correction)
 
     def _begin(self, request: CorrectPosesRequest) -> tuple[int, int]:
         poses = self._to_frames(request)
         if self._odometry_sessions is not None:
             poses = self._odometry_sessions.in_map(poses)
-        known = self._pipeline.corrector.poses()
+        known = self._corrector.poses()
         stamps = {stamp_ns for _, stamp_ns in known}
         used = sum((key in known) if isinstance(key, tuple) else (key in stamps) for key in poses)
-        self._pipeline.corrector.start(poses, until_ns=request.until_ns)
+        self._corrector.start(poses, until_ns=request.until_ns)
         return used, len(request.stamps_ns) - used
 
     def _to_frames(self, request: CorrectPosesRequest) -> CorrectedPoses:
@@ -152,24 +130,24 @@ class LiveCorrection:
         if len(set(zip(camera.tolist(), stamps.tolist(), strict=True))) < len(stamps):
             raise MapError("correct_poses: a frame is given twice")
         if request.within_ns:
-            return self._nearest_frames(request, stamps, camera, poses)
+            return self._nearest_frames(request, camera)
         if names == [""]:
             return dict(zip(stamps.tolist(), poses, strict=True))
         keys = [(names[c], s) for c, s in zip(camera.tolist(), stamps.tolist(), strict=True)]
         return dict(zip(keys, poses, strict=True))
 
     def _nearest_frames(
-        self, request: CorrectPosesRequest, stamps: NDArray[np.int64], camera: NDArray[np.int64], poses: Float64
+        self, request: CorrectPosesRequest, camera: NDArray[np.int64]
     ) -> dict[tuple[str, int], Float64]:
-        known = self._pipeline.corrector.poses()
+        known, stamps = self._corrector.poses(), request.stamps_ns
         cameras = sorted({name for name, _ in known})
         if request.cameras == ("",) and len(cameras) > 1:
             raise MapError(f"correct_poses: the map has frames of the cameras {', '.join(cameras)}; name one")
         found: dict[tuple[str, int], Float64] = {}
         for number, name in enumerate(request.cameras):
             keys = [key for key in known if name in ("", key[0])]
-            found |= match_frames(keys, stamps[camera == number], poses[camera == number], request.within_ns)
-        if not found and len(stamps) and self._pipeline.corrector.records:
+            found |= match_frames(keys, stamps[camera == number], request.poses[camera == number], request.within_ns)
+        if not found and len(stamps) and self._corrector.records:
             raise MapError(
                 f"correct_poses: none of {len(stamps)} poses was taken within {request.within_ns / 1e6:g} ms of a "
                 f"frame in the history ({len(known)} frames"
@@ -180,12 +158,12 @@ class LiveCorrection:
 
     def _advance(self, frames: int) -> None:
         try:
-            self._pipeline.corrector.advance(frames)
+            self._corrector.advance(frames)
         except MapError as error:  # given up and kept as ``failure``; mapping continues
             _log.warning("map_stays_uncorrected", reason=str(error))
 
     def _follow(self, session: MapSession | None) -> None:
-        completed = self._pipeline.corrector.status.completed
+        completed = self._corrector.status.completed
         if session is not None and completed != self._followed:
             self._followed = completed
             session.follow_correction()

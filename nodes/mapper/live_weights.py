@@ -6,6 +6,7 @@ import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -47,16 +48,9 @@ class _Task:
 
 
 class LiveWeights:
-    """Takes, refuses and lists weights, and goes back to earlier ones. A context manager.
+    """Takes, refuses and lists weights, goes back to earlier ones, and publishes which are in use. A context manager.
 
-    Args:
-        context: Of the mapper's node.
-        options: Of the mapper, with its learner.
-        bundle: What the mapper was started with.
-        publisher: Reports which weights are in use.
-
-    Raises:
-        TransportError: no endpoint.
+    ``bundle`` is what the mapper was started with.
     """
 
     def __init__(self, context: NodeContext, options: MapperOptions, bundle: Mapper, publisher: Publisher) -> None:
@@ -81,10 +75,9 @@ class LiveWeights:
 
     def status(self) -> PartStatus:
         """For the mapper's status."""
+        counters = {"weights_version": self._in_use} | {f"weights_{name}": n for name, n in self._counts.items()}
         reason = self._answer.get("reason")
-        warnings = (f"weights {self._answer['judged']} were refused: {reason}",) if reason else ()
-        counters = {f"weights_{name}": count for name, count in self._counts.items()}
-        return PartStatus({"weights_version": self._in_use, **counters}, warnings)
+        return PartStatus(counters, (f"weights {self._answer['judged']} were refused: {reason}" if reason else "",))
 
     def __enter__(self) -> Self:
         return self
@@ -94,12 +87,8 @@ class LiveWeights:
         self._offers.close()
 
     def advance(self, session: MapSession | None, *, mapped: bool) -> None:
-        """Receive an offer, and do one small piece of the work; for the mapper's thread.
-
-        Args:
-            session: Follows the exchange.
-            mapped: A frame was mapped since the last call, so that another one may wait: then pieces are few.
-        """
+        """Receive an offer, and do one small piece of the work; for the mapper's thread. ``session`` follows the
+        exchange. Where a frame was ``mapped`` since the last call, another one may wait: then pieces are few."""
         if isinstance(offer := self._offers.receive(0.0), WeightsUpdate):
             self.offer(offer)
         began = time.monotonic()
@@ -121,18 +110,11 @@ class LiveWeights:
 
     def offer(self, update: WeightsUpdate) -> None:
         """Begin to look at weights; unfinished earlier ones are refused."""
-        entry = WeightsEntry(
-            version=update.version,
-            digest=update.digest,
-            state="refused",  # until they are taken
-            score=update.score,
-            parent_score=update.parent_score,
-            keyframes=update.keyframes,
-        )
+        scores = (update.score, update.parent_score, update.keyframes)
+        entry = WeightsEntry(update.version, update.digest, "refused", *scores)  # until they are taken
         if update.version <= self._newest:
-            known = self._versions.get(update.version)
-            repeated = update.version == self._newest and (known is None or known.digest == update.digest)
-            if not repeated:
+            known = self._versions.get(update.version, entry)
+            if update.version != self._newest or known.digest != update.digest:  # else it is only repeated
                 self._refuse(entry, f"not newer than weights {self._newest}, which came before")
             return
         self._newest = update.version
@@ -159,11 +141,7 @@ class LiveWeights:
             )
 
     def return_to(self, number: int) -> Weights:
-        """Request weights that were in use before; for any thread.
-
-        Raises:
-            MapError: no such weights, or they were never in use.
-        """
+        """Request weights that were in use before; for any thread. ``MapError`` where there are none of this number."""
         with self._lock:
             usable = [n for n, v in self._versions.items() if v.state != "refused"]
             if number not in usable:
@@ -174,11 +152,7 @@ class LiveWeights:
         return self.describe()
 
     def close(self) -> Weights:
-        """End the thread; unfinished weights are refused. Harmless when repeated.
-
-        Returns:
-            What became of all that was offered.
-        """
+        """End the thread; unfinished weights are refused. Returns what became of all. Harmless when repeated."""
         self._drop_task("the mapper ends")
         self._reader.shutdown(wait=True, cancel_futures=True)
         return self.describe()
@@ -193,18 +167,11 @@ class LiveWeights:
     def _begin_return(self, number: int) -> None:
         self._drop_task("older ones were requested")
         entry, start = self._versions[number], self._bundle.checkpoint
-        if number:
-            reading = self._reader.submit(read_kept, self._folder, number, entry.digest, start)
-        else:
-            reading = self._reader.submit(lambda: start)
-        self._task = _Task(entry, reading, requested=True)
+        read = partial(read_kept, self._folder, number, entry.digest, start) if number else lambda: start
+        self._task = _Task(entry, self._reader.submit(read), requested=True)
 
     def _advance(self, task: _Task, checkpoint: Checkpoint, session: MapSession) -> None:
-        """One piece of the work.
-
-        Raises:
-            WeightsError, FrameError: these weights cannot be used, which says nothing about the labels behind them.
-        """
+        """One piece of the work. Errors: these weights cannot be used, which says nothing about their labels."""
         if task.trial is None:
             spread = session.snapshots[:: -(-len(session.snapshots) // COMPARED)]
             frames = () if task.requested else tuple(frame for frame, _ in spread)
@@ -214,19 +181,17 @@ class LiveWeights:
             return
         agreement = task.trial.agreement
         if agreement is not None and agreement < self._least_agreement:
-            found = f"where the map is sure of itself, they agree with {agreement:.2f} of it"
-            wanted = f"at least {self._least_agreement:g} is required (min_map_agreement)"
-            self._end_task(task, f"{found}; {wanted}", contradicts=True)
+            reason = (
+                f"where the map is sure of itself, they agree with {agreement:.2f} of it; at least "
+                f"{self._least_agreement:g} is required (min_map_agreement)"
+            )
+            self._end_task(task, reason, contradicts=True)
             return
         task.trial.exchange()
-        self._exchanged(task, checkpoint, session)
-
-    def _exchanged(self, task: _Task, checkpoint: Checkpoint, session: MapSession) -> None:
         number, before = task.version.version, self._in_use
         back = number < before
-        session.follow_weights(
-            checkpoint, file_of_version(self._folder, number) if number else self._bundle.weights_path
-        )
+        file = file_of_version(self._folder, number) if number else self._bundle.weights_path
+        session.follow_weights(checkpoint, file)
         with self._lock:
             self._task = None
             self._in_use = number
@@ -239,7 +204,6 @@ class LiveWeights:
         then = "a mapper that replaces it begins with the weights of the last note, else with those of its start"
         self._context.try_to_leave_note(_NOTE, f"{number} {task.version.digest}", then)
         event = "weights_rolled_back" if back else "weights_exchanged"
-        agreement = None if task.trial is None else task.trial.agreement
         _log.info(event, version=number, before=before, agreement=agreement, score=task.version.score)
         self._report()
 

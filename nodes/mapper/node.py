@@ -32,19 +32,18 @@ from semantic_mapper.nodes.mapper.saved_map import (
 )
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
-from semantic_mapper.nodes.publishing import PartStatus, PublicPublisher, publish_status
+from semantic_mapper.nodes.publishing import PartStatus, PublicPublisher, StatusReport
 from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.run_folder import MAP_NAME, map_path, prepare_folder
-from semantic_mapper.replay.session import MapSession
+from semantic_mapper.replay.session import MapSession, Refusal
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.keys import load_keys
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, NodeState, Status, StreamInfo
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused, NodeState, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 POLL_S = 0.1
-STATUS_PERIOD_S = 1.0
 MAX_AGE_S = 60.0  # of a frame, by its stamp: more, or less than nothing, and its clock is not this machine's
 TRIM_PERIOD_S = 60.0  # a node that runs for hours would otherwise hold more and more of what it has freed
 
@@ -72,16 +71,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
 
 
 class MapperNode:
-    """A mapper from its first message to its last file. A context manager.
-
-    Args:
-        context: Of the node.
-        options: See there.
-
-    Raises:
-        WeightsError, ConfigError, MapError: it cannot start.
-        TransportError: an endpoint is taken.
-    """
+    """A mapper from its first message to its last file. A context manager."""
 
     def __init__(self, context: NodeContext, options: MapperOptions) -> None:
         self._context = context
@@ -99,7 +89,6 @@ class MapperNode:
         self._step_us = 0  # that all steps took
         self._capture_age_s: float | None = None
         self._ended_by = "error"
-        self._last_status = 0.0
         self._last_trim = time.monotonic()
 
         self._correction = LiveCorrection(self._pipeline)
@@ -110,6 +99,7 @@ class MapperNode:
             self._publisher = stack.enter_context(
                 PublicPublisher(context.endpoint(context.name), options.publish, options.keys)
             )
+            self._report = StatusReport(context.name, self._publisher)
             subscriber = LosslessSubscriber if options.delivery == "all" else NewestSubscriber
             endpoints = [context.endpoint(name) for name in options.cameras]
             self._frames = stack.enter_context(subscriber(endpoints, ("info", "frame", "end")))
@@ -118,14 +108,12 @@ class MapperNode:
                 self._weights = stack.enter_context(LiveWeights(context, options, self._bundle, self._publisher))
             self._queries = stack.enter_context(self._answer_queries()) if options.query else None
             self._resources = stack.pop_all()
-        _log.info(
-            "ready", weights=self._bundle.weights_path.name, input=", ".join(options.cameras), delivery=options.delivery
-        )
+        _log.info("ready", weights=self._bundle.weights_path.name, input=options.cameras, delivery=options.delivery)
 
     def _answer_queries(self) -> QueryService:
-        query, keys = self._options.query, self._options.keys
+        keys = self._options.keys
         return QueryService(
-            query if "://" in query else self._context.endpoint(query),
+            self._context.endpoint(self._options.query),
             self._bundle.voxel_map,
             self._correction,
             load_keys(Path(keys).expanduser()) if keys else None,
@@ -206,17 +194,17 @@ class MapperNode:
         if len(session.odometry_sessions.known) != before:
             note_sessions(self._context, session.odometry_sessions.known)
         if not results and session.odometry_sessions.held:  # a player in lockstep waits for an answer to every frame
-            self._publisher.publish(
-                encode(FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, session.odometry_sessions.warning))
-            )
+            self._refuse(frame, session.odometry_sessions.warning)
         self._capture_age_s = (time.monotonic_ns() - frame.stamp_ns) / 1e9
         for result in results:
             if isinstance(result, MapUpdate):
                 self._step_us += round(1e3 * sum(result.stage_ms.values()))
                 self._publisher.publish(encode(result))
             else:
-                refused = FrameRefused(result.stamp_ns, result.seq, result.camera_id, result.reason)
-                self._publisher.publish(encode(refused))
+                self._refuse(result, result.reason)
+
+    def _refuse(self, frame: PosedFrame | Refusal, reason: str) -> None:
+        self._publisher.publish(encode(FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, reason)))
 
     def _forget_what_moves(self) -> None:
         """Where frames have ceased, nothing is known any more of where what moves is."""
@@ -290,27 +278,15 @@ class MapperNode:
             self._queries.follow()
 
     def _publish_status(self, state: NodeState, *, now: bool = False) -> None:
-        if not now and time.monotonic() - self._last_status < STATUS_PERIOD_S:
-            return
-        self._last_status = time.monotonic()
-        parts = (self._correction, self._weights, self._queries, self._autosave)
-        reports = [self._own_status(), *(part.status() for part in parts if part is not None)]
-        counters = {name: count for report in reports for name, count in report.counters.items()}
-        warnings = tuple(warning for report in reports for warning in report.warnings)
-        silent = self._frames.silent_s
-        ages = self._streams.ages_s | ({} if silent is None else {"frame": silent})
-        if self._capture_age_s is not None and 0 <= self._capture_age_s < MAX_AGE_S:
-            ages["capture"] = self._capture_age_s
-        publish_status(
-            self._publisher, Status(self._context.name, state, time.monotonic_ns(), counters, ages, warnings)
-        )
+        if now or self._report.due:
+            parts = (self._correction, self._weights, self._queries, self._autosave)
+            self._report.publish(state, self._own_status(), *(part.status() for part in parts if part is not None))
 
     def _own_status(self) -> PartStatus:
         """Of the stream and the pipeline."""
         counters = {"rejected": self._frames.rejected, "early": self._early, "missed": self._missing_frames.missed}
         pipeline, warnings = self._pipeline, [self._resumed]
-        session = self._session
-        if session is not None:
+        if (session := self._session) is not None:
             sessions = session.odometry_sessions
             counters |= {
                 "published": session.published,
@@ -329,25 +305,22 @@ class MapperNode:
             warnings.append(f"scale: unknown; lengths of the map are not metres: {SCALE_FIX}")
         counters |= pipeline.picture_check.counters
         warnings += [*pipeline.picture_check.warnings, pipeline.pose_check.warning]
-        return PartStatus(counters, tuple(filter(None, warnings)))
+        silent, age_s = self._frames.silent_s, self._capture_age_s
+        ages_s = self._streams.ages_s | ({} if silent is None else {"frame": silent})
+        if age_s is not None and 0 <= age_s < MAX_AGE_S:
+            ages_s["capture"] = age_s
+        return PartStatus(counters, tuple(warnings), ages_s)
 
 
 def _load(context: NodeContext, options: MapperOptions) -> tuple[Mapper, str]:
-    """Weights and pipeline, with the map that is continued, and what became of that of a process before this one.
-
-    Raises:
-        WeightsError, ConfigError, MapError: settings, weights or a map that cannot be used.
-    """
+    """Weights and pipeline, with the map that is continued, and what became of that of a process before this one."""
     path = Path(options.config) if options.config else None
-    config = load_mapper_config(
-        path,
-        {
-            "voxel_map.voxel_size_m": options.voxel_size_m or None,
-            "depth.source": options.depth or None,
-            "depth.refine_in_background": options.delivery == "newest" or None,
-        },
-        {"history.max_frames": options.history_frames},
-    )
+    given = {
+        "voxel_map.voxel_size_m": options.voxel_size_m or None,
+        "depth.source": options.depth or None,
+        "depth.refine_in_background": options.delivery == "newest" or None,
+    }
+    config = load_mapper_config(path, given, {"history.max_frames": options.history_frames})
     saved = None
     if options.map:
         file = map_path(Path(options.map))

@@ -86,14 +86,10 @@ class QueryService:
     Args:
         endpoint: Where to listen.
         voxel_map: The map; only ``follow`` and ``hand_over`` read its blocks.
-        correction: Takes corrected poses; without it they are refused.
-        keys: See ``QueryServer``.
-        weights: Takes other weights; without it questions about them are refused.
+        correction, weights: Take corrected poses and other weights; without them such requests are refused.
+        keys: See ``QueryServer``, also for errors.
         moving: Where something moves now that is left out of the map.
         pose_in_map: Pose of the last frame.
-
-    Raises:
-        TransportError: the endpoint is taken or cannot be bound.
     """
 
     def __init__(
@@ -140,14 +136,12 @@ class QueryService:
 
     def status(self) -> PartStatus:
         """For the mapper's status."""
-        dead = () if self.alive else ("questions about the map are no longer answered; see the log",)
-        return PartStatus({"answered": self.answered}, dead)
+        dead = "" if self.alive else "questions about the map are no longer answered; see the log"
+        return PartStatus({"answered": self.answered}, (dead,))
 
     def follow(self) -> None:
-        """Copy what has changed for the next snapshot; for the thread that changes the map, after each step.
-
-        Costs nothing while nobody asks, and never waits.
-        """
+        """Copy what has changed for the next snapshot; for the thread that changes the map, after each step. Costs
+        nothing while nobody asks, and never waits."""
         now, awaited = time.monotonic(), self._copied_version < self._awaited_version
         wanted = awaited or self._copy_again_at <= now <= self._listened_until
         if wanted and not self._copies and self._copied_version != self._map.version and self.alive:
@@ -160,8 +154,7 @@ class QueryService:
             self._copy(0)
 
     def close(self) -> None:
-        """End the threads and free the endpoint, once the answers that are being computed are. Harmless when
-        repeated."""
+        """End the threads once the answers under way are computed, and free the endpoint. Harmless when repeated."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -214,8 +207,8 @@ class QueryService:
         """Pass a question on to a worker, or let it wait for a snapshot."""
         try:
             request = decode_question(parts)
-        except (SemanticMapperError, MemoryError) as error:
-            self._send(address, encode_error(_to_error(error)))
+        except SemanticMapperError as error:
+            self._send(address, encode_error(error))
             return
         until = time.monotonic() + request.waits_s
         for pending in self._pending:
@@ -228,15 +221,11 @@ class QueryService:
             return
         self._pending.append(_PendingRequest(address, until, parts, request))
         if request.about_map:
-            self._note_question()
+            now = time.monotonic()
+            if now > self._listened_until:  # after a pause, questions wait for a snapshot of the map as it is now
+                self._awaited_version, self._copied_at = self._map.version, now
+            self._listened_until = now + LISTENED_S
         self._start_waiting()
-
-    def _note_question(self) -> None:
-        """After a pause, questions wait until there is a snapshot of the map as it is now."""
-        now = time.monotonic()
-        if now > self._listened_until:
-            self._awaited_version, self._copied_at = self._map.version, now
-        self._listened_until = now + LISTENED_S
 
     def _snapshot_lags(self) -> bool:
         """Whether questions wait for a newer snapshot."""
@@ -282,8 +271,10 @@ class QueryService:
                 raise MapError(_NOT_READY)
             state = MapState(self.map_id, snapshot.version, snapshot.epoch)
             return encode_answer(name, state, self._find(snapshot, request))
-        except (SemanticMapperError, MemoryError) as error:
-            return encode_error(_to_error(error))
+        except SemanticMapperError as error:
+            return encode_error(error)
+        except MemoryError:
+            return encode_error(MapError("the mapper has no memory left to answer this; ask for less at once"))
         except Exception as error:  # noqa: BLE001 -- a bug of ours must not end a thread that all wait for
             _log.exception("question_failed", question=name)
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
@@ -292,7 +283,8 @@ class QueryService:
         _refuse_too_much(snapshot, request)
         match request:
             case questions.InfoRequest():
-                return self._describe(snapshot)
+                about = (snapshot.block_count, snapshot.voxel_size_m, snapshot.truncation_voxels, snapshot.label_set)
+                return MapInfo(self.map_id, snapshot.version, snapshot.epoch, *about, snapshot.scale_known)
             case questions.AtRequest():
                 return at(self._with_moving(snapshot), request.points, request.radius_m)
             case questions.NearestRequest():
@@ -306,10 +298,8 @@ class QueryService:
             case questions.OccupancyRequest():
                 return occupancy(self._with_moving(snapshot), request.points)
             case questions.DistanceRequest():
-                box = request.lower, request.upper
-                return distance_field(
-                    self._with_moving(snapshot), *box, unknown_is_occupied=request.unknown_is_occupied
-                )
+                box, occupied = (request.lower, request.upper), request.unknown_is_occupied
+                return distance_field(self._with_moving(snapshot), *box, unknown_is_occupied=occupied)
             case questions.ChangesRequest():
                 since = request.since if request.map_id in ("", self.map_id) else 0
                 return snapshot.changes(since, min(request.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
@@ -330,18 +320,6 @@ class QueryService:
     def _with_moving(self, snapshot: MapSnapshot) -> MapSnapshot:
         return snapshot if self._moving is None else snapshot.with_moving(self._moving.points)
 
-    def _describe(self, snapshot: MapSnapshot) -> MapInfo:
-        return MapInfo(
-            self.map_id,
-            snapshot.version,
-            snapshot.epoch,
-            snapshot.block_count,
-            snapshot.voxel_size_m,
-            snapshot.truncation_voxels,
-            snapshot.label_set,
-            snapshot.scale_known,
-        )
-
     def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> InstanceArrays:
         # Out of there while it updates: one that fails half way is not used again.
         tracker, version, things = self._tracked.pop(request.up, (None, -1, ()))
@@ -352,12 +330,6 @@ class QueryService:
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
         return InstanceArrays.of((*things, *(tracker.gone if request.gone else ())), snapshot.label_set)
-
-
-def _to_error(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
-    if isinstance(error, MemoryError):
-        return MapError("the mapper has no memory left to answer this; ask for less at once")
-    return error
 
 
 def _refuse_too_much(snapshot: MapSnapshot, request: Request[Any]) -> None:

@@ -38,14 +38,10 @@ class _GivenUpError(Exception):
 
 
 class Autosave:
-    """Takes the map between two frames, and writes it in a thread while the next ones are mapped.
+    """Takes the map between two frames where it has changed, and writes it in a thread while the next ones are mapped.
 
     The file is always whole, and of one frame: the map before or the one after, whenever the process is killed.
-
-    Args:
-        voxel_map: To be saved, where it has changed.
-        path: The file; replaced each time.
-        every_s: From the beginning of one save to the next; the first ones come sooner.
+    ``every_s`` is from the beginning of one save to the next; the first ones come sooner.
     """
 
     def __init__(self, voxel_map: VoxelMap, path: Path, every_s: float) -> None:
@@ -55,30 +51,25 @@ class Autosave:
         self._path = path
         self._every_s = every_s
         self._begun = time.monotonic()
-        self._begins = 0  # of saves
+        self._pause_s = FIRST_S
         self._saved_version = voxel_map.version
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 
     def status(self) -> PartStatus:
         """For the mapper's status."""
-        failed = (f"the map was not saved: {self.failure}",) if self.failure else ()
-        return PartStatus({"saves": self.saves}, failed)
+        return PartStatus({"saves": self.saves}, (f"the map was not saved: {self.failure}",) if self.failure else ())
 
     def follow(self) -> None:
         """Begin a save if it is time; to be called between two frames."""
-        if self._ending.is_set():
-            return
         version = self._map.version
-        pause_s = min(self._every_s, FIRST_S * 2**self._begins)
-        if time.monotonic() - self._begun < pause_s or self._saved_version == version:
-            return
-        if self._thread is not None and self._thread.is_alive():
+        is_early = time.monotonic() - self._begun < min(self._every_s, self._pause_s)
+        is_busy = self._thread is not None and self._thread.is_alive()
+        if self._ending.is_set() or is_early or is_busy or self._saved_version == version:
             return
         self._begun = time.monotonic()
-        self._begins = min(self._begins + 1, 30)
-        snapshot = self._map.snapshot()
-        self._thread = threading.Thread(target=self._save, args=(snapshot, version), name="autosave", daemon=True)
+        self._pause_s = min(2 * self._pause_s, self._every_s)
+        self._thread = threading.Thread(target=self._save, args=(self._map.snapshot(), version), daemon=True)
         self._thread.start()
 
     def end(self, why: str) -> None:
@@ -106,34 +97,21 @@ class Autosave:
             snapshot.write(self._path, rest)
         except _GivenUpError:
             _log.info("autosave_given_up", reason="the mapper ends")
-        except MapError as error:
-            self._fail(str(error))
         except Exception as error:  # noqa: BLE001 -- whatever it is, it must be reported, and the next save tried
-            _log.exception("autosave_dies")
-            self._fail(f"{type(error).__name__}: {error}")
+            self.failure = str(error) if isinstance(error, MapError) else f"{type(error).__name__}: {error}"
+            _log.error("autosave_fails", reason=self.failure, exc_info=not isinstance(error, MapError))
         else:
             self._saved_version = version
             self.saves += 1
             self.failure = ""
 
-    def _fail(self, reason: str) -> None:
-        self.failure = reason
-        _log.error("autosave_fails", reason=reason, again_s=self._every_s)
-
 
 def resume_map(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
-    """In a restarted mapper, make ``voxel_map`` the one that its forerunner has saved in the course of this launch.
+    """In a restarted mapper, make the empty ``voxel_map`` the one that its forerunner has saved in this launch at
+    ``path``; a sentence that says what became of that, empty where the mapper was not restarted.
 
     Poses are of the same session as before, so a saved map continues as if the frames after it had not come.
     A saved map that cannot be gone on with is put aside, so that nothing is written over it.
-
-    Args:
-        context: Of the mapper.
-        path: Of the map that is saved now and then.
-        voxel_map: Empty; of the settings and classes of this run.
-
-    Returns:
-        A sentence that says what became of the map; empty where the mapper was not restarted.
 
     Raises:
         OSError: notes cannot be written, or a map cannot be put aside.
@@ -141,8 +119,8 @@ def resume_map(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
     if not context.restarts:
         context.leave_note(_EARLIER, _identity(path))
         return ""
-    earlier = context.note(_EARLIER)
-    if not earlier or _identity(path) == earlier:
+    earlier, there = context.note(_EARLIER), _identity(path)
+    if not earlier or there == earlier:
         why = "none had been saved (see save_every_s)"
     elif not (why := context.note(_UNSOUND)):
         try:
@@ -152,17 +130,20 @@ def resume_map(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
         else:
             _log.info("map_resumed", map=str(path), frames=voxel_map.frames, blocks=voxel_map.block_count)
             return f"the mapper was restarted and went on from the map saved after {voxel_map.frames} frames"
-    kept = _put_aside(context, path) if earlier and _identity(path) not in (earlier, _NO_FILE) else ""
+    kept = ""
+    if earlier and there not in (earlier, _NO_FILE):
+        aside = free_name(path.with_name(f"{path.stem}-before-restart-{context.restarts}{path.suffix}"))
+        path.replace(aside)
+        context.leave_note(_EARLIER, _NO_FILE)
+        context.leave_note(_UNSOUND, "")
+        kept = f"; the one before is kept as {aside.name}"
     _log.warning("empty_map_begun", reason=why)
     return f"the mapper was restarted and began an empty map: {why}{kept}"
 
 
 def continue_map(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
-    """Make ``voxel_map`` the saved one, unless it was resumed already.
-
-    Raises:
-        ConfigError: its classes are others.
-    """
+    """Make ``voxel_map`` the saved one, unless it was resumed already; ``ConfigError`` where its classes are others, or
+    nobody could find their place in it."""
     if voxel_map.frames:
         return
     try:
@@ -183,17 +164,10 @@ def continue_map(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
 def stored_settings(config: MapperConfig, path: Path | None, voxel_size_m: float, saved: Path) -> MapperConfig:
     """The settings of a run that continues a saved map: what its data means is the map's, the rest is this run's.
 
-    Args:
-        config: Of this run.
-        path: The TOML file that it comes from: what stands there is not replaced, so that it may be refused.
-        voxel_size_m: The same, given by itself; 0 = not given.
-        saved: The map.
-
-    Raises:
-        MapError: it cannot be read.
+    What is given, in the TOML file ``path`` or by itself (else 0), is not replaced, so that it may be refused.
+    ``MapError`` where the map cannot be read.
     """
-    given = {*(read_toml(path).get("voxel_map", {}) if path else ()), *(("voxel_size_m",) if voxel_size_m else ())}
-    if "voxel_size_m" in given:
+    if voxel_size_m or (path and "voxel_size_m" in read_toml(path).get("voxel_map", {})):
         return config
     with open_map(saved) as reader:
         voxel_size = reader.manifest.config.voxel_size_m
@@ -202,16 +176,14 @@ def stored_settings(config: MapperConfig, path: Path | None, voxel_size_m: float
 
 def note_sessions(context: NodeContext, known: Mapping[int, Float64]) -> None:
     """Note where sessions lie in the map, for a mapper that resumes it."""
-    plain = {str(world): T.ravel().tolist() for world, T in known.items()}
-    context.try_to_leave_note(
-        _SESSIONS, json.dumps(plain), "a mapper that replaces it has to look for the camera again"
-    )
+    plain = json.dumps({str(world): T.ravel().tolist() for world, T in known.items()})
+    context.try_to_leave_note(_SESSIONS, plain, "a mapper that replaces it has to look for the camera again")
 
 
 def noted_sessions(context: NodeContext) -> dict[int, Float64]:
     """What ``note_sessions`` has noted in this launch."""
-    noted = context.note(_SESSIONS)
-    return {int(world): np.array(T).reshape(4, 4) for world, T in json.loads(noted or "{}").items()}
+    noted = json.loads(context.note(_SESSIONS) or "{}")
+    return {int(world): np.array(T).reshape(4, 4) for world, T in noted.items()}
 
 
 def forbid(context: NodeContext, why: str) -> bool:
@@ -220,16 +192,10 @@ def forbid(context: NodeContext, why: str) -> bool:
 
 
 def keep_earlier(context: NodeContext, path: Path) -> None:
-    """Move the results of an earlier launch into a folder of their own, before others take their place.
+    """Move the results of an earlier launch into a folder of their own, before a mapper writes others in their place.
 
-    Live frames do not come again, so that their map is not to be lost to a launch that is restarted.
-
-    Args:
-        context: Of a mapper that has written nothing yet.
-        path: Of its map; one that was saved in the course of this launch stays.
-
-    Raises:
-        OSError: something cannot be moved.
+    Live frames do not come again, so that their map is not to be lost to a launch that is restarted. A map (``path``)
+    that was saved in the course of this launch stays. ``OSError`` where something cannot be moved.
     """
     there = _identity(path)
     if there == _NO_FILE or context.note(_EARLIER) not in ("", there):
@@ -242,14 +208,6 @@ def keep_earlier(context: NodeContext, path: Path) -> None:
             file.rename(kept / file.name)
     context.leave_note(_EARLIER, _NO_FILE)
     _log.warning("earlier_results_kept", folder=str(kept))
-
-
-def _put_aside(context: NodeContext, path: Path) -> str:
-    aside = free_name(path.with_name(f"{path.stem}-before-restart-{context.restarts}{path.suffix}"))
-    path.replace(aside)
-    context.leave_note(_EARLIER, _NO_FILE)
-    context.leave_note(_UNSOUND, "")
-    return f"; the one before is kept as {aside.name}"
 
 
 def _identity(path: Path) -> str:

@@ -17,7 +17,7 @@ from semantic_mapper.errors import CodecError, LogError, TransportError
 from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import NodeJob, RecorderOptions
-from semantic_mapper.nodes.publishing import StatusReport
+from semantic_mapper.nodes.publishing import PartStatus, StatusReport
 from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.reader import LogAttachment
@@ -298,7 +298,7 @@ def _publish_status(report: StatusReport, recorder: Recorder, state: NodeState) 
         counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost}
         counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
         degraded = (r.trouble,) if r.trouble else ()
-    report.publish(state, counters, {}, degraded)
+    report.publish(state, PartStatus(counters, degraded))
 
 
 def main(job: NodeJob | None = None) -> NoReturn:
