@@ -26,15 +26,13 @@ from semantic_mapper.nodes.mapper.offered_weights import read_kept
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions
 from semantic_mapper.nodes.process import run_when_idle
-from semantic_mapper.nodes.publishing import publish_status
+from semantic_mapper.nodes.publishing import PartStatus, StatusReport
 from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.online import KeyframePool, KeyframeSplit, OnlineResult, learn
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import (
     LabelledKeyframe,
-    NodeState,
-    Status,
     WeightsInUse,
     WeightsUpdate,
     digest_of,
@@ -43,7 +41,6 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 MAX_WAITING = 8  # keyframes, of about half a megabyte each, and of 64 MiB at the most
 POLL_S = 0.1
-STATUS_PERIOD_S = 1.0
 SETTLE_S = 2.0  # no keyframe for so long, and those that came are learned: people and tools send several at a time
 # After a round that failed for want of memory, say: pause before the next with the same keyframes, twice as long with
 # each further one in a row.
@@ -60,17 +57,12 @@ _log = structlog.get_logger(__name__)
 
 
 def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
-    """Open the sockets, load the weights to start from, and learn until a stop request.
-
-    Raises:
-        ConfigError, WeightsError: it cannot start.
-        TransportError: an endpoint is taken.
-    """
+    """Open the sockets, load the weights to start from, and learn until a stop request."""
     keep_freed_memory()
     config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
     path = find_checkpoint(Path(options.weights)) if options.weights else default_checkpoint_path()
     start, digest = load_checkpoint(path), digest_of(path.read_bytes())
-    endpoint = options.labels if "://" in options.labels else context.endpoint(options.labels)
+    endpoint = context.endpoint(options.labels)
     with (
         Publisher(context.endpoint(context.name), hwm=2) as publisher,
         LosslessSubscriber(endpoint, ("keyframe",), hwm=MAX_WAITING) as labels,
@@ -85,7 +77,9 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
 
 
 class FinetuneRound:
-    """A round of learning in a thread of its own, which rests after each step and each look as its share says.
+    """A round of learning in a ``thread`` of its own, which rests after each step and each look as its share says.
+
+    Once ``cancelled`` is set it ends after the step that it is in, and nobody wants its outcome any more.
 
     Args:
         parent, parent_digest: Weights in use, and the SHA-256 of their file.
@@ -107,32 +101,13 @@ class FinetuneRound:
         self.step = 0
         self.result: OnlineResult | None = None
         self.failure = "it failed; see the log"
+        self.cancelled = threading.Event()
         self._fraction = fraction
         self._clock = time.process_time if config.finetune.device == "cpu" else time.monotonic
         self._worked_from = self._clock()
-        self._cancelled = threading.Event()
         run = (keyframes, parent, config, idle)
-        self._thread = threading.Thread(target=self._run, args=run, name="learning", daemon=True)
-        self._thread.start()
-
-    @property
-    def running(self) -> bool:
-        """Whether there is no outcome yet."""
-        return self._thread.is_alive()
-
-    @property
-    def cancelled(self) -> bool:
-        """Whether nobody wants the outcome any more."""
-        return self._cancelled.is_set()
-
-    def cancel(self) -> None:
-        """Request that it ends after the step that it is in."""
-        self._cancelled.set()
-
-    def has_ended(self, timeout_s: float) -> bool:
-        """Whether it ends within this time."""
-        self._thread.join(timeout_s)
-        return not self.running
+        self.thread = threading.Thread(target=self._run, args=run, name="learning", daemon=True)
+        self.thread.start()
 
     def _run(self, keyframes: KeyframeSplit, parent: Checkpoint, config: OnlineConfig, idle: bool) -> None:
         torch.set_num_threads(torch.get_num_threads())  # OpenMP has a limit for each thread
@@ -145,8 +120,8 @@ class FinetuneRound:
         except SemanticMapperError as error:
             self.failure = str(error)
         except (MemoryError, RuntimeError) as error:  # torch raises a RuntimeError where memory is exhausted
-            lines = str(error).strip().splitlines()
-            self.failure = f"{type(error).__name__}: {lines[0] if lines else 'no more is known'}"
+            first, _, _ = str(error).strip().partition("\n")
+            self.failure = f"{type(error).__name__}: {first}"
 
     def _on_progress(self, progress: FitProgress) -> None:
         self.step = progress.step
@@ -154,7 +129,7 @@ class FinetuneRound:
 
     def _rest(self) -> None:
         worked_s = self._clock() - self._worked_from
-        if self._cancelled.wait(worked_s / self._fraction - worked_s):
+        if self.cancelled.wait(worked_s / self._fraction - worked_s):
             raise CancelledError
         self._worked_from = self._clock()
 
@@ -181,7 +156,8 @@ class Finetuner:
         self.context, self.options, self.config = context, options, config
         self.publisher, self.labels, self.mapper = publisher, labels, mapper
         self.start, self.start_digest = start, start_digest
-        self._pool = KeyframePool(self.start.label_set, held_out_every=HELD_OUT_EVERY, capacity=MAX_KEYFRAMES)
+        self._report = StatusReport(context.name, publisher)
+        self._pool = KeyframePool(start.label_set, held_out_every=HELD_OUT_EVERY, capacity=MAX_KEYFRAMES)
         self._last_keyframe_s = 0.0
         self._in_use: WeightsInUse | None = None
         self._current: Checkpoint | None = None  # the weights in use; None = unknown
@@ -194,11 +170,9 @@ class Finetuner:
         self._failure = ""  # why the last round failed
         self._failures = 0  # in a row
         self._retry_at_s = 0.0
-        self._store: LearningStore | None = None
+        self._store = LearningStore(Path(options.out) / FOLDER, start.label_set) if options.out else None
         self._store_failure = ""
-        self._last_status_s = 0.0
-        if self.options.out:
-            self._store = LearningStore(Path(self.options.out) / FOLDER, self.start.label_set)
+        if self._store is not None:
             self._restore(self._store)
 
     def run(self) -> None:
@@ -212,17 +186,19 @@ class Finetuner:
             self._end_round()
             self._begin_round()
             self._save()
-            self._publish_status("running")
+            if self._report.due:
+                self._report.publish("running", self._status())
 
     def close(self) -> None:
         """Cancel the round that runs."""
         if self._round is not None:
-            self._round.cancel()
-            if not self._round.has_ended(GIVE_UP_S):
+            self._round.cancelled.set()
+            self._round.thread.join(GIVE_UP_S)
+            if self._round.thread.is_alive():
                 _log.warning("round_left_behind", seconds=GIVE_UP_S, reason="it gets no processor")
             self._round = None
         self._save()
-        self._publish_status("ended", now=True)
+        self._report.publish("ended", self._status())
 
     def _restore(self, store: LearningStore) -> None:
         """After a restart, go on with the keyframes of the process before; a launch begins with none."""
@@ -239,14 +215,13 @@ class Finetuner:
         if self._store is None:
             return
         progress = Progress(rolled_back=self._rolled_back, failures=self._failures, learning=self._round is not None)
-        failure = ""
         try:
             self._store.keep(self._pool.kept, progress)
+            self._store_failure = ""
         except OSError as error:
-            failure = str(error)
-            if failure != self._store_failure:
-                _log.warning("not_kept", reason=failure)
-        self._store_failure = failure
+            if str(error) != self._store_failure:
+                _log.warning("not_kept", reason=str(error))
+            self._store_failure = str(error)
 
     def _add(self, keyframe: LabelledKeyframe) -> None:
         try:
@@ -270,7 +245,7 @@ class Finetuner:
         if changed or self._current is None:
             self._current = self._find(in_use)
         if changed and self._round is not None:
-            self._round.cancel()
+            self._round.cancelled.set()
         if self._offer is not None and in_use.judged == self._offer[0].version:
             self._take_answer(*self._offer, in_use)
             self._offer = None
@@ -317,24 +292,18 @@ class Finetuner:
         if self._pool.new < NEW_KEYFRAMES or len(keyframes.train) < 2 or not keyframes.held_out:
             return
         _log.info("round_begins", keyframes=len(keyframes.train), held_out=len(keyframes.held_out))
-        self._round = FinetuneRound(
-            keyframes,
-            self._current,
-            self._in_use.digest,
-            self.config,
-            self.options.cpu_fraction,
-            idle=self.options.niceness == MAX_NICENESS,
-        )
+        idle, parent = self.options.niceness == MAX_NICENESS, self._in_use.digest
+        fraction = self.options.cpu_fraction
+        self._round = FinetuneRound(keyframes, self._current, parent, self.config, fraction, idle=idle)
 
     def _end_round(self) -> None:
         ended = self._round
-        if ended is None or ended.running:
+        if ended is None or ended.thread.is_alive():
             return
         self._round = None
-        if ended.cancelled:
+        if ended.cancelled.is_set():
             return
-        result = ended.result
-        if result is None:
+        if (result := ended.result) is None:
             self._fail(ended.failure)
             return
         self._counts["rounds"] += 1
@@ -346,21 +315,13 @@ class Finetuner:
             self._publish(result, ended.parent_digest)
 
     def _publish(self, result: OnlineResult, parent: str) -> None:
-        checkpoint = result.checkpoint
+        name, checkpoint = self.context.name, result.checkpoint
         self._last_version = max(self._last_version, 0 if self._in_use is None else self._in_use.newest) + 1
-        checkpoint.recipe.update(version=self._last_version, parent=parent, learner=self.context.name)
+        checkpoint.recipe.update(version=self._last_version, parent=parent, learner=name)
         data = checkpoint_bytes(checkpoint)
-        update = WeightsUpdate(
-            node=self.context.name,
-            version=self._last_version,
-            data=data,
-            digest=digest_of(data),
-            parent=parent,
-            score=result.score,
-            parent_score=result.parent_score,
-            keyframes=len(checkpoint.anchors),
-            held_out=len(result.keys) - len(checkpoint.anchors),
-        )
+        learned = len(checkpoint.anchors)
+        judged = (result.score, result.parent_score, learned, len(result.keys) - learned)
+        update = WeightsUpdate(name, self._last_version, data, digest_of(data), parent, *judged)
         try:
             parts = encode(update)
         except CodecError as error:  # numbers of versions are the mapper's, who may have been offered any
@@ -388,25 +349,17 @@ class Finetuner:
         self._refusal = reason
         _log.warning("weights_rejected", reason=reason, keyframes_set_aside=dropped)
 
-    def _publish_status(self, state: NodeState, *, now: bool = False) -> None:
-        if not now and time.monotonic() - self._last_status_s < STATUS_PERIOD_S:
-            return
-        self._last_status_s = time.monotonic()
+    def _status(self) -> PartStatus:
+        running = self._round
         counters = {
             **self._counts,
             "kept": len(self._pool),
             "new": self._pool.new,
             "rejected": self.labels.rejected,
-            "learning": int(self._round is not None),
-            "step": 0 if self._round is None else self._round.step,
+            "learning": int(running is not None),
+            "step": 0 if running is None else running.step,
         }
-        status = Status(self.context.name, state, time.monotonic_ns(), counters, {}, tuple(self._warnings()))
-        publish_status(self.publisher, status)
-
-    def _warnings(self) -> list[str]:
-        warnings: list[str] = []
-        if self._refusal:
-            warnings.append(f"the last weights were refused: {self._refusal}")
+        warnings = [f"the last weights were refused: {self._refusal}"] if self._refusal else []
         if self._failure:
             wait_s = max(0.0, self._retry_at_s - time.monotonic())
             warnings.append(
@@ -419,4 +372,4 @@ class Finetuner:
                 f"the mapper uses weights {self._in_use.version}, which this node does not know; start both with the "
                 "same weights, or go back to weights that it knows"
             )
-        return warnings
+        return PartStatus(counters, tuple(warnings))

@@ -58,12 +58,7 @@ class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LearningStore:
-    """A folder with the keyframes of a pool and the progress of a finetuner.
-
-    Args:
-        folder: Made when there is something to save.
-        label_set: Of the pool.
-    """
+    """A folder, made when there is something to save, with the keyframes of a pool and the progress of a finetuner."""
 
     def __init__(self, folder: Path, label_set: LabelSet) -> None:
         self._folder = folder
@@ -72,8 +67,7 @@ class LearningStore:
         self._record: _Record | None = None
 
     def put_aside(self) -> None:
-        """Rename the folder of another launch, whose keyframes people may have labelled; then begin with nothing.
-        Raises OSError: it cannot be renamed."""
+        """Rename the folder of another launch, whose keyframes people may have labelled; then begin with nothing."""
         record = self._folder / _RECORD
         if not record.exists() or not any(self._folder.glob(f"*{_SUFFIX}")):
             record.unlink(missing_ok=True)
@@ -84,12 +78,8 @@ class LearningStore:
         _log.warning("earlier_keyframes_kept", folder=str(kept))
 
     def keep(self, kept: Sequence[Kept], progress: Progress) -> None:
-        """Save what has changed since the last call.
-        Raises OSError: it cannot be written; the last complete state stays."""
-        files = tuple(
-            _KeptFile(digest=self._save(k.frame), held_out=k.held_out, proved_at=k.validated_by, trials=k.trials)
-            for k in kept
-        )
+        """Save what has changed since the last call. ``OSError``: it cannot be written; the last state stays."""
+        files = tuple(_KeptFile(self._save(k.frame), k.held_out, k.validated_by, k.trials) for k in kept)
         record = _Record(progress=progress, keyframes=files)
         if record == self._record:
             return
@@ -103,8 +93,7 @@ class LearningStore:
                 path.unlink(missing_ok=True)
 
     def restore(self, pool: KeyframePool) -> Progress:
-        """Fill a pool with the keyframes of the folder; damaged ones are left out, with a warning.
-        Raises OSError: there are files that cannot be read."""
+        """Fill a pool with the keyframes of the folder; damaged ones are left out, with a warning."""
         record = self._read_record()
         for file in record.keyframes:
             try:
@@ -119,10 +108,10 @@ class LearningStore:
         try:
             return convert_config(msgspec.json.decode(read_regular(path, MAX_RECORD_BYTES)), _Record, str(path))
         except FileNotFoundError:
-            return _Record()
-        except (ConfigError, msgspec.DecodeError, UnicodeDecodeError) as error:
+            pass
+        except (ConfigError, ValueError) as error:
             _log.warning("keyframes_lost", reason=f"{path}: {error}")
-            return _Record()
+        return _Record()
 
     def _read(self, digest: str) -> LabelledKeyframe:
         data = read_regular(self._path(digest), MAX_FILE_BYTES)

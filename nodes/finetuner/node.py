@@ -10,25 +10,15 @@ from semantic_mapper.nodes.options import FinetunerOptions, NodeJob
 
 
 def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
-    """Learn until a stop request.
-
-    Raises:
-        ConfigError, WeightsError: it cannot start.
-        TransportError: an endpoint is taken.
-    """
-    _lower_priority(options)
-    from semantic_mapper.nodes.finetuner import finetuner  # loads torch, in the threads that were set
-
-    finetuner.run_finetuner(context, options)
-
-
-def _lower_priority(options: FinetunerOptions) -> None:
-    """Before anything computes: threads that are started then inherit this."""
+    """Learn until a stop request, with the threads and the priority of the options, which threads inherit."""
     os.environ["OMP_NUM_THREADS"] = str(options.threads)
     os.setpriority(os.PRIO_PROCESS, 0, max(options.niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     import torch
 
+    from semantic_mapper.nodes.finetuner import finetuner  # loads torch, in the threads that were set
+
     torch.set_num_threads(options.threads)  # a forked process has read the variable before
+    finetuner.run_finetuner(context, options)
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import NoReturn
@@ -25,7 +25,7 @@ from semantic_mapper.replay.log.recording import Recording, RecordingRules, make
 from semantic_mapper.replay.log.sequence import parts_on_disk
 from semantic_mapper.transport.codec import decode_as, read_envelope, repack_rgb
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import EndOfStream, NodeState, StreamInfo, parse_topic
+from semantic_mapper.transport.messages import EndOfStream, StreamInfo, parse_topic
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import CameraIntrinsics
 
@@ -42,36 +42,26 @@ _log = structlog.get_logger(__name__)
 
 
 def run_recorder(context: NodeContext, options: RecorderOptions) -> str:
-    """Record until the stream ends or somebody asks to stop, and tell how it goes.
+    """Record until the stream ends or somebody asks to stop, and tell how it goes; what the log lacks, in words.
 
-    Returns:
-        What the log lacks, in words; empty = nothing that is known of.
-
-    Raises:
-        LogError: the log cannot be begun, or somebody has removed it meanwhile. A disk that is full later ends the
-            recording, not the node.
-        TransportError: a source cannot be subscribed to, or the endpoint is taken.
+    A disk that is full later ends the recording, not the node.
     """
     with ExitStack() as stack:
         report = StatusReport(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
 
         def follow(recorder: Recorder) -> bool:
             if report.due:
-                _publish_status(report, recorder, "running")
+                report.publish("running", recorder.status())
             return False
 
         recorder = record(context, options, follow)
-        _publish_status(report, recorder, "ended")
+        report.publish("ended", recorder.status())
     return "; ".join(filter(None, (recorder.losses, recorder.never_came)))
 
 
 def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Recorder], bool]) -> Recorder:
-    """Record until the stream ends or somebody asks to stop.
-
-    Args:
-        context: Who asks to stop, and where the sources are.
-        options: See there.
-        follow: Called at least some twenty times a second; True = it is enough.
+    """Record until the stream ends or somebody asks to stop, or ``follow``, called some twenty times a second, says
+    True.
 
     Raises:
         LogError: the log cannot be begun, or somebody has removed it meanwhile.
@@ -82,15 +72,15 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
     others = [context.endpoint(name) for name in options.sources[options.streams :]]
     recorder = Recorder(context, options)  # at once, so that nothing begins where there is a log already
     with ExitStack() as stack:
-        answers = None
+        sources: list[LosslessSubscriber] = []
         if others:
-            answers = stack.enter_context(LosslessSubscriber(others, topics, hwm=MAX_WAITING))
-            _wait_until_heard(context, options, answers)
+            sources.append(stack.enter_context(LosslessSubscriber(others, topics, hwm=MAX_WAITING)))
+            _wait_until_heard(context, options, sources[0])
         # Cameras begin once they have all their subscribers, so this one comes last: by now nothing can be missed.
         frames = stack.enter_context(LosslessSubscriber(cameras, topics, hwm=MAX_WAITING))
+        sources.insert(0, frames)
         stack.callback(recorder.close)
         context.heartbeat.ready()
-        sources = [frames, *([answers] if answers is not None else [])]
         ended_at = 0.0
         while not (ended_at and time.monotonic() - ended_at > QUIET_S) and not context.stop:
             context.heartbeat.turn()
@@ -100,35 +90,24 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
             parts = frames.receive_parts(POLL_S)
             if parts is not None and recorder.take(parts):
                 ended_at = ended_at or time.monotonic()
-            while answers is not None and (parts := answers.receive_parts(0)) is not None:
+            for other in sources[1:]:
+                while (parts := other.receive_parts(0)) is not None:
+                    recorder.take(parts)
+        deadline = time.monotonic() + DRAIN_S
+        for source in sources if context.stop else ():  # what had come before the stop, as far as there is time
+            while not recorder.cut_off and (parts := source.receive_parts(DRAINED_S)) is not None:
+                context.heartbeat.turn()
+                recorder.cut_off = time.monotonic() > deadline
                 recorder.take(parts)
-        if context.stop:
-            _drain(context, recorder, sources)
+        recorder.rejected = sum(source.rejected for source in sources)
         context.heartbeat.ending()
     if recorder.recording is not None and recorder.recording.gone:
         raise LogError(f"{recorder.recording.path}: was removed while it was written, and what it held is lost")
     return recorder
 
 
-def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessSubscriber]) -> None:
-    """Write what had come before a stop was requested, as far as there is time."""
-    deadline = time.monotonic() + DRAIN_S
-    for source in sources:
-        while (parts := source.receive_parts(DRAINED_S)) is not None:
-            context.heartbeat.turn()
-            if time.monotonic() > deadline:
-                recorder.cut_off = True
-                break
-            recorder.take(parts)
-    recorder.rejected = sum(source.rejected for source in sources)
-
-
 def _wait_until_heard(context: NodeContext, options: RecorderOptions, answers: LosslessSubscriber) -> None:
-    """Wait, in slices, until the other sources know of us; return early on a stop request.
-
-    Raises:
-        TransportError: they do not answer within ``options.source_timeout_s``.
-    """
+    """Wait, in slices, until the other sources know of us; return early on a stop request."""
     deadline = time.monotonic() + options.source_timeout_s
     while not context.stop:
         try:
@@ -142,18 +121,8 @@ def _wait_until_heard(context: NodeContext, options: RecorderOptions, answers: L
 class Recorder:
     """The recording, opened once it is known what the stream is.
 
-    Args:
-        context: Of the node; where it was killed before, the recording goes on in the next part.
-        options: See there.
-
-    Attributes:
-        recording: None while no stream has begun.
-        rejected: Messages that could not be read.
-        cut_off: Whether there was no time to write all that had come before a stop.
-        received: Frames that came.
-
-    Raises:
-        LogError: the log is there already, and must not be replaced.
+    Where the node was killed before, the recording goes on in the next part. ``LogError`` where the log is there
+    already, and must not be replaced.
     """
 
     def __init__(self, context: NodeContext, options: RecorderOptions) -> None:
@@ -161,20 +130,16 @@ class Recorder:
         self._options = options
         self._path = Path(options.out)
         self._goes_on = bool(context.note(NOTE))  # else the one before was killed before it had begun
-        self._rules = RecordingRules(
-            split_bytes=round(options.split_mb * 1e6),
-            split_s=options.split_s,
-            disk_full=options.disk_full,
-            reserve_bytes=round(options.reserve_mb * 1e6),
-        )
+        split_bytes, reserve_bytes = round(options.split_mb * 1e6), round(options.reserve_mb * 1e6)
+        self._rules = RecordingRules(split_bytes, options.split_s, options.disk_full, reserve_bytes)
         if not self._goes_on:  # before the stream begins, so that nothing else is overwritten
             make_way(self._path, overwrite=options.overwrite, dry=True)
         self._packing = None
         if options.rgb != "as-sent":
             self._packing = CodecOptions(rgb=options.rgb, jpeg_quality=options.jpeg_quality)
-        self.recording: Recording | None = None
-        self.rejected = self.received = 0
-        self.cut_off = False
+        self.recording: Recording | None = None  # while no stream has begun
+        self.received = self.rejected = 0  # frames that came, messages that could not be read
+        self.cut_off = False  # whether there was no time to write all that had come before a stop
         self.missing_frames = MissingFrames()
         self._streams = Streams(options.streams)
         self._cameras: dict[str, CameraIntrinsics] = {}  # of all streams so far
@@ -189,6 +154,15 @@ class Recorder:
             with suppress(FileNotFoundError):  # somebody has just deleted it
                 size += file.stat().st_size
         return size
+
+    def status(self) -> PartStatus:
+        """For the node's status."""
+        counters = {"missed": self.missing_frames.missed, "rejected": self.rejected}
+        if (r := self.recording) is None:
+            return PartStatus(counters)
+        counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost}
+        counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": self.log_bytes // 1024}
+        return PartStatus(counters, (r.trouble,))
 
     @property
     def losses(self) -> str:
@@ -289,16 +263,6 @@ class Recorder:
         except CodecError as error:  # the reader of the log judges it
             _log.warning("frame_kept_as_sent", seq=envelope.seq, error=str(error))
             return parts
-
-
-def _publish_status(report: StatusReport, recorder: Recorder, state: NodeState) -> None:
-    counters = {"missed": recorder.missing_frames.missed, "rejected": recorder.rejected}
-    degraded: tuple[str, ...] = ()
-    if (r := recorder.recording) is not None:
-        counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost}
-        counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
-        degraded = (r.trouble,) if r.trouble else ()
-    report.publish(state, PartStatus(counters, degraded))
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

@@ -313,9 +313,10 @@ def test_a_round_rests_as_its_share_says_and_can_be_cancelled(monkeypatch: pytes
     config = OnlineConfig()
     under_way = FinetuneRound(KeyframeSplit((), ()), start_of(), "ab" * 32, config, 0.25, idle=False)
     assert eventually(lambda: bool(rested_s)) and rested_s[0] >= 0.15  # three times what it worked
-    assert under_way.running and under_way.step >= 2
-    under_way.cancel()
-    assert under_way.has_ended(60) and under_way.cancelled and under_way.result is None
+    assert under_way.thread.is_alive() and under_way.step >= 2
+    under_way.cancelled.set()
+    under_way.thread.join(60)
+    assert not under_way.thread.is_alive() and under_way.result is None
 
 
 @pytest.mark.parametrize("given", [["camera.log=kitchen.mcap", "camera.mode=realtime"], ["finetuner.niceness=18"]])
