@@ -45,10 +45,6 @@ class PlainConsole(Console):
     Names of classes, cameras and files come from logs, maps and weights of others. Markup and emoji codes in them are
     text, and control characters are shown as escapes (``\x1b``), so that no name can end a verb, hide, forge a line or
     command the terminal. Colours are given as ``style``.
-
-    Args:
-        file: Where to write; None = stdout.
-        stderr: Write to the current ``sys.stderr``.
     """
 
     def __init__(self, file: TextIO | None = None, *, stderr: bool = False) -> None:
@@ -114,10 +110,9 @@ class Output:
 
     def json(self, data: Any) -> None:
         """Write one JSON document where it was requested, without secrets of the addresses in it."""
-        if not self.quiet:
-            return
-        self._stream.write(json.dumps(plain_without_secrets(data), indent=1, allow_nan=False) + "\n")
-        self._stream.flush()
+        if self.quiet:
+            self._stream.write(json.dumps(plain_without_secrets(data), indent=1, allow_nan=False) + "\n")
+            self._stream.flush()
 
 
 def table(
@@ -128,14 +123,8 @@ def table(
     caption: str = "",
     numbers: Collection[str] = (),
 ) -> Table:
-    """A table for ``Output.print``.
-
-    Args:
-        rows: Cells; None is an empty one.
-        names: Of the columns; without any the first column names the rows.
-        title, caption: Above and below it.
-        numbers: Names of the columns that end at the right.
-    """
+    """A table for ``Output.print``, of cells (None is an empty one), names of the columns (without any the first column
+    names the rows), and which of these are of ``numbers``, that end at the right."""
     found = Table(title=title, caption=caption, title_justify="left", show_header=bool(names))
     for name in names:
         found.add_column(name, justify="right" if name in numbers else "left", overflow="fold")
@@ -152,14 +141,10 @@ def stderr_console() -> PlainConsole:
 class FrameProgress(JobMonitor):
     """A bar with frames a second and time left; events in the log where stderr is no terminal."""
 
-    def __init__(
-        self, progress: Progress, task: Any, what: str, total: int | None, unit: str, stop: StopRequest | None
-    ) -> None:
+    def __init__(self, progress: Progress, what: str, total: int | None, unit: str, stop: StopRequest | None) -> None:
         self._progress = progress
-        self._task = task
-        self._what = what
-        self._total = total
-        self._unit = unit
+        self._task = progress.add_task(what, total=total, note="")
+        self._what, self._total, self._unit = what, total, unit
         self._stop = stop
         self._done = 0
         self._began = self._reported = time.monotonic()
@@ -182,13 +167,12 @@ class FrameProgress(JobMonitor):
     def set(self, done: int, note: str = "") -> None:
         """This many are done by now; ``note`` replaces the text next to the bar."""
         self._done = done
-        changes: dict[str, Any] = {"note": note} if note else {}
-        self._progress.update(self._task, completed=done, **changes)
+        more: dict[str, Any] = {"note": note} if note else {}
+        self._progress.update(self._task, completed=done, **more)
         now = time.monotonic()
         if not self._progress.console.is_terminal and now - self._reported >= LOG_PERIOD_S:
             self._reported = now
             rate = done / max(now - self._began, 1e-9)
-            more = {"note": note} if note else {}
             _log.info(self._what, done=done, total=self._total, rate=f"{rate:.2f} {self._unit}/s", **more)
 
 
@@ -209,7 +193,7 @@ def frame_progress(
     )
     console = stderr_console()
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit, stop)
+        yield FrameProgress(progress, what, total, unit, stop)
 
 
 class _RateColumn(ProgressColumn):

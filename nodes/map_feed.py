@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -31,15 +30,11 @@ class MapFollower:
 
     Args:
         look: May raise errors of ours: a mapper that starts has no map for a while.
-        refresh_s: Between two looks, at least.
-        pause: After a look, so many times as long as it took, at least.
-
-    Attributes:
-        trouble: Why the last look failed; empty = it did not.
+        refresh_s: Between two looks, at least; and ``pause`` times as long as the last one took.
     """
 
     def __init__(self, look: Callable[[], None], refresh_s: float, pause: float = 0.0) -> None:
-        self.trouble = ""
+        self.trouble = ""  # why the last look failed
         self._look = look
         self._refresh_s = refresh_s
         self._pause = pause
@@ -55,9 +50,7 @@ class MapFollower:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
 
@@ -90,10 +83,9 @@ def thinned(points: MapPoints) -> MapPoints:
 def pack_points(points: MapPoints, rgb: UInt8) -> bytes:
     """Records of ``POINT``, with colours (N, 3)."""
     packed = np.zeros(len(points.xyz), POINT)
-    for column, axis in enumerate(("x", "y", "z")):
-        packed[axis] = points.xyz[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        packed[name] = rgb[:, column]
+    for names, columns in (("x", "y", "z"), points.xyz), (("red", "green", "blue"), rgb):
+        for column, name in enumerate(names):
+            packed[name] = columns[:, column]
     packed["alpha"] = 255
     packed["label"] = points.label
     packed["confidence"] = np.rint(points.confidence * 255)
@@ -102,13 +94,7 @@ def pack_points(points: MapPoints, rgb: UInt8) -> bytes:
 
 
 def describe_map(snapshot: MapSnapshot, count: int, stamp_ns: int) -> dict[str, Any]:
-    """What a map is, for JSON.
-
-    Args:
-        snapshot: Of it.
-        count: Its points, before thinning.
-        stamp_ns: Of the newest frame that was heard of.
-    """
+    """What a map of ``count`` points before thinning is, for JSON; ``stamp_ns`` of the newest frame heard of."""
     labels = snapshot.label_set
     classes = zip(labels.ids, labels.names, labels.colors, strict=True)
     return {

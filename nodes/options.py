@@ -25,11 +25,7 @@ PoseRow = tuple[float, float, float, float]
 
 
 def check_tracking(camera_kind: str, pose_kind: object) -> None:
-    """Refuse poses of kind "device" of a camera that does not track itself: none of its images would have one.
-
-    Raises:
-        ValueError: naming what to use instead.
-    """
+    """Refuse (``ValueError``) poses of kind "device" of a camera that does not track itself."""
     if pose_kind == "device" and camera_kind in CAMERA_KINDS and camera_kind not in TRACKING_KINDS:
         raise ValueError(
             f'poses = {{ kind = "device" }}: cameras of kind "{camera_kind}" do not track themselves, and no frame '
@@ -44,9 +40,8 @@ class LiveCamera(Config, frozen=True):
 
     kind: Text  # of drivers/registry.py: v4l2, opencv, stereo, oak, realsense
     poses: Text | dict[str, Any]  # who knows where the camera is: TOML file, or the same as a table; see drivers/poses
-    config: str | dict[str, Any] = msgspec.field(
-        default_factory=dict
-    )  # the driver's: TOML file, or the same as a table
+    # the driver's: TOML file, or the same as a table
+    config: str | dict[str, Any] = msgspec.field(default_factory=dict)
     id: Annotated[str, msgspec.Meta(pattern=SOURCE_PATTERN)] = "camera"  # what its frames are called
     # Where it sits on the rig that `poses` tells of (T_base_rig, T_world_rig), row by row; empty = as its calibration
     # file says.
@@ -130,7 +125,7 @@ class MapperOptions(Config, frozen=True):
     # most of it are more often wrong than the map is. 0 = the finetuner's own judgement is enough.
     min_map_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.4
 
-    # A fixed endpoint in addition to that of the launch at which its updates and status can be subscribed to: ipc://PATH,
+    # A fixed endpoint next to that of the launch at which its updates and status can be subscribed to: ipc://PATH,
     # tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
     publish: Annotated[str, msgspec.Meta(pattern=ENDPOINT_PATTERN)] = ""
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
 import structlog
@@ -27,8 +28,7 @@ MAX_THREADS = 16  # more gain nothing on the small work of one frame
 def prepare_process(*, verbose: bool = False) -> None:
     """Set thread counts (kept where the user has set them) and send log events to stderr, one a line.
 
-    Both the command line and the nodes call it, so that they compute with the same number of threads: the map of one
-    process equals that of several, bit for bit.
+    The command line and the nodes compute with the same number of threads, so that their maps are equal bit for bit.
     """
     os.environ.setdefault("OMP_NUM_THREADS", str(min(usable_cores(), MAX_THREADS)))
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s; a camera that has stalled hangs OpenCV for 10
@@ -44,7 +44,7 @@ def prepare_process(*, verbose: bool = False) -> None:
             structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), pad_event_to=24),
         ],
         wrapper_class=structlog.make_filtering_bound_logger("debug" if verbose else "info"),
-        logger_factory=_make_logger,
+        logger_factory=lambda *_: structlog.PrintLogger(_Stderr()),  # pyright: ignore[reportArgumentType]
     )
 
 
@@ -59,10 +59,7 @@ def usable_cores() -> int:
 
 
 def run_when_idle() -> None:
-    """Let the calling thread, and those that it starts, compute only while nobody else wants the core.
-
-    The other threads of the process go on, so that messages are answered while learning gets no processor.
-    """
+    """Let the calling thread, and those that it starts, compute only while nobody else wants the core; others go on."""
     try:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     except (AttributeError, OSError) as error:  # not Linux, or forbidden
@@ -71,14 +68,8 @@ def run_when_idle() -> None:
 
 
 def failure_message(error: BaseException) -> str:
-    """What a failure that is no bug of ours says to people: out of memory, or an error of the system.
-
-    Args:
-        error: None of ours, which say all that is to be said.
-
-    Returns:
-        One line; empty where it is a bug, whose traceback is worth more.
-    """
+    """What a failure that is no error of ours says to people, on one line: out of memory, or an error of the system.
+    Empty where it is a bug, whose traceback is worth more."""
     if is_out_of_memory(error):  # native packages raise whatever they like then
         return memory_message(error)
     if isinstance(error, OSError):  # disk full, permission denied: the system's own words and the file
@@ -92,7 +83,6 @@ class StopRequest:
     Args:
         patient: Further signals change nothing (nodes: the launcher kills what does not end). Otherwise the second
             one raises ``KeyboardInterrupt`` (a person has pressed Ctrl-C twice).
-        signals: Those that are noted.
     """
 
     def __init__(
@@ -123,9 +113,7 @@ class StopRequest:
             self._previous[signum] = signal.signal(signum, self._note)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for signum, handler in self._previous.items():
             if signal.getsignal(signum) == self._note:  # else somebody has set another one meanwhile
                 signal.signal(signum, handler)
@@ -140,27 +128,20 @@ class _Stderr:
     """The current ``sys.stderr`` (progress bars exchange it); what nobody reads any more is no reason to die."""
 
     def write(self, text: str) -> int:
-        try:
-            return sys.stderr.write(text)
-        except (OSError, ValueError):  # the reader of the pipe is gone, or the stream is closed at exit
-            return len(text)
+        with suppress(OSError, ValueError):  # the reader of the pipe is gone, or the stream is closed at exit
+            sys.stderr.write(text)
+        return len(text)
 
     def flush(self) -> None:
-        try:
+        with suppress(OSError, ValueError):
             sys.stderr.flush()
-        except (OSError, ValueError):
-            return
-
-
-def _make_logger(*names: Any) -> structlog.PrintLogger:
-    return structlog.PrintLogger(_Stderr())  # pyright: ignore[reportArgumentType]
 
 
 def _one_line(logger: Any, method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
     """Keep one event on one line, the terminal as it is, and secrets out, whatever a message says."""
-    return {k: v if isinstance(v, bool | int | float | None) else _shown(str(v), k) for k, v in event.items()}
 
+    def shown(value: object, key: str) -> str:
+        text = without_secrets(str(value))
+        return visible(text, keep="\n") if key == "exception" else visible(text.replace("\n", " | "))
 
-def _shown(text: str, key: str) -> str:
-    text = without_secrets(text)
-    return visible(text, keep="\n") if key == "exception" else visible(text.replace("\n", " | "))
+    return {k: v if isinstance(v, bool | int | float | None) else shown(v, k) for k, v in event.items()}

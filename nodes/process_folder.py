@@ -24,13 +24,9 @@ _log = structlog.get_logger(__name__)
 
 
 class OwnFolder:
-    """A new folder that only this user can enter. ``sweep`` leaves it alone until it is closed or its process is dead.
+    """A new folder that only this user can enter, with ``kind`` in its name; ``OSError`` where it cannot be made.
 
-    Args:
-        kind: Part of its name.
-
-    Raises:
-        OSError: it cannot be made.
+    ``sweep`` leaves it alone until it is closed or its process is dead.
     """
 
     def __init__(self, kind: str = "") -> None:
@@ -53,11 +49,7 @@ def own_folders() -> Iterator[Path]:
 
 
 def is_in_use(folder: Path) -> bool:
-    """Whether the process that has made it still runs.
-
-    Raises:
-        OSError: it is another user's.
-    """
+    """Whether the process that has made it still runs; ``OSError`` where it is another user's."""
     with _lock_of(folder) as lock:
         return lock is None and (folder / _LOCK).exists()
 
@@ -77,16 +69,11 @@ def sweep() -> None:
 def _lock_of(folder: Path) -> Iterator[FileLock | None]:
     """Hold its lock; None where the lock is missing, or another process holds it."""
     lock = FileLock(folder / _LOCK)
+    with suppress(Timeout):
+        if (folder / _LOCK).exists():
+            lock.acquire(timeout=_ASK_S, poll_interval=_ASK_S / 5)
     try:
-        if not (folder / _LOCK).exists():
-            yield None
-            return
-        lock.acquire(timeout=_ASK_S, poll_interval=_ASK_S / 5)
-    except Timeout:
-        yield None
-        return
-    try:
-        yield lock
+        yield lock if lock.is_locked else None
     finally:
         lock.release()
 

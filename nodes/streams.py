@@ -14,11 +14,7 @@ from semantic_mapper.types import Float64
 
 
 class Streams:
-    """Camera nodes whose frames go into one map or one log.
-
-    Args:
-        count: How many there are; each of several has cameras of its own.
-    """
+    """Camera nodes (``count`` of them, each with cameras of its own) whose frames go into one map or one log."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -60,10 +56,7 @@ class Streams:
 
     def begin(self, info: StreamInfo) -> bool:
         """A stream says what it is, maybe not for the first time; True where it said something else before.
-
-        Raises:
-            NodeError: its label images are of another label set than those of the streams before it.
-        """
+        ``NodeError`` where its label images are of another label set than those of the streams before it."""
         key = tuple(sorted(info.cameras)) if self._count > 1 else ()
         before = self._infos.get(key)
         others = [other for name, other in self._infos.items() if name != key]
@@ -99,21 +92,17 @@ class MissingFrames:
 
     def note(self, camera_id: str, seq: int) -> None:
         """A frame has come."""
-        last = self._last.get(camera_id)
+        last = self._last.get(camera_id, seq - 1)
         self._last[camera_id] = seq
-        if last is None:
-            return
-        if seq <= last:
-            self.restarts += 1
-        else:
-            self.missed += seq - last - 1
+        self.restarts += seq <= last
+        self.missed += max(0, seq - last - 1)
 
 
 class MapPoses:
     """Where cameras are in the map: of each world of theirs, what the mapper has said of it last.
 
-    A camera that tracks itself begins its own world; the mapper may have to find that in its map first. Until it has
-    mapped a frame of a world, nobody knows where cameras of that world are.
+    A camera that tracks itself begins its own world, which the mapper may have to find in its map first: until it has
+    mapped a frame of it, nobody knows where its cameras are.
     """
 
     def __init__(self) -> None:

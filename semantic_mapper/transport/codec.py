@@ -208,23 +208,21 @@ def unpack_parts(payload: Buffer) -> list[bytes]:
 
 
 def to_plain(value: object, what: str) -> Any:
-    """A message or header as dicts, lists, strings and numbers; numbers of NumPy become Python's.
+    """A message or header as dicts, lists, strings and numbers, also those of NumPy; ``CodecError``: something else."""
 
-    Raises:
-        CodecError: it holds something else.
-    """
+    def plain(value: object) -> object:
+        if isinstance(value, np.generic):
+            return value.item()
+        raise TypeError(f"no header holds a {type(value).__name__}")
+
     try:
-        return msgspec.to_builtins(value, builtin_types=(bytes,), enc_hook=_plain_number)
+        return msgspec.to_builtins(value, builtin_types=(bytes,), enc_hook=plain)
     except (ValueError, TypeError, OverflowError) as error:
         raise CodecError(f"{what}: cannot be sent: {error}") from error
 
 
 def pack_header(header: Mapping[str, Any], what: str) -> bytes:
-    """Plain fields, which have passed ``check_header``, -> msgpack.
-
-    Raises:
-        CodecError: longer than ``MAX_HEADER_BYTES``.
-    """
+    """Plain fields, which have passed ``check_header``, -> msgpack; ``CodecError`` beyond ``MAX_HEADER_BYTES``."""
     packed = msgspec.msgpack.encode({"v": PROTOCOL_VERSION, **header})
     if len(packed) > MAX_HEADER_BYTES:
         raise CodecError(f"{what}: cannot be sent: a header of {len(packed)} bytes, at most {MAX_HEADER_BYTES}")
@@ -268,19 +266,10 @@ def check_header(
         raise CodecError(f"{what}: bad header: {_BEYOND.sub('only finite numbers can be sent', str(error))}") from error
 
 
-def _plain_number(value: object) -> object:
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"no header holds a {type(value).__name__}")
-
-
 def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str = "source") -> list[bytes]:
     """Any message -> parts.
 
-    Args:
-        message: Overlong texts of it were cut when it was made.
-        options: How to pack images.
-        sender: Second word of the topic of a ``StreamInfo``; the other messages name theirs.
+    ``sender`` is the second word of the topic of a ``StreamInfo``; the other messages name theirs.
 
     Raises:
         CodecError: a value that cannot be sent: out of bounds, NaN, or of the wrong type.
@@ -307,15 +296,11 @@ def encode_frame(
     frame: PosedFrame, options: CodecOptions = _DEFAULTS, *, encoded_rgb: EncodedImage | None = None
 ) -> list[bytes]:
     """Posed frame -> parts. Depth, its spread, labels, stamps and the float64 pose are exact; so is colour unless
-    "jpeg".
-
-    Args:
-        frame: With a finite pose; whether it is a rotation is for the receiver to judge.
-        options: How to pack.
-        encoded_rgb: Sent instead of packing ``frame.rgb`` again, so that an imported JPEG stays what it was.
+    "jpeg". ``encoded_rgb`` is sent instead of packing ``frame.rgb`` again, so that an imported JPEG stays what it was.
 
     Raises:
-        CodecError: NaN in the pose, or a camera id that a topic cannot hold.
+        CodecError: the pose is not finite (whether it is a rotation the receiver judges), or no topic can hold the
+            camera's id.
     """
     rgb = encoded_rgb.data if encoded_rgb else encode_rgb(frame.rgb, options.rgb, options.jpeg_quality)
     packed: _Packed = {"rgb": (RgbSpec(encoded_rgb.encoding if encoded_rgb else options.rgb, len(rgb)), rgb)}
@@ -360,31 +345,19 @@ def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
 
 
 def with_label(parts: Parts, pseudo_label: UInt8 | None) -> list[bytes]:
-    """A frame with a pseudo label (H, W), or none, in place of its label; all else stays, byte for byte.
-
-    Raises:
-        CodecError: no frame.
-    """
+    """A frame with a pseudo label (H, W), or none, in place of its label; all else stays, byte for byte."""
     packed: _Packed = {} if pseudo_label is None else {"label": encode_uint8(pseudo_label)}
     return _with_images(parts, packed, without="label", pseudo_label=pseudo_label is not None)
 
 
 def with_computed_depth(parts: Parts, depth_m: Float32, sigma_m: Float32) -> list[bytes]:
-    """A frame with computed depth (H, W) and its one-sigma spread, in metres; all else stays, byte for byte.
-
-    Raises:
-        CodecError: no frame.
-    """
+    """A frame with computed depth (H, W) and its one-sigma spread, in metres; all else stays, byte for byte."""
     scale = _DEFAULTS.depth_scale
     return _with_images(parts, {"depth": encode_depth(depth_m, scale), "depth_sigma": encode_depth(sigma_m, scale)})
 
 
 def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
-    """A frame with its colour image packed as ``options`` say; all else, and an image that is so already, stays.
-
-    Raises:
-        CodecError: no frame, or its colour image is damaged.
-    """
+    """A frame with its colour image packed as ``options`` say; all else, and an image that is so already, stays."""
     header, buffers = _open_frame(parts)
     if header.rgb.encoding == options.rgb:
         return [bytes(part) for part in parts]
@@ -404,11 +377,7 @@ def _with_images(parts: Parts, packed: _Packed, *, without: str = "", **fields: 
 
 
 def decode(parts: Parts) -> Message:
-    """Any message, by its topic.
-
-    Raises:
-        CodecError: anything that ``encode`` would not have made.
-    """
+    """Any message, by its topic; ``CodecError`` where ``encode`` would not have made it."""
     _, header, buffers = _open(parts)
     match header:
         case FrameHeader():
@@ -434,11 +403,7 @@ def decode(parts: Parts) -> Message:
 
 
 def decode_as(kind: type[MessageT], parts: Parts) -> MessageT:
-    """A message that must be of this type.
-
-    Raises:
-        CodecError: another one, or anything that ``encode`` would not have made.
-    """
+    """As ``decode``, a message that must be of this type."""
     row, _ = read_topic(parts)
     if row.message is not kind:
         raise CodecError(f"expected a {kind.__name__}, got a message of topic '{row.name}'")
@@ -447,10 +412,7 @@ def decode_as(kind: type[MessageT], parts: Parts) -> MessageT:
 
 def read_envelope(parts: Parts) -> Envelope:
     """Check topic, header and buffer sizes of a message, but leave its buffers alone (some ten microseconds).
-
-    Raises:
-        CodecError: not one of ours, or damaged.
-    """
+    ``CodecError`` where it is not one of ours, or damaged."""
     row, header, buffers = _open(parts)
     if isinstance(header, KeyframeHeader):
         header, _ = _open_frame(buffers)

@@ -54,11 +54,8 @@ def default_endpoint(name: str, namespace: str = "default") -> str:
 
 
 def check_bind(endpoint: str, keys: Keys | None = None) -> None:
-    """Refuse to listen where other machines could connect, unless there are keys, and peers to be let in.
-
-    Raises:
-        TransportError: an address beyond this machine without these, or a transport other than ipc, inproc and tcp.
-    """
+    """Refuse (``TransportError``) to listen where other machines could connect, unless there are keys, and peers to be
+    let in; and transports other than ipc, inproc and tcp."""
     transport, _, address = endpoint.partition("://")
     if transport not in ("ipc", "inproc", "tcp"):
         raise TransportError(f"{endpoint}: use ipc://PATH or tcp://127.0.0.1:PORT")
@@ -82,12 +79,8 @@ def check_bind(endpoint: str, keys: Keys | None = None) -> None:
 
 
 def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None:
-    """Refuse to take the word of another machine, unless it is known by its key.
-
-    Raises:
-        TransportError: an address beyond this machine without the server's identity, or a transport other than ipc,
-            inproc and tcp.
-    """
+    """Refuse (``TransportError``) to take the word of another machine, unless it is known by its key; and transports
+    other than ipc, inproc and tcp."""
     transport, _, address = endpoint.partition("://")
     if transport not in ("ipc", "inproc", "tcp"):
         raise TransportError(f"{endpoint}: no endpoint; endpoints read ipc://PATH or tcp://HOST:PORT")
@@ -160,12 +153,8 @@ def client_socket(
     identity: ServerIdentity | None,
     options: Mapping[zmq.SocketOption, int],
 ) -> zmq.Socket[bytes]:
-    """A socket that is ready to be connected to these endpoints.
-
-    Raises:
-        TransportError: an invalid endpoint, or of another machine whose identity is not given, or a server that is not
-            among the peers.
-    """
+    """A socket that is ready to be connected to these endpoints. ``TransportError``: one is invalid, or of another
+    machine whose identity is not given, or a server that is no peer."""
     for endpoint in endpoints:
         check_connect(endpoint, identity)
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)

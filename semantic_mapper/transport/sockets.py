@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 import threading
 import time
 import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Literal, Self, cast
 
 import zmq
@@ -16,7 +15,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
-from semantic_mapper.transport.codec import Envelope, decode, read_envelope
+from semantic_mapper.transport.codec import decode, read_envelope
 from semantic_mapper.transport.endpoints import ServerSocket, client_socket
 from semantic_mapper.transport.keys import Keys, ServerIdentity
 from semantic_mapper.transport.messages import (
@@ -28,7 +27,6 @@ from semantic_mapper.transport.messages import (
     TOPICS,
     Message,
     Parts,
-    Topic,
     subscription,
 )
 from semantic_mapper.types import MAX_PIXELS
@@ -36,6 +34,7 @@ from semantic_mapper.types import MAX_PIXELS
 MAX_MESSAGE_BYTES = 10 * MAX_PIXELS + 2 * MAX_HEADER_BYTES  # a frame's colours, depth and labels, none packed
 _OF_TOPIC = {"keyframe": MAX_KEYFRAME_BYTES, "weights": MAX_WEIGHTS_BYTES + 2 * MAX_HEADER_BYTES}
 SYNC_PREFIX = b"sync/"  # a subscription to sync/TOKEN/ is answered by that very topic: "I have heard you"
+_LATCHED = {row.name.encode(): row.closes.encode() for row in TOPICS.values() if row.latched}  # and what they end
 _PUMP_PERIOD_S = 0.02
 _SEND_SLICE_MS = 100
 _LATE_S = 0.1  # subscriptions of one socket come in no order; an end must not arrive before what it ends
@@ -129,10 +128,7 @@ class Publisher:
 
         Raises:
             TransportError: closed; or policy "block" and a subscriber did not make room within ``timeout_s``.
-            CodecError: fewer than two parts.
         """
-        if len(parts) < 2:
-            raise CodecError(f"a message has at least topic and header, got {len(parts)} parts")
         topic = bytes(parts[0])
         deadline = time.monotonic() + timeout_s
         while True:
@@ -163,11 +159,8 @@ class Publisher:
             return sum(count for prefix, count in self._counts.items() if topic.startswith(prefix))
 
     def wait_for_subscribers(self, name: str, count: int = 1, timeout_s: float = 10.0) -> None:
-        """Block until ``count`` subscriptions to topic ``name`` have arrived, so that no one misses the first message.
-
-        Raises:
-            TransportError: too few within ``timeout_s``.
-        """
+        """Block until ``count`` subscriptions to topic ``name`` have arrived, so that no one misses the first message;
+        ``TransportError`` where it takes longer than ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
         while (there := self.subscribers(name)) < count:
             if time.monotonic() > deadline:
@@ -234,8 +227,7 @@ class Publisher:
         self._counts[prefix] += 1
         for topic, parts in self._latched.items():
             if topic.startswith(prefix):
-                row = _row(topic)
-                if row is not None and row.closes:
+                if _LATCHED[topic.partition(b"/")[0]]:
                     self._late[topic] = time.monotonic() + _LATE_S
                 else:
                     self._answer(parts)
@@ -243,15 +235,13 @@ class Publisher:
             self._answer([prefix, b""])
 
     def _latch(self, topic: bytes, parts: Parts) -> None:
-        row = _row(topic)
-        if row is None or not row.latched:
+        name, _, source = topic.partition(b"/")
+        if name not in _LATCHED:
             return
         self._latched[topic] = tuple(parts)
-        for other in TOPICS.values():
-            if other.closes == row.name:  # a stream that begins has not ended
-                ended = other.name.encode() + topic[len(row.name) :]
-                self._latched.pop(ended, None)
-                self._late.pop(ended, None)
+        for ending in [ending for ending, begun in _LATCHED.items() if begun == name]:  # what begins has not ended
+            self._latched.pop(ending + b"/" + source, None)
+            self._late.pop(ending + b"/" + source, None)
 
     def _answer(self, parts: Parts) -> None:
         if not self._try_send(parts, zmq.NOBLOCK) and len(self._owed) < _MAX_SUBSCRIPTIONS:
@@ -266,10 +256,6 @@ class Publisher:
             self._socket.send(b"", zmq.NOBLOCK)
             raise
         return True
-
-
-def _row(topic: bytes) -> Topic | None:
-    return TOPICS.get(topic.partition(b"/")[0].decode("ascii", errors="replace"))
 
 
 def _known(topic: str) -> tuple[str, str | None]:
@@ -351,11 +337,8 @@ class _Subscriber:
         return self._connections.count
 
     def wait_until_heard(self, timeout_s: float = 10.0) -> None:
-        """Block until every publisher knows of our subscriptions; what it sends from then on arrives.
-
-        Raises:
-            TransportError: not within ``timeout_s``.
-        """
+        """Block until every publisher knows of our subscriptions: what it sends from then on arrives.
+        ``TransportError`` where it takes longer than ``timeout_s``."""
         with self._changed:
             self._changed.wait_for(lambda: self._synced >= len(self.endpoints) or self._failure is not None, timeout_s)
             self._check_receiving()
@@ -367,32 +350,24 @@ class _Subscriber:
                 )
 
     def receive(self, timeout_s: float | None = None) -> Message | None:
-        """The message that has waited longest, decoded; None when none came in time.
+        """The message that has waited longest, decoded; None when none came in time (``timeout_s`` None: wait for
+        ever).
 
-        Args:
-            timeout_s: None = wait for ever. Bad messages are passed over until then: a flood of them holds nobody up.
-
-        Raises:
-            TransportError: closed; or nothing can come any more, which says why.
+        Bad messages are passed over until then: a flood of them holds nobody up. ``TransportError`` where the
+        subscriber is closed, or nothing can come any more.
         """
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        while True:
-            parts = self.receive_parts(None if deadline is None else max(0.0, deadline - time.monotonic()))
-            if parts is None:
-                return None
+        deadline, left_s = None if timeout_s is None else time.monotonic() + timeout_s, timeout_s
+        while (parts := self.receive_parts(left_s)) is not None:
             try:
                 return decode(parts)
             except CodecError as error:
                 self._reject(error)
-            if deadline is not None and time.monotonic() >= deadline:
-                return None
+            if deadline is not None and (left_s := deadline - time.monotonic()) <= 0:
+                break
+        return None
 
     def receive_parts(self, timeout_s: float | None = None) -> list[bytes] | None:
-        """As ``receive``, as it came over the wire, its header checked: for who may not want what is in it.
-
-        Raises:
-            TransportError: see ``receive``.
-        """
+        """As ``receive``, as it came over the wire, its header checked: for who may not want what is in it."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._waiting) or self._closed or self._failure is not None, timeout_s)
             if self._closed:
@@ -444,11 +419,11 @@ class _Subscriber:
             self._reject(error)
             return
         with self._changed:
-            self._put(parts, envelope)
+            self._put(parts, TOPICS[envelope.topic].queue)
             self._received_at = time.monotonic()
             self._changed.notify_all()
 
-    def _put(self, parts: list[bytes], envelope: Envelope) -> None:
+    def _put(self, parts: list[bytes], queue: str) -> None:
         """Let a good message wait to be read; ``_changed`` is held."""
         raise NotImplementedError
 
@@ -468,7 +443,7 @@ class _Subscriber:
 class LosslessSubscriber(_Subscriber):
     """Gets every message, in order; with a ``Publisher`` of policy "block" none is lost. Arguments: ``_Subscriber``."""
 
-    def _put(self, parts: list[bytes], envelope: Envelope) -> None:
+    def _put(self, parts: list[bytes], queue: str) -> None:
         self._changed.wait_for(lambda: len(self._waiting) < self._hwm or self._closed)
         self._serial += 1
         self._waiting[self._serial] = parts
@@ -482,9 +457,9 @@ class NewestSubscriber(_Subscriber):
 
     overwritten = 0
 
-    def _put(self, parts: list[bytes], envelope: Envelope) -> None:
+    def _put(self, parts: list[bytes], queue: str) -> None:
         self._serial += 1
-        key = parts[0] if TOPICS[envelope.topic].queue == "newest" else self._serial
+        key = parts[0] if queue == "newest" else self._serial
         if key not in self._waiting and len(self._waiting) >= _MAX_SLOTS:
             self._reject(CodecError(f"{len(self._waiting)} sources wait to be read; no room for {parts[0]!r}"))
             return
@@ -512,10 +487,10 @@ class _Connections:
         """Hear what has happened, and connect again where that is needed; often called, costs nothing."""
         while self._monitor.poll(0):
             report = recv_monitor_message(self._monitor)
-            event, endpoint = report["event"], report["endpoint"].decode(errors="replace")
-            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            endpoint = report["endpoint"].decode(errors="replace")
+            if report["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self.count += 1
-            elif event == zmq.EVENT_DISCONNECTED:
+            elif report["event"] == zmq.EVENT_DISCONNECTED:
                 self.count = max(0, self.count - 1)
                 self._lost[endpoint] = time.monotonic()
             else:
@@ -524,11 +499,8 @@ class _Connections:
         for endpoint in [e for e, since in self._lost.items() if now - since > _GIVEN_UP_S]:
             del self._lost[endpoint]
             self._renewed += 1
-            try:
+            with suppress(zmq.ZMQError):  # it knows nothing of that connection any more
                 self._socket.disconnect(endpoint)
-            except zmq.ZMQError as error:
-                if error.errno != errno.ENOENT:  # it knows nothing of that connection any more
-                    raise
             self._socket.connect(endpoint)
             if is_power_of_two(self._renewed):
                 log.warning("connection_renewed", endpoint=endpoint, renewed=self._renewed)
