@@ -18,20 +18,7 @@ from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
-from semantic_mapper.queries.questions import (
-    MAX_WAIT_S,
-    NAMES,
-    QUESTIONS,
-    AnswerT,
-    Correction,
-    MapInfo,
-    MapState,
-    Point,
-    Request,
-    Weights,
-    decode_answer,
-    encode_request,
-)
+from semantic_mapper.queries.questions import AnswerT, Correction, MapInfo, Point, Request, Weights
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.queries.surface import RayHits
 from semantic_mapper.transport.endpoints import default_endpoint
@@ -227,12 +214,12 @@ class MapClient:
     def _ask(self, request: Request[AnswerT]) -> AnswerT:
         return self._ask_about(request)[1]
 
-    def _ask_about(self, request: Request[AnswerT]) -> tuple[MapState, AnswerT]:
+    def _ask_about(self, request: Request[AnswerT]) -> tuple[questions.MapState, AnswerT]:
         """Also which map the answer is about."""
-        name = NAMES[type(request)]
-        request = replace(request, asker=self._asker, waits_s=min(self._timeout_s + GRACE_S, MAX_WAIT_S))
-        parts = self._socket.ask(encode_request(name, request))
-        found: tuple[MapState, Any] = decode_answer(name, QUESTIONS[name].answer, parts)
+        name = questions.NAMES[type(request)]
+        request = replace(request, asker=self._asker, waits_s=min(self._timeout_s + GRACE_S, questions.MAX_WAIT_S))
+        parts = self._socket.ask(questions.encode_request(name, request))
+        found: tuple[questions.MapState, Any] = questions.decode_answer(name, questions.QUESTIONS[name].answer, parts)
         if request.about_map:
             self.version = found[0].version
         return found

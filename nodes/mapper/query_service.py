@@ -31,17 +31,7 @@ from semantic_mapper.queries import questions
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
-from semantic_mapper.queries.questions import (
-    NAMES,
-    InstanceArrays,
-    MapInfo,
-    MapState,
-    Point,
-    Request,
-    decode_question,
-    encode_answer,
-    encode_error,
-)
+from semantic_mapper.queries.questions import Request, encode_error
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, points_in_box
 from semantic_mapper.transport.keys import Keys
@@ -111,7 +101,7 @@ class QueryService:
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
         # By direction, the last one used last: a tracker, and what it found last, in which version of the map.
-        self._tracked: dict[Point, tuple[InstanceTracker, int, tuple[Instance, ...]]] = {}
+        self._tracked: dict[questions.Point, tuple[InstanceTracker, int, tuple[Instance, ...]]] = {}
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
@@ -183,12 +173,11 @@ class QueryService:
         while not self._closed.is_set():
             self._server.wait(_POLL_S)
             self._make_snapshots()
-            self._start_waiting()
-            self._send_finished()
+            self._advance()
             # One at a time: the socket takes turns between clients, so that many questions of one delay no other.
             while not self._closed.is_set() and (received := self._server.receive()) is not None:
                 self._take(*received)
-                self._send_finished()
+                self._advance()
         for pending in self._pending:
             if pending.answer is None:
                 self._send(pending.address, encode_error(MapError(_NOT_READY)))
@@ -206,9 +195,9 @@ class QueryService:
     def _take(self, address: bytes, parts: list[bytes]) -> None:
         """Pass a question on to a worker, or let it wait for a snapshot."""
         try:
-            request = decode_question(parts)
-        except SemanticMapperError as error:
-            self._send(address, encode_error(error))
+            request = questions.decode_question(parts)
+        except (SemanticMapperError, MemoryError) as error:
+            self._send(address, _encode_error(error))
             return
         until = time.monotonic() + request.waits_s
         for pending in self._pending:
@@ -225,35 +214,26 @@ class QueryService:
             if now > self._listened_until:  # after a pause, questions wait for a snapshot of the map as it is now
                 self._awaited_version, self._copied_at = self._map.version, now
             self._listened_until = now + LISTENED_S
-        self._start_waiting()
 
-    def _snapshot_lags(self) -> bool:
-        """Whether questions wait for a newer snapshot."""
-        if self._mirror.snapshot().version >= self._awaited_version:
-            return False
-        if time.monotonic() <= self._copied_at + CATCH_UP_S and not self._broken:
-            return True
-        self._awaited_version, self._map_is_busy = 0, True  # those who ask next need not wait as well
-        return False
-
-    def _start_waiting(self) -> None:
-        """Pass on the questions that wait for no snapshot, or whose snapshot is there or will not come in time."""
-        lags = self._snapshot_lags()
-        for pending in self._pending:
-            if pending.answer is None and not (lags and pending.request.about_map):
+    def _advance(self) -> None:
+        """Pass questions on to the workers, but for those that wait for a newer snapshot, and send finished answers."""
+        lags = self._mirror.snapshot().version < self._awaited_version
+        if lags and (self._broken or time.monotonic() > self._copied_at + CATCH_UP_S):
+            self._awaited_version, self._map_is_busy = 0, True  # those who ask next need not wait as well
+            lags = False
+        for pending in list(self._pending):
+            if pending.answer is not None:
+                if not pending.answer.done():
+                    continue
+                self._pending.remove(pending)
+                if (answer := pending.answer.result()) is not None:
+                    self._send(pending.address, answer)
+                    if pending.request.about_map:
+                        self._listened_until = time.monotonic() + LISTENED_S
+            elif not (lags and pending.request.about_map):
                 worker = self._long if pending.request.takes_long else self._quick
                 pending.answer = worker.submit(self._answer, pending)
                 pending.answer.add_done_callback(lambda _: self._server.wake())
-
-    def _send_finished(self) -> None:
-        for pending in [p for p in self._pending if p.answer is not None and p.answer.done()]:
-            self._pending.remove(pending)
-            answer = pending.answer.result() if pending.answer is not None else None
-            if answer is None:
-                continue
-            self._send(pending.address, answer)
-            if pending.request.about_map:
-                self._listened_until = time.monotonic() + LISTENED_S
 
     def _send(self, address: bytes, parts: Sequence[bytes]) -> None:
         self._server.send(address, parts)
@@ -265,16 +245,14 @@ class QueryService:
         if time.monotonic() > pending.until:
             return None
         request, snapshot = pending.request, self._mirror.snapshot()
-        name = NAMES[type(request)]
+        name = questions.NAMES[type(request)]
         try:
             if request.about_map and self._map_is_busy and not snapshot.version:
                 raise MapError(_NOT_READY)
-            state = MapState(self.map_id, snapshot.version, snapshot.epoch)
-            return encode_answer(name, state, self._find(snapshot, request))
-        except SemanticMapperError as error:
-            return encode_error(error)
-        except MemoryError:
-            return encode_error(MapError("the mapper has no memory left to answer this; ask for less at once"))
+            state = questions.MapState(self.map_id, snapshot.version, snapshot.epoch)
+            return questions.encode_answer(name, state, self._find(snapshot, request))
+        except (SemanticMapperError, MemoryError) as error:
+            return _encode_error(error)
         except Exception as error:  # noqa: BLE001 -- a bug of ours must not end a thread that all wait for
             _log.exception("question_failed", question=name)
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
@@ -284,7 +262,7 @@ class QueryService:
         match request:
             case questions.InfoRequest():
                 about = (snapshot.block_count, snapshot.voxel_size_m, snapshot.truncation_voxels, snapshot.label_set)
-                return MapInfo(self.map_id, snapshot.version, snapshot.epoch, *about, snapshot.scale_known)
+                return questions.MapInfo(self.map_id, snapshot.version, snapshot.epoch, *about, snapshot.scale_known)
             case questions.AtRequest():
                 return at(self._with_moving(snapshot), request.points, request.radius_m)
             case questions.NearestRequest():
@@ -320,7 +298,7 @@ class QueryService:
     def _with_moving(self, snapshot: MapSnapshot) -> MapSnapshot:
         return snapshot if self._moving is None else snapshot.with_moving(self._moving.points)
 
-    def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> InstanceArrays:
+    def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> questions.InstanceArrays:
         # Out of there while it updates: one that fails half way is not used again.
         tracker, version, things = self._tracked.pop(request.up, (None, -1, ()))
         tracker = tracker or InstanceTracker(up=request.up)
@@ -329,7 +307,13 @@ class QueryService:
         self._tracked[request.up] = tracker, snapshot.version, things
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
-        return InstanceArrays.of((*things, *(tracker.gone if request.gone else ())), snapshot.label_set)
+        return questions.InstanceArrays.of((*things, *(tracker.gone if request.gone else ())), snapshot.label_set)
+
+
+def _encode_error(error: SemanticMapperError | MemoryError) -> list[bytes]:
+    if isinstance(error, MemoryError):
+        error = MapError("the mapper has no memory left to answer this; ask for less at once")
+    return encode_error(error)
 
 
 def _refuse_too_much(snapshot: MapSnapshot, request: Request[Any]) -> None:

@@ -140,19 +140,6 @@ def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
     assert {"map.ply", "overview.png", "report.html"} <= {path.name for path in out.iterdir()}
 
 
-@pytest.mark.slow
-def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path) -> None:
-    with Running("up", alone(tmp_path, long_log)) as running:
-        running.wait_for_line(r"\beye\].* playing ")
-        os.kill(wait_for_start(running, "eye", 0), signal.SIGTERM)
-        pid = wait_for_start(running, "eye", 1)
-        assert eventually(lambda: len(re.findall(r"\beye\].* playing ", running.text)) == 2)
-        for process in (running.process.pid, pid):  # as a service manager may, and terminals
-            os.kill(process, signal.SIGTERM)
-        assert running.wait() == 0, running.text
-        assert not any(map(is_alive, running.all_pids()))
-
-
 def test_node_that_is_not_to_come_back_and_is_sent_away_ends_the_launch_with_the_reason(
     long_log: Path, tmp_path: Path
 ) -> None:

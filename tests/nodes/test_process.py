@@ -20,33 +20,23 @@ def _python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_first_signal_is_noted_and_the_second_interrupts() -> None:
+def test_first_signal_is_noted_the_second_interrupts_and_handlers_are_given_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
     with StopRequest() as stop:
         assert not stop
         os.kill(os.getpid(), signal.SIGINT)
         assert stop and stop.name == "SIGINT" and stop.exit_code == 130
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
-
-
-def test_patient_request_keeps_the_first_signal() -> None:
-    with StopRequest(patient=True) as stop:
-        for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM):
-            os.kill(os.getpid(), signum)
-        assert stop.name == "SIGTERM" and stop.exit_code == 143
-
-
-def test_request_of_a_launcher_is_no_signal_that_ends_a_process() -> None:
-    with StopRequest(signals=(STOP_SIGNAL, signal.SIGTERM)) as stop:
-        os.kill(os.getpid(), STOP_SIGNAL)
-        assert stop and stop.name == "the launcher" and stop.exit_code == 0
-
-
-def test_handlers_are_given_back() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with StopRequest():
-        assert signal.getsignal(signal.SIGINT) != before
     assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_patient_request_keeps_the_first_signal_and_that_of_a_launcher_is_no_failure() -> None:
+    for first, name, code in ((signal.SIGTERM, "SIGTERM", 143), (STOP_SIGNAL, "the launcher", 0)):
+        with StopRequest(patient=True, signals=(STOP_SIGNAL, signal.SIGTERM, signal.SIGINT)) as stop:
+            for signum in (first, signal.SIGINT, signal.SIGTERM):
+                os.kill(os.getpid(), signum)
+            assert (stop.name, stop.exit_code) == (name, code)
 
 
 def test_threads_are_set_before_anything_heavy_is_loaded_and_the_users_choice_is_kept() -> None:
@@ -80,23 +70,12 @@ output.json({"a": 1})
         assert text in done.stderr
 
 
-def test_one_event_is_one_line_even_when_a_message_has_several() -> None:
-    code = """
-import structlog
-from semantic_mapper.nodes.process import prepare_process
-prepare_process()
-structlog.get_logger("x").error("broken", reason="first\\nsecond")
-"""
-    done = _python(code)
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1 and "first | second" in done.stderr
-
-
-def test_log_events_survive_a_closed_stderr() -> None:
+def test_an_event_is_one_line_and_survives_a_closed_stderr() -> None:
     code = """
 import os, structlog
 from semantic_mapper.nodes.process import prepare_process
 prepare_process()
+structlog.get_logger("x").error("broken", reason="first\\nsecond")
 read, write = os.pipe()
 os.dup2(write, 2); os.close(write); os.close(read)
 structlog.get_logger("x").error("nobody hears this")
@@ -105,3 +84,4 @@ os._exit(0)
 """
     done = _python(code)
     assert done.stdout == "alive" and done.returncode == 0
+    assert done.stderr.count("\n") == 1 and "first | second" in done.stderr

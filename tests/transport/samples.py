@@ -85,32 +85,26 @@ def make_weights() -> WeightsUpdate:
     return WeightsUpdate("learner", 2, data, digest_of(data), "cd" * 32, 0.8, 0.5, 9, 3)
 
 
-def make_in_use() -> WeightsInUse:
-    return WeightsInUse("mapper", 1, "cd" * 32, 2, 2, False, "it disagrees with the map", 1, True)
-
-
 def all_messages() -> dict[str, list[bytes]]:
     """One encoded message of each topic."""
     return {
         "frame": encode_frame(make_frame()),
         "map": encode(make_update()),
         "refused": encode(FrameRefused(4, 5, CAMERA, "pose holds NaN")),
-        "status": encode(make_status()),
+        "status": encode(
+            Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU; running on the CPU",))
+        ),
         "info": encode(make_info()),
         "end": encode(EndOfStream("player", "end", 200)),
         "keyframe": encode(LabelledKeyframe(make_frame(), NYU40, "a person")),
         "weights": encode(make_weights()),
-        "in_use": encode(make_in_use()),
+        "in_use": encode(WeightsInUse("mapper", 1, "cd" * 32, 2, 2, False, "it disagrees", 1, True)),
     }
 
 
 def frame_variants() -> list[list[bytes]]:
     """Frames in every packing."""
-    options = [
-        CodecOptions(),
-        CodecOptions(rgb="raw"),
-        CodecOptions(rgb="jpeg", depth_scale=999.0),
-    ]
+    options = [CodecOptions(), CodecOptions(rgb="raw"), CodecOptions(rgb="jpeg", depth_scale=999.0)]
     frames = [make_frame(), make_frame(depth=False), make_frame(label=False), make_frame(depth=False, label=False)]
     return [encode_frame(frame, option) for option in options for frame in frames]
 
@@ -121,25 +115,8 @@ def deep_bomb(depth: int) -> bytes:
 
 
 STRANGE_VALUES: tuple[object, ...] = (
-    None,
-    True,
-    -1,
-    0,
-    2**63 - 1,
-    2**64 - 1,
-    -(2**63),
-    1.5,
-    float("nan"),
-    float("inf"),
-    "",
-    "x" * 5000,
-    "../../etc",
-    b"\x00\xff",
-    [],
-    [[[]]],
-    {},
-    {"v": 1},
-    list(range(2000)),
+    *(None, True, -1, 0, 2**63 - 1, 2**64 - 1, -(2**63), 1.5, float("nan"), float("inf")),
+    *("", "x" * 5000, "../../etc", b"\x00\xff", [], [[[]]], {}, {"v": 1}, list(range(2000))),
 )
 
 

@@ -335,18 +335,3 @@ def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(given: 
     (tmp_path / "other.toml").write_text(other, encoding="utf-8")
     with pytest.raises(ConfigError, match="did you mean 'finetuner'"):
         load_launch(tmp_path / "other.toml", given, tmp_path)
-
-
-def test_images_by_number_are_labels_of_their_frames(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "room.mcap", FRAMES)
-    images = tmp_path / "images"
-    images.mkdir()
-    cv2.imwrite(str(images / "000002.png"), permuted(FRAMES[2]).label)  # pyright: ignore
-    with a_folder() as folder:
-        endpoint = f"ipc://{folder / 'labels'}"
-        with LosslessSubscriber(endpoint, ("keyframe",)) as learner:
-            code, text = run_here("label", log, "--images", images, "--to", endpoint)
-            assert code == 0, text
-            came = learner.receive(30)
-            assert isinstance(came, LabelledKeyframe) and came.frame.seq == FRAMES[2].seq
-            assert (came.frame.label == permuted(FRAMES[2]).label).all() and learner.receive(0.2) is None

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -113,10 +114,7 @@ def test_a_save_that_dies_is_reported_and_tried_again(tmp_path: Path, monkeypatc
     autosave = Autosave(voxel_map, path, ALWAYS)
     walk(voxel_map, 1)
 
-    def fail(*arguments: object) -> None:
-        raise MemoryError("a chunk")
-
-    monkeypatch.setattr(map_file, "_write_chunk", fail)
+    monkeypatch.setattr(map_file, "_write_chunk", Mock(side_effect=MemoryError("a chunk")))
     autosave.follow()
     assert eventually(lambda: autosave.failure == "MemoryError: a chunk", 20)
     assert autosave.status().warnings == ("the map was not saved: MemoryError: a chunk",)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from structlog.testing import capture_logs
@@ -22,9 +23,7 @@ from tests.small import tiny_frames
 def test_a_failure_to_write_does_not_hide_what_ended_the_run(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*arguments: object) -> None:
-        raise MapError("map.npz: no space left")
-
+    full = Mock(side_effect=MapError("map.npz: no space left"))
     monkeypatch.setattr("semantic_mapper.nodes.mapper.node.finish_session", full)
     monkeypatch.setattr("semantic_mapper.replay.session.MapSession.process", full)
     with capture_logs() as logs, running_robot(weights, tmp_path / "out", 0) as robot:

@@ -18,19 +18,14 @@ from semantic_mapper.localization.places import make_place
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.mapper.saved_map import (
-    continue_map,
-    forbid,
-    keep_earlier,
-    resume_map,
-    stored_settings,
-)
+from semantic_mapper.nodes.mapper.saved_map import continue_map, forbid, keep_earlier, resume_map, stored_settings
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import Publisher
+from tests.mapping.test_voxel_map import same
 from tests.small import INTRINSICS, tiny_frames
 
 CONFIG = VoxelMapConfig(voxel_size_m=0.05)
@@ -50,16 +45,18 @@ def some_map(frames: int) -> VoxelMap:
 
 
 def assert_same(left: VoxelMap, right: VoxelMap) -> None:
-    ours, theirs = left.block_state(), right.block_state()
-    for name, values in theirs.items():
-        np.testing.assert_array_equal(ours[name], values, err_msg=name)
+    assert same(left.block_state(), right.block_state())
 
 
 def test_map_saved_in_this_launch_is_gone_on_with_as_if_nothing_had_happened(tmp_path: Path) -> None:
     path, folder = tmp_path / "map.npz", tmp_path / "notes"
+    some_map(2).save(path)  # by an earlier launch: no map of this one
+    before = path.read_bytes()
     assert resume_map(context(folder, 0), path, VoxelMap(CONFIG, ROOMS)) == ""
-    some_map(3).save(path)
     resumed = VoxelMap(CONFIG, ROOMS)
+    assert "began an empty map: none had been saved" in resume_map(context(folder, 1), path, resumed)
+    assert resumed.frames == 0 and path.read_bytes() == before
+    some_map(3).save(path)
     said = resume_map(context(folder, 1), path, resumed)
     assert said == "the mapper was restarted and went on from the map saved after 3 frames"
     for frame in tiny_frames(6)[3:]:
@@ -67,18 +64,6 @@ def test_map_saved_in_this_launch_is_gone_on_with_as_if_nothing_had_happened(tmp
         resumed.integrate(frame, frame.depth_m, None)
     assert resumed.frames == 6
     assert_same(resumed, some_map(6))
-
-
-def test_map_of_an_earlier_run_is_no_map_of_this_one(tmp_path: Path) -> None:
-    path, folder = tmp_path / "map.npz", tmp_path / "notes"
-    some_map(2).save(path)
-    before = path.read_bytes()
-    resume_map(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))
-    fresh = VoxelMap(CONFIG, ROOMS)
-    assert "began an empty map: none had been saved" in resume_map(context(folder, 1), path, fresh)
-    assert fresh.frames == 0 and path.read_bytes() == before
-    some_map(4).save(path)  # by the first restarted one
-    assert "after 4 frames" in resume_map(context(folder, 2), path, fresh)
 
 
 def test_a_run_that_goes_on_keeps_its_settings_but_for_what_the_stored_data_means(tmp_path: Path) -> None:
@@ -141,18 +126,12 @@ def test_map_that_cannot_be_gone_on_with_is_put_aside(tmp_path: Path, case: str)
     assert (tmp_path / "map-before-restart-1.npz").read_bytes() == saved
 
 
-def begin(folder: Path, path: Path, restarts: int) -> str:
-    """What a mapper does until its stream begins."""
-    said = resume_map(context(folder, restarts), path, VoxelMap(CONFIG, ROOMS))
-    keep_earlier(context(folder, restarts), path)
-    return said
-
-
 def test_results_of_earlier_launches_are_kept_each_in_a_folder(tmp_path: Path) -> None:
     path, contents = tmp_path / "map.npz", {}
     for launch in range(3):  # all saved in the same second, by their stamps
-        folder = tmp_path / f"notes-{launch}"
-        begin(folder, path, 0)
+        first, second = (context(tmp_path / f"notes-{launch}", restarts) for restarts in range(2))
+        resume_map(first, path, VoxelMap(CONFIG, ROOMS))
+        keep_earlier(first, path)
         assert not path.exists() and not (tmp_path / "summary.json").exists()
         some_map(launch + 1).save(path)
         os.utime(path, (1.8e9 + launch / 10, 1.8e9 + launch / 10))
@@ -160,7 +139,9 @@ def test_results_of_earlier_launches_are_kept_each_in_a_folder(tmp_path: Path) -
         (tmp_path / "summary.json").write_text(str(launch))
         (tmp_path / "map-before-restart-1.npz").write_text(str(launch))
         (tmp_path / "recorded.mcap").write_text("the recorder's")
-        assert f"after {launch + 1} frames" in begin(folder, path, 1) and path.exists()  # this launch's own
+        assert f"after {launch + 1} frames" in resume_map(second, path, VoxelMap(CONFIG, ROOMS))
+        keep_earlier(second, path)
+        assert path.exists(), "this launch's own"
     for launch, name in enumerate(("earlier-20270115T080000Z", "earlier-20270115T080000Z-1")):
         assert (tmp_path / name / "map.npz").read_bytes() == contents[launch]
         assert {p.name for p in (tmp_path / name).iterdir()} == {"map.npz", "summary.json", "map-before-restart-1.npz"}

@@ -20,11 +20,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from semantic_mapper.config import convert_config
-from semantic_mapper.errors import ConfigError, LogError, TransportError
+from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.info import describe_log
-from semantic_mapper.nodes.cli.record import _join
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
-from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, launch_folder, read_launch_note
+from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -237,21 +236,6 @@ def test_what_waits_when_the_recorder_is_stopped_is_written(
     assert (told["recorded"], told["lost"]) == (40, 0)
 
 
-def test_what_is_no_node_of_a_launch_cannot_be_recorded(tmp_path: Path) -> None:
-    note = LaunchNote("kitchen.toml", (NodeNote("eye", "camera", {}), NodeNote("mapper", "mapper", {})))
-    (tmp_path / NOTE).write_bytes(msgspec.json.encode(note))
-    wanted = {"out": "a.mcap"}
-    with pytest.raises(ConfigError, match=r"--source ear: no node of kitchen\.toml; there are eye, mapper"):
-        _join(tmp_path, ("ear",), wanted, StopRequest())
-    context, options = _join(tmp_path, (), wanted, StopRequest())
-    assert options.sources == ("eye", "mapper") and context.endpoint("eye") == f"ipc://{tmp_path}/eye"
-    (tmp_path / NOTE).write_bytes(b"{}")
-    with pytest.raises(TransportError, match="another version"):
-        _join(tmp_path, (), wanted, StopRequest())
-    with pytest.raises(TransportError, match="no socket folder"):
-        launch_folder(str(tmp_path))
-
-
 def test_running_launch_is_recorded_from_outside(tmp_path: Path) -> None:
     long_log = write_log(tmp_path / "long.mcap", repeated_frames(600))
     with Running("up", alone(tmp_path, long_log)) as running:
@@ -259,6 +243,8 @@ def test_running_launch_is_recorded_from_outside(tmp_path: Path) -> None:
         sockets = re.findall(r"sockets=(\S+)", running.text)[0]
         assert read_launch_note(Path(sockets)).names("camera") == ("eye",)
         out = tmp_path / "out" / "a.mcap"
+        wrong = run("record", out, "--launch", sockets, "--source", "ear")
+        assert "--source ear: no node of alone.toml; there are eye" in error_line(wrong.stderr)
         done = run("record", out, "--launch", sockets, "--duration", "1.5", "--split-s", "0.5", "--jpeg", "80")
         assert done.returncode == 0, done.stderr
         running.process.send_signal(signal.SIGINT)
