@@ -66,11 +66,8 @@ class StatusReport:
 class PublicPublisher(Publisher):
     """Sends every message to two endpoints; who does not keep up at the second one loses messages.
 
-    Args:
-        endpoint: Of the node, among those of its launch.
-        public: The fixed one, ``ipc://PATH`` or ``tcp://ADDRESS:PORT``; empty = none.
-        keys: Folder of keys: what goes out there is encrypted, and sent to its peers alone; empty = none.
-        linger_ms: See ``Publisher``, also for errors.
+    The second one, ``public``, is ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (empty = none). With a folder of ``keys``,
+    what goes out there is encrypted, and sent to its peers alone.
     """
 
     def __init__(self, endpoint: str, public: str, keys: str, *, linger_ms: int = 2000) -> None:

@@ -31,12 +31,7 @@ from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.online import KeyframePool, KeyframeSplit, OnlineResult, learn
 from semantic_mapper.transport.codec import encode
-from semantic_mapper.transport.messages import (
-    LabelledKeyframe,
-    WeightsInUse,
-    WeightsUpdate,
-    digest_of,
-)
+from semantic_mapper.transport.messages import LabelledKeyframe, WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 MAX_WAITING = 8  # keyframes, of about half a megabyte each, and of 64 MiB at the most
@@ -59,17 +54,14 @@ _log = structlog.get_logger(__name__)
 def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     """Open the sockets, load the weights to start from, and learn until a stop request."""
     keep_freed_memory()
-    config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
-    path = find_checkpoint(Path(options.weights)) if options.weights else default_checkpoint_path()
-    start, digest = load_checkpoint(path), digest_of(path.read_bytes())
     endpoint = context.endpoint(options.labels)
     with (
         Publisher(context.endpoint(context.name), hwm=2) as publisher,
         LosslessSubscriber(endpoint, ("keyframe",), hwm=MAX_WAITING) as labels,
         LosslessSubscriber(context.endpoint(options.mapper), ("in_use",)) as mapper,
     ):
-        _log.info("ready", weights=path.name, labels=endpoint, fraction=options.cpu_fraction)
-        finetuner = Finetuner(context, options, config, publisher, labels, mapper, start, digest)
+        finetuner = Finetuner(context, options, publisher, labels, mapper)
+        _log.info("ready", labels=endpoint, fraction=options.cpu_fraction)
         context.heartbeat.ready()
         finetuner.run()
         context.heartbeat.ending()
@@ -135,27 +127,22 @@ class FinetuneRound:
 
 
 class Finetuner:
-    """Learns from labelled keyframes, and offers the mapper what proves better.
-
-    Args:
-        start: Weights that the mapper was started with.
-        start_digest: SHA-256 of their file, hexadecimal.
-    """
+    """Learns from labelled keyframes, and offers the mapper what proves better."""
 
     def __init__(
         self,
         context: NodeContext,
         options: FinetunerOptions,
-        config: OnlineConfig,
         publisher: Publisher,
         labels: LosslessSubscriber,
         mapper: LosslessSubscriber,
-        start: Checkpoint,
-        start_digest: str,
     ) -> None:
-        self.context, self.options, self.config = context, options, config
+        self.context, self.options = context, options
         self.publisher, self.labels, self.mapper = publisher, labels, mapper
-        self.start, self.start_digest = start, start_digest
+        self.config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
+        path = find_checkpoint(Path(options.weights)) if options.weights else default_checkpoint_path()
+        start = self.start = load_checkpoint(path)  # what the mapper was started with
+        self.start_digest = digest_of(path.read_bytes())
         self._report = StatusReport(context.name, publisher)
         self._pool = KeyframePool(start.label_set, held_out_every=HELD_OUT_EVERY, capacity=MAX_KEYFRAMES)
         self._last_keyframe_s = 0.0
@@ -315,11 +302,10 @@ class Finetuner:
             self._publish(result, ended.parent_digest)
 
     def _publish(self, result: OnlineResult, parent: str) -> None:
-        name, checkpoint = self.context.name, result.checkpoint
+        name, checkpoint, learned = self.context.name, result.checkpoint, len(result.checkpoint.anchors)
         self._last_version = max(self._last_version, 0 if self._in_use is None else self._in_use.newest) + 1
         checkpoint.recipe.update(version=self._last_version, parent=parent, learner=name)
         data = checkpoint_bytes(checkpoint)
-        learned = len(checkpoint.anchors)
         judged = (result.score, result.parent_score, learned, len(result.keys) - learned)
         update = WeightsUpdate(name, self._last_version, data, digest_of(data), parent, *judged)
         try:
@@ -351,14 +337,8 @@ class Finetuner:
 
     def _status(self) -> PartStatus:
         running = self._round
-        counters = {
-            **self._counts,
-            "kept": len(self._pool),
-            "new": self._pool.new,
-            "rejected": self.labels.rejected,
-            "learning": int(running is not None),
-            "step": 0 if running is None else running.step,
-        }
+        counters = {**self._counts, "kept": len(self._pool), "new": self._pool.new, "rejected": self.labels.rejected}
+        counters |= {"learning": int(running is not None), "step": 0 if running is None else running.step}
         warnings = [f"the last weights were refused: {self._refusal}"] if self._refusal else []
         if self._failure:
             wait_s = max(0.0, self._retry_at_s - time.monotonic())

@@ -97,14 +97,17 @@ class LiveWeights:
         with self._lock:
             requested, self._requested = self._requested, None
         if requested is not None:
-            self._begin_return(requested)
+            self._end_task("older ones were requested")
+            entry, start = self._versions[requested], self._bundle.checkpoint
+            read = partial(read_kept, self._folder, requested, entry.digest, start) if requested else lambda: start
+            self._task = _Task(entry, self._reader.submit(read), requested=True)
         task = self._task
         if task is None or not task.reading.done():
             return
         try:
             self._advance(task, task.reading.result(), session)
         except (SemanticMapperError, OSError) as error:
-            self._end_task(task, str(error))
+            self._end_task(str(error))
         now = time.monotonic()
         self._pause_until = now + min((now - began) / MAX_FRACTION, MAX_PAUSE_S)
 
@@ -121,7 +124,7 @@ class LiveWeights:
         if update.parent != self._versions[self._in_use].digest:
             self._refuse(entry, f"they were compared with others than those in use (weights {self._in_use})")
             return
-        self._drop_task("newer ones came")
+        self._end_task("newer ones came")
         reading = self._reader.submit(keep_offer, update, self._folder, self._bundle.checkpoint)
         self._task = _Task(entry, reading, requested=False)
 
@@ -132,13 +135,9 @@ class LiveWeights:
             if requested is None and self._task is not None and self._task.requested:
                 requested = self._task.version.version
             earlier = [n for n, v in self._versions.items() if v.state == "earlier" and n < self._in_use]
-            return Weights(
-                in_use=self._in_use,
-                before=max(earlier, default=None),
-                wanted=requested,
-                versions=tuple(self._versions.values()),
-                **self._counts,
-            )
+            versions = tuple(self._versions.values())
+            before = max(earlier, default=None)
+            return Weights(self._in_use, before, requested, **self._counts, versions=versions)
 
     def return_to(self, number: int) -> Weights:
         """Request weights that were in use before; for any thread. ``MapError`` where there are none of this number."""
@@ -153,7 +152,7 @@ class LiveWeights:
 
     def close(self) -> Weights:
         """End the thread; unfinished weights are refused. Returns what became of all. Harmless when repeated."""
-        self._drop_task("the mapper ends")
+        self._end_task("the mapper ends")
         self._reader.shutdown(wait=True, cancel_futures=True)
         return self.describe()
 
@@ -163,12 +162,6 @@ class LiveWeights:
         if number not in ("", "0") and file_of_version(self._folder, int(number)).exists():
             self._requested = self._newest = int(number)
             self._versions[self._newest] = WeightsEntry(self._newest, digest, "earlier")
-
-    def _begin_return(self, number: int) -> None:
-        self._drop_task("older ones were requested")
-        entry, start = self._versions[number], self._bundle.checkpoint
-        read = partial(read_kept, self._folder, number, entry.digest, start) if number else lambda: start
-        self._task = _Task(entry, self._reader.submit(read), requested=True)
 
     def _advance(self, task: _Task, checkpoint: Checkpoint, session: MapSession) -> None:
         """One piece of the work. Errors: these weights cannot be used, which says nothing about their labels."""
@@ -185,7 +178,7 @@ class LiveWeights:
                 f"where the map is sure of itself, they agree with {agreement:.2f} of it; at least "
                 f"{self._least_agreement:g} is required (min_map_agreement)"
             )
-            self._end_task(task, reason, contradicts=True)
+            self._end_task(reason, contradicts=True)
             return
         task.trial.exchange()
         number, before = task.version.version, self._in_use
@@ -207,19 +200,14 @@ class LiveWeights:
         _log.info(event, version=number, before=before, agreement=agreement, score=task.version.score)
         self._report()
 
-    def _end_task(self, task: _Task, reason: str, *, contradicts: bool = False) -> None:
-        self._task = None
-        if task.requested:
-            _log.error("weights_not_rolled_back", version=task.version.version, reason=reason)
-        else:
-            self._refuse(task.version, reason, contradicts=contradicts)
-
-    def _drop_task(self, reason: str) -> None:
+    def _end_task(self, reason: str, *, contradicts: bool = False) -> None:
         task, self._task = self._task, None
-        if task is not None and not task.requested:
+        if task is not None and task.requested:
+            _log.error("weights_not_rolled_back", version=task.version.version, reason=reason)
+        elif task is not None:
             path = file_of_version(self._folder, task.version.version)
             task.reading.add_done_callback(lambda _: path.unlink(missing_ok=True))
-            self._refuse(task.version, reason)
+            self._refuse(task.version, reason, contradicts=contradicts)
 
     def _refuse(self, entry: WeightsEntry, reason: str, *, contradicts: bool = False) -> None:
         self._answer = {"judged": entry.version, "reason": reason, "contradicts": contradicts}
@@ -241,12 +229,7 @@ class LiveWeights:
         self._versions = {n: v for n, v in sorted(self._versions.items()) if n in listed}
 
     def _report(self) -> None:
-        in_use = WeightsInUse(
-            self._context.name,
-            self._in_use,
-            self._versions[self._in_use].digest,
-            self._newest,
-            rolled_back=self._counts["rolled_back"],
-            **self._answer,
-        )
+        state = (self._in_use, self._versions[self._in_use].digest, self._newest)
+        rolled_back = self._counts["rolled_back"]
+        in_use = WeightsInUse(self._context.name, *state, rolled_back=rolled_back, **self._answer)
         self._publisher.publish(encode(in_use))

@@ -51,20 +51,17 @@ _log = structlog.get_logger(__name__)
 
 
 def run_mapper(context: NodeContext, options: MapperOptions) -> None:
-    """Map until the stream ends or somebody asks to stop, then write the results.
-
-    Raises:
-        WeightsError, ConfigError: it cannot start.
-        MapError: the map is full, or cannot be written.
-        TransportError: an endpoint is taken.
-    """
+    """Map until the stream ends or somebody asks to stop, then write the results."""
     prepare_folder(Path(options.out))
     with MapperNode(context, options) as mapper:
         context.heartbeat.ready()
         try:
             mapper.run()
         except BaseException as error:
-            mapper.finish_after(error)
+            try:
+                mapper.finish()
+            except (SemanticMapperError, OSError) as second:  # must not hide the first
+                _log.error("results_not_written", reason=str(second), after=str(error))
             raise
         context.heartbeat.ending()
         mapper.finish()
@@ -92,13 +89,10 @@ class MapperNode:
         self._last_trim = time.monotonic()
 
         self._correction = LiveCorrection(self._pipeline)
-        self._autosave: Autosave | None = None
-        if options.save_every_s:
-            self._autosave = Autosave(self._bundle.voxel_map, self._out / MAP_NAME, options.save_every_s)
+        self._autosave = Autosave(self._bundle.voxel_map, self._out / MAP_NAME, options.save_every_s)
         with ExitStack() as stack:
-            self._publisher = stack.enter_context(
-                PublicPublisher(context.endpoint(context.name), options.publish, options.keys)
-            )
+            publisher = PublicPublisher(context.endpoint(context.name), options.publish, options.keys)
+            self._publisher = stack.enter_context(publisher)
             self._report = StatusReport(context.name, self._publisher)
             subscriber = LosslessSubscriber if options.delivery == "all" else NewestSubscriber
             endpoints = [context.endpoint(name) for name in options.cameras]
@@ -141,8 +135,8 @@ class MapperNode:
                 case EndOfStream():
                     if self._end_stream(message):
                         return
-                case _:
-                    self._forget_what_moves()
+                case _ if (self._frames.silent_s or 0) > KEPT_S:  # nothing is known any more of where what moves is
+                    self._pipeline.moving.space.clear()
             self._between_frames(mapped=isinstance(message, PosedFrame))
         self._ended_by = self._context.stop.name
 
@@ -154,8 +148,7 @@ class MapperNode:
             self._weights.advance(self._session, mapped=mapped)
         if self._queries is not None:
             self._queries.follow()
-        if self._autosave is not None:
-            self._autosave.follow()
+        self._autosave.follow()
         self._publish_status("running")
         if time.monotonic() - self._last_trim > TRIM_PERIOD_S:
             give_back_freed_memory()
@@ -172,10 +165,7 @@ class MapperNode:
             keep_earlier(self._context, self._out / MAP_NAME)
         clear_results(self._out)
         self._session = MapSession(
-            self._bundle,
-            stream_labels=info.label_set,
-            source=info.source,
-            own_first=not self._options.map,
+            self._bundle, stream_labels=info.label_set, source=info.source, own_first=not self._options.map
         )
         if self._bundle.voxel_map.frames:
             self._session.odometry_sessions.known.update(noted_sessions(self._context))
@@ -206,18 +196,12 @@ class MapperNode:
     def _refuse(self, frame: PosedFrame | Refusal, reason: str) -> None:
         self._publisher.publish(encode(FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, reason)))
 
-    def _forget_what_moves(self) -> None:
-        """Where frames have ceased, nothing is known any more of where what moves is."""
-        silent_s = self._frames.silent_s
-        if silent_s is not None and silent_s > KEPT_S:
-            self._pipeline.moving.space.clear()
-
     def _note_correction(self) -> None:
         """Frames after a correction may still come with poses from before it: a restarted mapper could not tell."""
         if not self._corrected and self._pipeline.corrector.status.poses:
             self._corrected = True
             noted = forbid(self._context, "poses had been corrected, which only the mapper that was killed knew of")
-            if not noted and self._autosave is not None:
+            if not noted and self._options.save_every_s:
                 self._autosave.end("poses were corrected, and no note could say so to a mapper that replaces this one")
 
     def _end_stream(self, end: EndOfStream) -> bool:
@@ -250,8 +234,7 @@ class MapperNode:
                 return
             self._session = MapSession(self._bundle, stream_labels=None)  # of the map that was saved before a restart
         self._publish_status("stopping", now=True)
-        if self._autosave is not None:
-            self._autosave.close()
+        self._autosave.close()
         self._correction.finish(self._session, lambda: bool(self._context.stop), self._while_correcting)
         if self._queries is not None:
             self._queries.hand_over()  # questions are answered while the map is written
@@ -260,13 +243,6 @@ class MapperNode:
         summary = finish_session(self._session, self._out, self._ended_by, self._resumed, self._step_of_finish)
         _log.info("map_written", out=str(self._out), **summary["frames"])
         self._publish_status("ended", now=True)
-
-    def finish_after(self, error: BaseException) -> None:
-        """Write what there is, and let no second failure hide the first."""
-        try:
-            self.finish()
-        except (SemanticMapperError, OSError) as second:
-            _log.error("results_not_written", reason=str(second), after=str(error))
 
     def _step_of_finish(self) -> None:
         self._context.heartbeat.turn()

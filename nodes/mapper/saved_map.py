@@ -41,7 +41,7 @@ class Autosave:
     """Takes the map between two frames where it has changed, and writes it in a thread while the next ones are mapped.
 
     The file is always whole, and of one frame: the map before or the one after, whenever the process is killed.
-    ``every_s`` is from the beginning of one save to the next; the first ones come sooner.
+    ``every_s`` is from the beginning of one save to the next; the first ones come sooner. 0 = no saves.
     """
 
     def __init__(self, voxel_map: VoxelMap, path: Path, every_s: float) -> None:
@@ -54,6 +54,8 @@ class Autosave:
         self._pause_s = FIRST_S
         self._saved_version = voxel_map.version
         self._ending = threading.Event()
+        if not every_s:
+            self._ending.set()
         self._thread: threading.Thread | None = None
 
     def status(self) -> PartStatus:

@@ -18,18 +18,8 @@ from semantic_mapper.transport.sockets import receive_bounded
 MAX_REQUEST_BYTES = 10_000_000  # of a part: 65,536 poses, and some room; a client that sends more is cut off
 _QUESTION_PARTS = 5  # who asks, the empty part that REQ sockets put first, and a question's three
 _WAITING = 64  # questions and answers that may wait for each client
-_SERVER_OPTIONS = {
-    zmq.LINGER: 200,
-    zmq.RCVHWM: _WAITING,
-    zmq.SNDHWM: _WAITING,
-    zmq.MAXMSGSIZE: MAX_REQUEST_BYTES,
-}
-_CLIENT_OPTIONS = {
-    zmq.LINGER: 0,
-    zmq.MAXMSGSIZE: MAX_PART_BYTES,
-    zmq.RECONNECT_IVL: 50,
-    zmq.RECONNECT_IVL_MAX: 1000,
-}
+_SERVER_OPTIONS = {zmq.LINGER: 200, zmq.RCVHWM: _WAITING, zmq.SNDHWM: _WAITING, zmq.MAXMSGSIZE: MAX_REQUEST_BYTES}
+_CLIENT_OPTIONS = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_PART_BYTES, zmq.RECONNECT_IVL: 50, zmq.RECONNECT_IVL_MAX: 1000}
 
 
 class QueryServer(ServerSocket):

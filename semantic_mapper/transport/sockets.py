@@ -117,8 +117,7 @@ class Publisher:
         self._mutex = threading.Lock()  # a zmq socket may change threads only across a memory barrier
         self._counts: Counter[bytes] = Counter()
         self._latched: dict[bytes, Parts] = {}
-        self._late: dict[bytes, float] = {}  # latched ends that newcomers get yet, and when
-        self._owed: list[Parts] = []  # answers to subscriptions that found a full queue
+        self._owed: list[tuple[float, Parts]] = []  # answers to subscriptions, and not before when
         self._closed = threading.Event()
         self._pump_thread = threading.Thread(target=self._pump, name=f"publisher {endpoint}", daemon=True)
         self._pump_thread.start()
@@ -201,38 +200,31 @@ class Publisher:
                 self._drain()
 
     def _drain(self) -> None:
-        owed, self._owed = self._owed, []
-        now = time.monotonic()
-        due = [topic for topic, at in self._late.items() if at <= now]
-        for parts in (*owed, *(self._latched[topic] for topic in due)):
-            self._answer(parts)
-        for topic in due:
-            del self._late[topic]
+        """Hear what subscribers have sent, and answer as far as there is room."""
         for _ in range(_MAX_EVENTS):
             try:
                 event = self._socket.recv(zmq.NOBLOCK)
             except zmq.Again:
-                return
+                break
             if event[:1] == b"\x01":
                 self._on_subscribed(event[1:])
             elif event[:1] == b"\x00":
                 self._counts[event[1:]] -= 1
                 if self._counts[event[1:]] <= 0:
                     del self._counts[event[1:]]
+        now = time.monotonic()
+        self._owed = [(due, parts) for due, parts in self._owed if due > now or not self._try_send(parts, zmq.NOBLOCK)]
 
     def _on_subscribed(self, prefix: bytes) -> None:
-        if prefix not in self._counts and len(self._counts) >= _MAX_SUBSCRIPTIONS:
+        if max(len(self._counts), len(self._owed)) >= _MAX_SUBSCRIPTIONS and prefix not in self._counts:
             log.warning("subscription_ignored", endpoint=self.endpoint, reason="too many different topics")
             return
         self._counts[prefix] += 1
-        for topic, parts in self._latched.items():
-            if topic.startswith(prefix):
-                if _LATCHED[topic.partition(b"/")[0]]:
-                    self._late[topic] = time.monotonic() + _LATE_S
-                else:
-                    self._answer(parts)
+        now = time.monotonic()
+        answers = [(topic, parts) for topic, parts in self._latched.items() if topic.startswith(prefix)]
+        self._owed += [(now + _LATE_S * bool(_LATCHED[topic.partition(b"/")[0]]), parts) for topic, parts in answers]
         if prefix.startswith(SYNC_PREFIX):
-            self._answer([prefix, b""])
+            self._owed.append((now, [prefix, b""]))
 
     def _latch(self, topic: bytes, parts: Parts) -> None:
         name, _, source = topic.partition(b"/")
@@ -240,12 +232,8 @@ class Publisher:
             return
         self._latched[topic] = tuple(parts)
         for ending in [ending for ending, begun in _LATCHED.items() if begun == name]:  # what begins has not ended
-            self._latched.pop(ending + b"/" + source, None)
-            self._late.pop(ending + b"/" + source, None)
-
-    def _answer(self, parts: Parts) -> None:
-        if not self._try_send(parts, zmq.NOBLOCK) and len(self._owed) < _MAX_SUBSCRIPTIONS:
-            self._owed.append(parts)
+            ended = self._latched.pop(ending + b"/" + source, None)
+            self._owed = [(due, owed) for due, owed in self._owed if owed is not ended]
 
     def _try_send(self, parts: Parts, flags: int = 0) -> bool:
         try:

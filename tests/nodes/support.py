@@ -12,8 +12,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import typer
@@ -25,6 +27,9 @@ from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.console import Output
+from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.training.config import GridFitConfig
 from semantic_mapper.training.grid_fit import grid_of_depth
@@ -113,6 +118,23 @@ def run_here(*arguments: str | Path) -> tuple[int, str]:
     """As ``run``: exit code, and all that it said on one line."""
     done = run(*arguments)
     return done.returncode, " ".join((done.stdout + done.stderr).split())
+
+
+@contextmanager
+def node_here(
+    work: Callable[[NodeContext, Any], object], name: str, endpoints: dict[str, str], options: Any, **more: Any
+) -> Iterator[tuple[threading.Thread, StopRequest]]:
+    """A node in a thread of this process; it is asked to stop at the end."""
+    stop = StopRequest(patient=True)
+    context = NodeContext(name, endpoints, 1, stop, HeartbeatWriter(-1, 1), **more)
+    thread = threading.Thread(target=work, args=(context, options), daemon=True)
+    thread.start()
+    try:
+        yield thread, stop
+    finally:
+        stop.signum = 15
+        thread.join(60)
+        assert not thread.is_alive()
 
 
 class Running:

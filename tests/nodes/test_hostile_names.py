@@ -1,8 +1,9 @@
-"""Names of classes, attachments, cameras and files are text for every verb, whatever they hold."""
+"""Names of classes, cameras and files are text for every verb, whatever they hold, and what they name is judged."""
 
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 
 import pytest
@@ -135,3 +136,53 @@ def test_every_place_of_a_table_and_a_line_is_plain(name: str, shown: str) -> No
     for place in ("head", "title", "caption", "cell", "line"):
         assert f"{place} {shown}" in stream.getvalue()
     assert len(stream.getvalue().splitlines()) == 5  # title, table of 5 lines, caption, line
+
+
+def test_what_is_no_file_is_refused_by_its_name(tmp_path: Path) -> None:
+    (folder := tmp_path / "dir.toml").mkdir()
+    os.mkfifo(pipe := tmp_path / "pipe")
+    (big := tmp_path / "big.json").write_text('{"boxes": [{"id": ' + "9" * 5000 + "}]}", encoding="utf-8")
+    for words, said in (
+        (("up", folder), f"{folder}: is a folder; name a launch file in it"),
+        (("info", "/proc/self/mem"), "/proc/self/mem: cannot be read: Input/output error"),
+        (("replay", pipe, "--out", tmp_path / "o"), f"{pipe}: cannot be read: it is no regular file"),
+        (("import", pipe, tmp_path / "o.mcap"), f"{pipe}: is neither a file nor a folder"),
+        (("query", "://", "info"), "://: no endpoint; endpoints read"),
+        (("info", big), "value has 5000 digits"),
+    ):
+        code, shown = run_here(*map(str, words))
+        assert code == 1 and said in " ".join(shown.split()), shown
+        assert "sys.set_int" not in shown
+
+
+def test_rates_and_numbers_that_overflow_are_refused_where_they_stand(tmp_path: Path, log: Path) -> None:
+    launch = tmp_path / "a.toml"
+    for option in ("rate = 1e-300", f"rate = {'9' * 5000}", f"max_frames = {'9' * 5000}"):
+        launch.write_text(f'[[node]]\nname = "eye"\nkind = "camera"\n[node.options]\nlog = "{log}"\n{option}\n')
+        code, said = run_here("up", launch)
+        assert code == 1 and "error: " in said and "a.toml" in said, said
+
+
+RESULTS = ("overview.png", "map.npz", "map.ply", "report.html", "summary.json", "eval.json", "eval.html")
+
+
+def test_no_result_is_written_through_a_link(
+    tmp_path: Path, log: Path, weights: Path, config: Path, replayed: Path
+) -> None:
+    target, out = tmp_path / "precious", tmp_path / "out"
+    target.write_bytes(b"precious")
+    out.mkdir()
+    for name in RESULTS:
+        for link in (name, name + ".part", "part." + name):
+            (out / link).symlink_to(target)
+    (out / ".writable").symlink_to(tmp_path / "made")
+    for arguments in (
+        ("replay", log, "--out", out, "--weights", weights, "--config", config),
+        ("eval", out),
+        ("compare", replayed, out),
+    ):
+        code, said = run_here(*arguments)
+        assert code in (0, 1) and "Traceback" not in said, said
+        assert target.read_bytes() == b"precious", arguments
+    assert not (tmp_path / "made").exists()
+    assert all((out / name).is_file() and not (out / name).is_symlink() for name in RESULTS)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import tempfile
-import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +14,8 @@ import pytest
 
 from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.labels import NYU40, ROOMS
-from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.node import run_mapper
-from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions, RecorderOptions
-from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.nodes.recorder.node import run_recorder
 from semantic_mapper.nodes.streams import MissingFrames, Streams
@@ -29,33 +24,21 @@ from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
-from tests.nodes.support import write_config, write_weights
+from tests.nodes.support import node_here, write_config, write_weights
 from tests.small import INTRINSICS, tiny_frames
 
 LEFT, RIGHT = StreamInfo("left eye", {"left": INTRINSICS}), StreamInfo("right eye", {"right": INTRINSICS})
-
-
-@contextmanager
-def recording(path: Path, endpoints: dict[str, str]) -> Iterator[StopRequest]:
-    stop = StopRequest()
-    context = NodeContext("recorder", endpoints, 0, stop, HeartbeatWriter(-1, 1))
-    options = RecorderOptions(out=str(path), sources=("left", "right"), streams=2)
-    thread = threading.Thread(target=run_recorder, args=(context, options))
-    thread.start()
-    try:
-        yield stop
-        thread.join(20)
-        assert not thread.is_alive()
-    finally:
-        stop.signum = 15
-        thread.join(20)
 
 
 def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(tmp_path: Path) -> None:
     frame = tiny_frames(1)[0]
     with tempfile.TemporaryDirectory(prefix="sm-") as folder:
         endpoints = {name: f"ipc://{folder}/{name}" for name in ("left", "right", "recorder")}
-        with Publisher(endpoints["right"]) as right, recording(tmp_path / "both.mcap", endpoints):
+        options = RecorderOptions(out=str(tmp_path / "both.mcap"), sources=("left", "right"), streams=2)
+        with (
+            Publisher(endpoints["right"]) as right,
+            node_here(run_recorder, "recorder", endpoints, options) as (recorder, _),
+        ):
             for restart in range(2):  # the camera's process dies after three frames and counts from 0 again
                 with Publisher(endpoints["left"]) as left:
                     left.wait_for_subscribers("frame", timeout_s=20)
@@ -70,6 +53,7 @@ def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(t
             for seq in range(2):
                 right.publish(encode_frame(replace(frame, camera_id="right", seq=seq, stamp_ns=20_000 + seq)))
             right.publish(encode(EndOfStream("right", "end", 2)))
+            recorder.join(20)
     with LogReader(tmp_path / "both.mcap") as log:
         frames = list(log)
         assert log.finished and not log.errors
@@ -89,10 +73,8 @@ def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) ->
         endpoints = {name: f"ipc://{folder}/{name}" for name in ("left", "right", "mapper")}
         files = {"out": str(tmp_path), "weights": str(weights), "config": str(config)}
         options = MapperOptions(**files, input=("left", "right"), delivery="all", query="")
-        context = NodeContext("mapper", endpoints, 0, StopRequest(), HeartbeatWriter(-1, 1))
         publishers = {name: stack.enter_context(Publisher(endpoints[name], policy="block")) for name in infos}
-        thread = threading.Thread(target=run_mapper, args=(context, options))
-        thread.start()
+        thread, _ = stack.enter_context(node_here(run_mapper, "mapper", endpoints, options))
         for name, publisher in publishers.items():
             publisher.wait_for_subscribers("frame", timeout_s=120)
             publisher.publish(encode(infos[name], sender=name))

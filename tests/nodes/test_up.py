@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.replay.log.format import LogReader
 from tests.nodes.support import (
     REPLAY_LAUNCH,
@@ -161,3 +163,15 @@ def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, co
     assert done.returncode == 0, done.stderr
     frames = json.loads((out / "summary.json").read_text())["frames"]
     assert (frames["published"], frames["without_depth"], frames["dropped"], frames["refused"]) == (40, 40, 0, 0)
+
+
+def test_without_a_query_endpoint_there_is_none_and_names_must_differ(tmp_path: Path) -> None:
+    launch = load_launch(REPLAY_LAUNCH, ["camera.log=x"], tmp_path)
+    assert launch.sockets() == ("launch", "mapper", "camera", "query")
+    for query in ("", "ipc:///a/b"):
+        launch = load_launch(REPLAY_LAUNCH, ["camera.log=x", f"mapper.query={query}"], tmp_path)
+        assert launch.sockets() == ("launch", "mapper", "camera")
+    with pytest.raises(ConfigError, match="camera: names two endpoints"):
+        load_launch(REPLAY_LAUNCH, ["camera.log=x", "mapper.query=camera"], tmp_path)
+    with pytest.raises(ConfigError, match="query"):
+        load_launch(REPLAY_LAUNCH, ["camera.log=x", "mapper.query=../up"], tmp_path)

@@ -25,10 +25,8 @@ from semantic_mapper.nodes.finetuner import finetuner
 from semantic_mapper.nodes.finetuner.finetuner import FinetuneRound
 from semantic_mapper.nodes.finetuner.node import run_finetuner
 from semantic_mapper.nodes.launcher.launch_file import load_launch
-from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
-from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
-from semantic_mapper.nodes.process import StopRequest, run_when_idle
+from semantic_mapper.nodes.process import run_when_idle
 from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.online import KeyframeSplit
@@ -37,7 +35,7 @@ from semantic_mapper.transport.messages import LabelledKeyframe, Status, Weights
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from tests.nodes.mapper.test_live_correction import running_robot
 from tests.nodes.mapper.test_query_service import a_folder
-from tests.nodes.support import REPLAY_LAUNCH, eventually, run_here, write_log
+from tests.nodes.support import REPLAY_LAUNCH, eventually, node_here, run_here, write_log
 from tests.small import tiny_frames
 from tests.training.test_online import permuted, start_of
 
@@ -93,23 +91,15 @@ def finetuning(
 ) -> Iterator[Heard]:
     settings = {"config": str(start.with_name("learning.toml")), "niceness": 0, **more}
     options = FinetunerOptions(weights=str(start), cpu_fraction=1.0, **settings)
-    stop = StopRequest(patient=True)
-    context = NodeContext("finetuner", endpoints, 1, stop, HeartbeatWriter(-1, 1), restarts)
-    node = threading.Thread(target=run_finetuner, args=(context, options), daemon=True)
     with (
         patch.multiple(finetuner, SETTLE_S=0.3, RETRY_S=retry_s),
         LosslessSubscriber(endpoints["finetuner"], ("weights",)) as weights,
         NewestSubscriber(endpoints["finetuner"], ("status",)) as status,
+        node_here(run_finetuner, "finetuner", endpoints, options, restarts=restarts),
     ):
-        node.start()
         weights.wait_until_heard(60)
         status.wait_until_heard(60)
-        try:
-            yield Heard(endpoints, weights, status)
-        finally:
-            stop.signum = 15
-            node.join(30)
-            assert not node.is_alive()
+        yield Heard(endpoints, weights, status)
 
 
 @contextmanager

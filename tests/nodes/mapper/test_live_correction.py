@@ -24,11 +24,9 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.camera.corrections import CorrectionSender
-from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.queries.questions import CorrectPosesRequest, encode_request
@@ -39,7 +37,7 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.mapping.test_correction import drift, drifted, true_poses
 from tests.nodes.mapper.test_query_service import RawClient, a_folder
-from tests.nodes.support import CONFIG, eventually, run
+from tests.nodes.support import CONFIG, eventually, node_here, run
 from tests.replay.test_corrected_poses import write as write_tum
 from tests.small import INTRINSICS, tiny_frames
 
@@ -96,13 +94,12 @@ def running_robot(
         options = MapperOptions(
             out=str(out), weights=str(weights), config=str(config_file(folder, history)), delivery="all", **more
         )
-        stop = StopRequest(patient=True)
-        context = NodeContext("mapper", endpoints, 1, stop, HeartbeatWriter(-1, 1), restarts, notes)
-        mapper = threading.Thread(target=run_mapper, args=(context, options), daemon=True)
         status: list[Status] = []
         ended = threading.Event()
-        with Publisher(endpoints["camera"], policy="block") as camera:
-            mapper.start()
+        with (
+            Publisher(endpoints["camera"], policy="block") as camera,
+            node_here(run_mapper, "mapper", endpoints, options, restarts=restarts, folder=notes) as (mapper, stop),
+        ):
             for topic in ("info", "frame", "end"):
                 camera.wait_for_subscribers(topic, timeout_s=60)
             with LosslessSubscriber(endpoints["mapper"], ("status",)) as listener:

@@ -21,10 +21,7 @@ UNKNOWN = {SCALE_KEY: SCALE_UNKNOWN}
 
 def test_a_live_map_without_metres(weights: Path, tmp_path: Path) -> None:
     frames, out = tiny_frames(4), tmp_path / "out"
-    with (
-        running_robot(weights, out, metadata=UNKNOWN) as robot,
-        MapClient(robot.query, timeout_s=60) as client,
-    ):
+    with running_robot(weights, out, metadata=UNKNOWN) as robot, MapClient(robot.query, timeout_s=60) as client:
         robot.send(list(frames))
         assert robot.fused(4)
         assert eventually(lambda: client.info().version >= 4) and not client.info().scale_known

@@ -332,10 +332,7 @@ def test_a_mapper_that_nobody_asks_is_not_looked_at(endpoint: str, monkeypatch: 
 
 def test_where_the_last_frame_was_taken_is_told(endpoint: str) -> None:
     pose_in_map, pose = PoseInMap(), np.diag([-1.0, -1.0, 1.0, 1.0])
-    with (
-        QueryService(endpoint, whole_map(), pose_in_map=pose_in_map),
-        MapClient(endpoint, timeout_s=60) as client,
-    ):
+    with QueryService(endpoint, whole_map(), pose_in_map=pose_in_map), MapClient(endpoint, timeout_s=60) as client:
         assert client.pose() is None
         pose_in_map.last = CameraPose("oak", 5, None, "looking")
         unknown = client.pose()

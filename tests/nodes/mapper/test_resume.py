@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +25,7 @@ from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import Publisher
 from tests.mapping.test_voxel_map import same
+from tests.nodes.support import node_here
 from tests.small import INTRINSICS, tiny_frames
 
 CONFIG = VoxelMapConfig(voxel_size_m=0.05)
@@ -153,16 +153,15 @@ def map_stream(options: MapperOptions) -> None:
     """A mapper from the beginning of a stream to its end."""
     with tempfile.TemporaryDirectory(prefix="sm-") as folder:
         endpoints = {name: f"ipc://{folder}/{name}" for name in ("camera", "mapper")}
-        mapper = NodeContext("mapper", endpoints, 0, StopRequest(), HeartbeatWriter(-1, 1), folder=Path(folder))
-        with Publisher(endpoints["camera"], policy="block") as camera:
-            thread = threading.Thread(target=run_mapper, args=(mapper, options))
-            thread.start()
+        with (
+            Publisher(endpoints["camera"], policy="block") as camera,
+            node_here(run_mapper, "mapper", endpoints, options, folder=Path(folder)) as (thread, _),
+        ):
             camera.wait_for_subscribers("frame", timeout_s=200)
             camera.publish(encode(StreamInfo("a wall", {"rooms": INTRINSICS}, ROOMS), sender="camera"))
             camera.publish(encode_frame(tiny_frames(1)[0]), 120)
             camera.publish(encode(EndOfStream("camera", "end", 1)), 120)
             thread.join(200)
-            assert not thread.is_alive()
 
 
 def test_live_launch_into_the_same_folder_keeps_the_map_and_a_replay_replaces_it(

@@ -22,7 +22,6 @@ from structlog.testing import capture_logs
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.info import describe_log
-from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
@@ -33,7 +32,7 @@ from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
-from tests.nodes.support import Running, error_line, eventually, repeated_frames, run, write_log
+from tests.nodes.support import Running, error_line, eventually, node_here, repeated_frames, run, write_log
 from tests.nodes.test_faults import alone
 from tests.transport import samples
 
@@ -95,23 +94,22 @@ class Stream:
 def streaming(tmp_path: Path, sockets: Path, restarts: int = 0, **options: Any) -> Iterator[Stream]:
     endpoints = {name: f"ipc://{sockets}/{name}" for name in ("camera", "recorder")}
     settings = convert_config({"out": str(tmp_path / "a.mcap"), "sources": ["camera"], **options}, RecorderOptions, "t")
-    stop = StopRequest()
-    context = NodeContext("recorder", endpoints, 0, stop, HeartbeatWriter(-1, 0), restarts, folder=sockets)
     failures: list[BaseException] = []
 
-    def work() -> None:
+    def work(context: NodeContext, settings: RecorderOptions) -> None:
         try:
             run_recorder(context, settings)
         except (LogError, TransportError) as error:
             failures.append(error)
 
-    with Publisher(endpoints["camera"], policy="block") as publisher:
-        recorder = threading.Thread(target=work, daemon=True)
-        recorder.start()
-        with NewestSubscriber(endpoints["recorder"], ("status",)) as status:
-            publisher.wait_for_subscribers("frame", 1, 30)
-            publisher.publish(encode(samples.make_info(), sender="camera"))
-            yield Stream(publisher, recorder, status, failures, stop)
+    with (
+        Publisher(endpoints["camera"], policy="block") as publisher,
+        node_here(work, "recorder", endpoints, settings, restarts=restarts, folder=sockets) as (recorder, stop),
+        NewestSubscriber(endpoints["recorder"], ("status",)) as status,
+    ):
+        publisher.wait_for_subscribers("frame", 1, 30)
+        publisher.publish(encode(samples.make_info(), sender="camera"))
+        yield Stream(publisher, recorder, status, failures, stop)
 
 
 @pytest.fixture
