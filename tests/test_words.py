@@ -19,7 +19,7 @@ DIALECT = re.compile(
 )
 THIRD_PARTY = {  # words of others, by file
     "replay/importers/models.py": {"Shot", "shot", "shots"},  # keys of OpenSfM's files
-    "replay/sfm/reconstruct.py": {"ARM"},  # processors
+    "replay/sfm/colmap.py": {"ARM"},  # processors
 }
 
 

@@ -35,7 +35,7 @@ from semantic_mapper.replay.importers.tables import (
     read_plain_json,
     unknown_notice,
 )
-from semantic_mapper.replay.sfm.colmap_model import ColmapModel, find_models, read_model
+from semantic_mapper.replay.sfm.colmap import ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition, place_by_gps, read_position
 from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, scene_depth, upright
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
@@ -65,8 +65,7 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
         except ImportSourceError as error:
             left_out.append(str(error))
     notices += left_out_notice("image", left_out)
-    points = np.array([*model.points.values()], np.float64).reshape(-1, 3)
-    return _opened("colmap", folder, pictures, points, options, notices)
+    return _opened("colmap", folder, pictures, model.xyz, options, notices)
 
 
 def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:

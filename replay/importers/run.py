@@ -32,7 +32,7 @@ from semantic_mapper.replay.importers.tum import open_tum
 from semantic_mapper.replay.log.format import LogReader, LogWriter, atomic_log
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
-from semantic_mapper.replay.sfm.colmap_model import find_models
+from semantic_mapper.replay.sfm.colmap import find_models
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame

@@ -7,61 +7,56 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from semantic_mapper.geometry import camera_matrix, invert_pose
+from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 MIN_INLIERS = 25
 MIN_INLIER_FRACTION = 0.5  # of the points that were followed
 MAX_ERROR_PX = 3.0  # of an inlier, for a width of 640
 MAX_POINTS = 600
-_WINDOW, _LEVELS = (21, 21), 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Anchor:
-    """A registered frame."""
+class RegisteredFrame:
+    """A frame of the model."""
 
-    gray: UInt8  # (H, W) its picture
-    xy: Float64  # (N, 2) pixels of its points
-    xyz: Float64  # (N, 3) their places in the world
     T_world_camera: Float64  # (4, 4)
+    xy: Float64  # (N, 2) pixels of the points that it sees
+    xyz: Float64  # (N, 3) these points in the world
 
 
-def follow_pose(anchor: Anchor, gray: UInt8, intrinsics: CameraIntrinsics) -> Float64 | None:
-    """T_world_camera (4, 4) of a frame soon after the anchor; None where too few of its points are found again.
+def follow_pose(before: UInt8, frame: RegisteredFrame, gray: UInt8, intrinsics: CameraIntrinsics) -> Float64 | None:
+    """T_world_camera (4, 4) of a frame soon after a registered one; None where too few of its points are found again.
 
     Args:
-        anchor: The registered frame.
+        before: (H, W) picture of the registered frame.
+        frame: The registered frame.
         gray: (H, W) picture of the other one.
         intrinsics: Of both, with their distortion.
     """
-    if len(anchor.xy) < MIN_INLIERS:
+    if len(frame.xy) < MIN_INLIERS:
         return None
-    chosen = np.linspace(0, len(anchor.xy) - 1, min(len(anchor.xy), MAX_POINTS)).astype(np.int64)
-    before = np.ascontiguousarray(anchor.xy[chosen, None], np.float32)
-    after, true = track(anchor.gray, gray, before)
+    chosen = np.linspace(0, len(frame.xy) - 1, min(len(frame.xy), MAX_POINTS)).astype(np.int64)
+    after, true = track(before, gray, np.ascontiguousarray(frame.xy[chosen, None], np.float32))
     if true.sum() < MIN_INLIERS:
         return None
-    xyz, xy = anchor.xyz[chosen][true], after[true, 0].astype(np.float64)
-    T_camera_world = invert_pose(anchor.T_world_camera)
+    xyz, xy = frame.xyz[chosen][true], after[true, 0].astype(np.float64)
+    T_camera_world = invert_pose(frame.T_world_camera)
     turn, shift = cv2.Rodrigues(T_camera_world[:3, :3])[0], T_camera_world[:3, 3:].copy()
-    K, lens = camera_matrix(intrinsics), np.array(intrinsics.distortion or (0.0,) * 4)
-    limit = MAX_ERROR_PX * intrinsics.width / 640
+    lens = camera_matrix(intrinsics), np.array(intrinsics.distortion or (0.0,) * 4)
     cv2.setRNGSeed(0)
     good, turn, shift, inliers = cv2.solvePnPRansac(
-        xyz, xy, K, lens, turn, shift, useExtrinsicGuess=True, iterationsCount=100, reprojectionError=limit
+        xyz, xy, *lens, turn, shift, True, 100, MAX_ERROR_PX * intrinsics.width / 640
     )
     if not good or inliers is None or len(inliers) < max(MIN_INLIERS, MIN_INLIER_FRACTION * len(xyz)):
         return None
     rows = np.asarray(inliers, np.int64)[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(xyz[rows], xy[rows], K, lens, turn, shift)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    T = make_pose(*cv2.solvePnPRefineLM(xyz[rows], xy[rows], *lens, turn, shift))
     return invert_pose(T) if np.isfinite(T).all() else None
 
 
 def track(
-    last: UInt8, now: UInt8, xy: np.ndarray, window: tuple[int, int] = _WINDOW, levels: int = _LEVELS
+    last: UInt8, now: UInt8, xy: np.ndarray, window: tuple[int, int] = (21, 21), levels: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 1, 2) float32 of one picture in another, and (N,) whether they come back to where they were."""
     options = {"winSize": window, "maxLevel": levels}

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 
 import cv2
@@ -17,15 +15,14 @@ import numpy as np
 
 from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.drivers.calibration import Rectifier, load_calibration
-from semantic_mapper.errors import ConfigError, DependencyError, FrameError, ImportSourceError
+from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import camera_matrix, scale_intrinsics, transform
 from semantic_mapper.imaging import rotate_intrinsics
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.log.format import LogWriter, atomic_log
-from semantic_mapper.replay.sfm import colmap_process as colmap
-from semantic_mapper.replay.sfm.between import Anchor, follow_pose
-from semantic_mapper.replay.sfm.colmap_model import ColmapModel, read_model
+from semantic_mapper.replay.log.format import atomic_log
+from semantic_mapper.replay.sfm import colmap, refusals
+from semantic_mapper.replay.sfm.between import RegisteredFrame, follow_pose
 from semantic_mapper.replay.sfm.features import find_features
 from semantic_mapper.replay.sfm.film import (
     LEAST_MOTION,
@@ -37,27 +34,16 @@ from semantic_mapper.replay.sfm.film import (
     look_through,
     pick_frames,
 )
-from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsFit, place_by_gps
-from semantic_mapper.replay.sfm.refusals import (
-    LEAST_ANGLE_DEG,
-    TURNING,
-    baseline_notes,
-    focal_note,
-    refuse_features,
-    refuse_look,
-    refuse_outcome,
-)
+from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, place_by_gps
 from semantic_mapper.replay.sfm.scale import (
     NEIGHBOURS,
     UNSCALED_DEPTH_M,
     BoardScale,
     Mark,
-    RegisteredFrame,
     ScaleHint,
     find_edges,
     marked_place,
     median_depth,
-    nearest_frame,
     scene_depth,
     upright,
     vertical,
@@ -139,14 +125,10 @@ class FilmReport:
     @property
     def left_out_counts(self) -> dict[str, int]:
         """Frames that are not in the log, by reason."""
-        return _counts(self.left_out)
-
-
-def _counts(left_out: Iterable[LeftOut]) -> dict[str, int]:
-    counts: Counter[str] = Counter()
-    for part in left_out:
-        counts[part.reason] += part.frames
-    return dict(counts)
+        counts: Counter[str] = Counter()
+        for part in self.left_out:
+            counts[part.reason] += part.frames
+        return dict(counts)
 
 
 def import_film(
@@ -171,11 +153,7 @@ def import_film(
         DependencyError: pycolmap is not installed.
         LogError: ``dst`` is there already, or cannot be written.
     """
-    if find_spec("pycolmap") is None:
-        raise DependencyError(
-            "poses of films are found by pycolmap, which is not installed: pip install 'semantic-mapper[sfm]' (it has "
-            "no packages for Linux on ARM: import the film on another machine, and copy the log)"
-        )
+    colmap.require_colmap()
     film = Film(src, options.quarters)
     lens = _Lens(film, options)
     with tempfile.TemporaryDirectory(prefix="semantic-mapper-film-") as folder:
@@ -237,12 +215,14 @@ class _Lens:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Registered:
-    """The frames of the chosen model, by their index in the film, in the world of the log."""
+class _Scene:
+    """The chosen model in the world of the log."""
 
-    frames: dict[int, RegisteredFrame]
-    xy: dict[int, Float64]  # (N, 2) pixels of the points of each
+    frames: dict[int, RegisteredFrame]  # by their index in the film
     seen: CameraIntrinsics  # of what was seen, with distortion
+    scale: str  # how it was found; empty = unknown
+    height_m: float | None  # of the camera over the floor
+    origin: str  # where its origin is on the Earth; empty = not known
 
 
 class _Import:
@@ -253,45 +233,42 @@ class _Import:
         self._progress = on_progress
         self._notices: list[str] = []
         self._edges: dict[int, Float64] = {}  # of some of the picked frames
-        self._gps: GpsFit | None = None
+        self._board = None if options.scale.board is None else BoardScale(options.scale.board)
+        self._look: FilmLook
 
     def run(self, dst: Path, *, overwrite: bool) -> FilmReport:
         film = self._film
-        look = look_through(film, lambda done: self._progress("look", done, max(done, film.count)))
+        self._look = look_through(film, lambda done: self._progress("look", done, max(done, film.count)))
         if film.unread:
             self._notices.append(
                 f"{film.count - film.unread} of the {film.count} frames that the film announces could be read; it is "
                 "damaged or cut off: copy or convert it again, if what is missing matters"
             )
-        rows = pick_frames(look)
-        refuse_look(film.path, look, len(rows))
-        if self._options.scale.distance is not None:
-            for mark in (self._options.scale.distance.a, self._options.scale.distance.b):
-                self._check_mark(mark, look)
-        board = None if self._options.scale.board is None else BoardScale(self._options.scale.board)
-        picked = self._find_features(look, rows, board)
-        outcome = self._run_colmap()
-        models, error_px = self._judge(outcome, look, picked)
-        registered, scale, height = self._orient(models, look, picked, board)
-        return self._write(dst, look, picked, registered, scale, height, error_px, overwrite=overwrite)
+        rows = pick_frames(self._look)
+        refusals.refuse_look(film.path, self._look, len(rows))
+        for mark in (self._options.scale.distance or ())[:2]:
+            self._check_mark(mark)
+        picked = self._find_features(rows)
+        model, error_px = self._map(picked)
+        return self._write(dst, picked, self._place(model, picked), error_px, overwrite=overwrite)
 
-    def _find_features(self, look: FilmLook, rows: Int64, board: BoardScale | None) -> list[int]:
+    def _find_features(self, rows: Int64) -> list[int]:
         """Index of each picked frame; its features are in the folder, under its place in the sequence."""
         counts: list[int] = []
         picked: list[int] = []
         (self._folder / colmap.FEATURES).mkdir()
-        for frame in self._frames({int(i) for i in look.index[rows]}):
+        for frame in self._frames({int(i) for i in self._look.index[rows]}):
             seen = self._lens.seen(frame.bgr)
             xy, descriptors = find_features(seen)
             np.savez(self._folder / colmap.FEATURES / f"{len(picked):06d}.npz", xy=xy, descriptors=descriptors)
-            if board is not None:
-                board.look(frame.index, np.asarray(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB), np.uint8))
+            if self._board is not None:
+                self._board.look(frame.index, np.asarray(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB), np.uint8))
             if len(picked) % max(1, len(rows) // EDGE_FRAMES) == 0:
                 self._edges[frame.index] = find_edges(_gray(seen))
             counts.append(len(xy))
             picked.append(frame.index)
             self._progress("features", len(picked), len(rows))
-        refuse_features(self._film.path, counts)
+        refusals.refuse_features(self._film.path, counts)
         return picked
 
     def _frames(self, wanted: set[int]) -> Iterator[FilmFrame]:
@@ -302,115 +279,80 @@ class _Import:
             if frame.index >= last:
                 return
 
-    def _run_colmap(self) -> colmap.Outcome:
-        request = self._lens.request(self._film)
-        (self._folder / colmap.REQUEST).write_bytes(msgspec.json.encode(request))
-        errors = self._folder / "stderr.txt"
-        command = [sys.executable, "-I", "-m", colmap.__name__, str(self._folder)]
-        with errors.open("wb") as stderr:
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr)
-            try:
-                assert process.stdout is not None
-                for line in process.stdout:
-                    what, done, total = line.decode().split()
-                    self._progress(what, int(done), int(total))
-                code = process.wait()
-            finally:
-                process.kill()  # after Ctrl-C; one that has ended does not mind
-                process.wait()
-                if process.stdout is not None:
-                    process.stdout.close()
-        if code:
-            said = errors.read_text("utf-8", "replace").strip().splitlines()
-            raise ImportSourceError(
-                f"{self._film.path}: pycolmap ended with exit code {code}: {said[-1] if said else 'it said nothing'}"
-            )
-        return msgspec.json.decode((self._folder / colmap.RESULT).read_bytes(), type=colmap.Outcome)
-
-    def _judge(self, outcome: colmap.Outcome, look: FilmLook, picked: list[int]) -> tuple[list[ColmapModel], float]:
-        """Models of the best attempt, the largest first, and the mean reprojection error of that one.
+    def _map(self, picked: list[int]) -> tuple[colmap.ColmapModel, float]:
+        """The largest model of the best attempt, and its mean reprojection error.
 
         Raises:
-            ImportSourceError: see ``refuse_outcome``.
+            ImportSourceError: see ``refusals``.
         """
-        film, best = self._film, outcome.attempts[colmap.best_attempt(outcome.attempts)]
-        models = [read_model(self._folder / model.folder) for model in best.models]
+
+        def progress(line: str) -> None:
+            what, done, total = line.split()
+            self._progress(what, int(done), int(total))
+
+        film = self._film
+        (self._folder / colmap.REQUEST).write_bytes(msgspec.json.encode(self._lens.request(film)))
+        colmap.run_colmap(film.path, [self._folder], progress)
+        outcome = msgspec.json.decode((self._folder / colmap.RESULT).read_bytes(), type=colmap.Outcome)
+        models = [colmap.read_model(self._folder / model.folder) for model in outcome.best.models]
         spans = [[int(image.name) for image in model.images] for model in models]
-        times = [_seconds(look, index) for index in picked]
-        refuse_outcome(film.path, outcome, times, spans)
+        times = [self._seconds(index) for index in picked]
+        refusals.refuse_outcome(film.path, outcome, times, spans)
         angle_deg = _parallax_deg(models[0])
-        if angle_deg < LEAST_ANGLE_DEG:
-            raise ImportSourceError(f"{film.path}: {TURNING}")
-        self._notices += baseline_notes(best.ahead, angle_deg, outcome.focal_sigma)
+        if angle_deg < refusals.LEAST_ANGLE_DEG:
+            raise ImportSourceError(f"{film.path}: {refusals.TURNING}")
+        self._notices += refusals.baseline_notes(outcome.best.ahead, angle_deg, outcome.focal_sigma)
         if outcome.focal is not None and self._lens.measured is not None:
             given_px = self._lens.measured.fx * film.full_width / film.width
-            self._notices += focal_note(film.path, self._options.calibration, given_px, outcome.focal)
-        for span in spans[1:]:
-            if len(span) >= colmap.MIN_MODEL_IMAGES:
-                self._notices.append(
-                    f"the part from {times[min(span)]:.1f} to {times[max(span)]:.1f} s ({counted(len(span), 'view')}) "
-                    "does not hang together with the rest and is left out; import it as a film of its own"
-                )
-        return models, best.models[0].error_px
+            self._notices += refusals.focal_note(film.path, self._options.calibration, given_px, outcome.focal)
+        self._notices += [
+            f"the part from {times[min(span)]:.1f} to {times[max(span)]:.1f} s ({counted(len(span), 'view')}) "
+            "does not hang together with the rest and is left out; import it as a film of its own"
+            for span in spans[1:]
+            if len(span) >= colmap.MIN_MODEL_IMAGES
+        ]
+        return models[0], outcome.best.models[0].error_px
 
-    def _orient(
-        self, models: list[ColmapModel], look: FilmLook, picked: list[int], board: BoardScale | None
-    ) -> tuple[_Registered, str, float | None]:
-        """The largest model with z up, in metres, its floor at 0; how its scale was found; the camera's height."""
-        model = models[0]
+    def _place(self, model: colmap.ColmapModel, picked: list[int]) -> _Scene:
+        """The model with z up, in metres where that is known, its floor at 0."""
         seen = model.cameras[model.images[0].camera_id]
         frames: dict[int, RegisteredFrame] = {}
-        xy: dict[int, Float64] = {}
         for image in model.images:
-            index = picked[int(image.name)]
-            errors_px = np.array([model.errors_px.get(int(p), np.inf) for p in image.point_ids])
-            good = errors_px < MAX_POINT_ERROR_PX
-            xyz = np.array([model.points[int(p)] for p in image.point_ids[good]]).reshape(-1, 3)
-            xy[index] = image.xy[good]
-            frames[index] = RegisteredFrame(image.T_world_camera, xyz)
-        poses = {index: frame.T_world_camera for index, frame in frames.items()}
-        guess = camera_up(np.stack(list(poses.values())))
-        up = vertical(self._edges, poses, seen, guess)
+            exact = model.errors_px[image.points] < MAX_POINT_ERROR_PX
+            xyz = model.xyz[image.points[exact]]
+            frames[picked[int(image.name)]] = RegisteredFrame(image.T_world_camera, image.xy[exact], xyz)
+        guess = camera_up(np.stack([frame.T_world_camera for frame in frames.values()]))
+        up = vertical(self._edges, _poses(frames), seen, guess)
         if up is None:
             self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
         frames = _moved(frames, upright(frames[min(frames)].T_world_camera, guess if up is None else up), 1.0)
         frames = _moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values())))
-        self._gps = self._place_by_gps(frames)
-        if self._gps is not None:
-            fit, scale = self._gps, str(self._gps)
+        fit = None
+        if self._options.scale == ScaleHint():
+            try:
+                positions = [self._film.position(index) for index in frames]
+                fit = place_by_gps(np.stack([frame.T_world_camera for frame in frames.values()]), positions)
+            except ImportSourceError as error:
+                self._notices.append(f"GPS is not used: {error}")
+        if fit is not None:
             T_world_model = fit.T_world_model.copy()
             T_world_model[:3, 3] /= fit.scale
             frames = _moved(frames, T_world_model, fit.scale)
-        else:
-            factor, scale = self._scale(_Registered(frames, xy, seen), look, board)
-            frames = _moved(frames, np.eye(4), factor)
+            return _Scene(frames, seen, str(fit), _floor_and_height(frames)[1], str(fit.origin))
+        factor, scale = self._scale(frames, seen)
+        frames = _moved(frames, np.eye(4), factor)
         floor, height = _floor_and_height(frames)
-        if floor is not None and self._gps is None:
-            down = np.eye(4)
-            down[2, 3] = -floor
-            frames = _moved(frames, down, 1.0)
-        return _Registered(frames, xy, seen), scale, height
+        down = np.eye(4)
+        down[2, 3] = -floor
+        return _Scene(_moved(frames, down, 1.0), seen, scale, height, "")
 
-    def _place_by_gps(self, frames: dict[int, RegisteredFrame]) -> GpsFit | None:
-        """Where the pictures' positions put the model, unless a scale is given; None = they do not say."""
-        if self._options.scale != ScaleHint():
-            return None
-        try:
-            return place_by_gps(
-                np.stack([frame.T_world_camera for frame in frames.values()]),
-                [self._film.position(index) for index in frames],
-            )
-        except ImportSourceError as error:
-            self._notices.append(f"GPS is not used: {error}")
-            return None
-
-    def _scale(self, registered: _Registered, look: FilmLook, board: BoardScale | None) -> tuple[float, str]:
+    def _scale(self, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics) -> tuple[float, str]:
         """Metres per unit, and how they were found; empty = they were not."""
-        hint, frames = self._options.scale, registered.frames
+        hint = self._options.scale
         if hint.factor is not None:
             return hint.factor, f"given: {hint.factor:g} m per unit"
-        if board is not None:
-            return board.metres_per_unit({i: f.T_world_camera for i, f in frames.items()}, registered.seen)
+        if self._board is not None:
+            return self._board.metres_per_unit(_poses(frames), seen)
         if hint.camera_height_m is not None:
             _, height = _floor_and_height(frames)
             if height is None:
@@ -420,122 +362,100 @@ class _Import:
                 )
             return hint.camera_height_m / height, f"camera {hint.camera_height_m:g} m over the floor that was found"
         if hint.distance is not None:
-            a, b = (self._marked_place(mark, registered, look) for mark in (hint.distance.a, hint.distance.b))
+            *marks, metres = hint.distance
+            a, b = (self._marked_place(mark, frames, seen) for mark in marks)
             found = float(np.linalg.norm(a - b))
             if found < 1e-6:
                 raise ImportSourceError("the two marked points are one; mark two that are far apart")
-            return hint.distance.metres / found, f"two marked points, {hint.distance.metres:g} m apart"
+            return metres / found, f"two marked points, {metres:g} m apart"
         self._notices.append(
             "the scale is unknown: lengths of the log are not metres. Give one of --scale, --distance, --square-mm "
             "(with a printed board in the film) or --camera-height"
         )
         return 1.0, ""
 
-    def _check_mark(self, mark: Mark, look: FilmLook) -> None:
+    def _check_mark(self, mark: Mark) -> None:
         """Refuse a mark outside of the film, before the long work begins."""
-        film, last_s = self._film, look.stamp_ns[-1] / 1e9
-        if mark.time_s > last_s + 0.5 / film.hz:
+        film, last_s = self._film, self._look.stamp_ns[-1] / 1e9
+        inside = 0 <= mark.u < film.full_width and 0 <= mark.v < film.full_height
+        if not inside or mark.time_s > last_s + 0.5 / film.hz:
             raise ImportSourceError(
-                f"{film.path}: --distance marks a point at {mark.time_s:g} s, and the last frame is at {last_s:.2f} s; "
-                "give times within the film"
-            )
-        if not (0 <= mark.u < film.full_width and 0 <= mark.v < film.full_height):
-            raise ImportSourceError(
-                f"{film.path}: --distance marks the pixel {mark.u:g},{mark.v:g}, outside of the film's "
-                f"{film.full_width}x{film.full_height}"
+                f"{film.path}: --distance marks {mark.time_s:g}:{mark.u:g},{mark.v:g}, outside of the film's "
+                f"{film.full_width}x{film.full_height} pixels, or after its last frame at {last_s:.2f} s"
             )
 
-    def _marked_place(self, mark: Mark, registered: _Registered, look: FilmLook) -> Float64:
-        ratio = self._film.width / self._film.full_width
-        seen = Mark(mark.time_s, *self._lens.seen_pixel(mark.u * ratio, mark.v * ratio))
-        row = nearest_frame(mark.time_s, look.stamp_ns)
-        way = look.way
-        order = sorted(registered.frames)
+    def _marked_place(self, mark: Mark, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics) -> Float64:
+        look, ratio = self._look, self._film.width / self._film.full_width
+        row = int(np.argmin(np.abs(look.stamp_ns - 1e9 * mark.time_s)))
+        order = sorted(frames)
         rows = np.searchsorted(look.index, order)
-        near = [_seconds(look, order[n]) for n in np.argsort(np.abs(rows - row), kind="stable")[:4]]
-        if np.abs(way[rows] - way[row]).min() > FOLLOWED:
+        if np.abs(look.way[rows] - look.way[row]).min() > FOLLOWED:
+            near = sorted(self._seconds(order[n]) for n in np.argsort(np.abs(rows - row), kind="stable")[:4])
             raise ImportSourceError(
                 f"{self._film.path}: --distance marks a point at {mark.time_s:g} s, where the camera's place was not "
-                f"found; mark it at another time, such as {', '.join(f'{s:.2f}' for s in sorted(near))} s"
+                f"found; mark it at another time, such as {', '.join(f'{s:.2f}' for s in near)} s"
             )
-        at = int(np.searchsorted(rows, row))
-        marked = int(look.index[row])
+        at, marked = int(np.searchsorted(rows, row)), int(look.index[row])
         chosen = {marked, *order[max(0, at - NEIGHBOURS) : at + NEIGHBOURS + 1]}
         pictures = {f.index: _gray(self._lens.seen(f.bgr)) for f in self._frames(chosen)}
-        poses = {index: frame.T_world_camera for index, frame in registered.frames.items()}
-        return marked_place(seen, marked, pictures, poses, registered.seen)
+        pixel = Mark(mark.time_s, *self._lens.seen_pixel(mark.u * ratio, mark.v * ratio))
+        return marked_place(pixel, marked, pictures, _poses(frames), seen)
 
-    def _write(
-        self,
-        dst: Path,
-        look: FilmLook,
-        picked: list[int],
-        registered: _Registered,
-        scale: str,
-        height_m: float | None,
-        error_px: float,
-        *,
-        overwrite: bool,
-    ) -> FilmReport:
-        film = self._film
+    def _write(self, dst: Path, picked: list[int], scene: _Scene, error_px: float, *, overwrite: bool) -> FilmReport:
+        film, look = self._film, self._look
         try:
-            rectify = self._lens.rectify or Rectifier(registered.seen)
+            rectify = self._lens.rectify or Rectifier(scene.seen)
         except ConfigError as error:
             raise ImportSourceError(f"{film.path}: the lens that was found cannot be undone: {error}") from error
-        chooser = _Chooser(look, set(picked), registered)
-        info = StreamInfo(
-            source=f"film {film.path.resolve().name}",
-            cameras={CAMERA_ID: rectify.intrinsics},
-            frame_hz=film.hz,
-            metadata={
-                "poses": "structure from motion",
-                SCALE_KEY: scale or SCALE_UNKNOWN,
-                **scene_depth(median_depth(list(registered.frames.values()))),
-                "stamps": "time within the film",
-            }
-            | ({} if self._gps is None else {ORIGIN_KEY: str(self._gps.origin)}),
-        )
+        metadata = {
+            "poses": "structure from motion",
+            SCALE_KEY: scene.scale or SCALE_UNKNOWN,
+            **scene_depth(median_depth(list(scene.frames.values()))),
+            "stamps": "time within the film",
+            **({ORIGIN_KEY: scene.origin} if scene.origin else {}),
+        }
+        cameras = {CAMERA_ID: rectify.intrinsics}
+        info = StreamInfo(f"film {film.path.resolve().name}", cameras, frame_hz=film.hz, metadata=metadata)
         poses: list[Float64] = []
-        left_out: list[LeftOut] = []
+        reasons: list[tuple[str, float]] = []  # why each frame is left out, empty where it is not; and its time
         pictures: list[tuple[float, UInt8]] = []
-        focal_px = registered.seen.fx * film.full_width / film.width
+        focal_px = scene.seen.fx * film.full_width / film.width
         shown = set(np.linspace(0, len(look.index) - 1, 14).astype(int)[1:-1].tolist())
         with atomic_log(dst, info, options=PACKING, overwrite=overwrite) as writer:
-            last = ""
-            for row, frame in enumerate(film):
+            for row, (frame, pose, reason) in enumerate(self._posed(set(picked), scene)):
                 self._progress("write", row + 1, len(look.index))
                 seconds = frame.stamp_ns / 1e9
-                pose, reason = chooser.pose(row, frame, self._lens)
                 if pose is not None:
                     rgb = rectify(frame.bgr)
-                    reason = _written(writer, frame, rgb, rectify.intrinsics, pose)
-                    if not reason:
+                    try:
+                        writer.write_frame(_log_frame(frame, rgb, rectify.intrinsics, pose))
+                    except FrameError as error:
+                        reason = str(error)
+                    else:
                         poses.append(pose)
                         if shown and row >= min(shown):
                             shown = {s for s in shown if s > row}
                             pictures.append((seconds, rgb))
-                if reason and reason == last:
-                    left_out[-1] = replace(left_out[-1], end_s=seconds, frames=left_out[-1].frames + 1)
-                elif reason:
-                    left_out.append(LeftOut(reason, seconds, seconds, 1))
-                last = reason
-            note = FilmNote(len(look.index), _counts(left_out), len(picked), len(registered.frames), error_px, focal_px)
+                reasons.append((reason, seconds))
+            counts = dict(Counter(reason for reason, _ in reasons if reason))
+            note = FilmNote(len(look.index), counts, len(picked), len(scene.frames), error_px, focal_px)
             writer.attach(note.attachment())
         self._notices += [f"{file.name} {reason}; it is left out" for file, reason in film.odd_pictures.items()]
-        xyz = np.unique(np.concatenate([frame.xyz for frame in registered.frames.values()]), axis=0)
+        xyz = np.unique(np.concatenate([frame.xyz for frame in scene.frames.values()]), axis=0)
+        runs = [(reason, [s for _, s in run]) for reason, run in groupby(reasons, key=lambda item: item[0])]
         return FilmReport(
             film=film.path,
             looked_at=len(look.index),
             picked=len(picked),
-            registered=len(registered.frames),
-            left_out=tuple(left_out),
+            registered=len(scene.frames),
+            left_out=tuple(LeftOut(reason, s[0], s[-1], len(s)) for reason, s in runs if reason),
             error_px=error_px,
             points=len(xyz),
             focal_px=focal_px,
             focal_source=self._lens.source,
-            distortion=(self._lens.measured or registered.seen).distortion,
-            scale=scale,
-            height_m=height_m,
+            distortion=(self._lens.measured or scene.seen).distortion,
+            scale=scene.scale,
+            height_m=scene.height_m,
             T_world_camera=np.stack(poses),
             xyz=xyz[np.random.default_rng(0).permutation(len(xyz))[:MAX_POINTS]],
             notices=tuple(self._notices),
@@ -544,67 +464,54 @@ class _Import:
             bytes=dst.stat().st_size,
         )
 
+    def _posed(self, picked: set[int], scene: _Scene) -> Iterator[tuple[FilmFrame, Float64 | None, str]]:
+        """All frames of the film, with T_world_camera (4, 4) of those of the log, or why they are left out."""
+        look, ways, blurred = self._look, self._look.way.tolist(), self._look.blurred
+        fill = max(FILL, ways[-1] / MAX_FRAMES)
+        anchor: tuple[UInt8, RegisteredFrame, float] | None = None  # the last registered frame, and how far the way was
+        last_way, last_ns = -np.inf, -(1 << 62)
+        for row, (frame, way) in enumerate(zip(self._film, ways, strict=True)):
+            registered = scene.frames.get(frame.index)
+            moved, since_ns = way - last_way, frame.stamp_ns - last_ns
+            wanted = moved >= fill or (since_ns >= FILL_NS and moved >= FILL_LEAST)
+            pose, reason = None, ""
+            if registered is not None:
+                anchor = _gray(self._lens.seen(frame.bgr)), registered, way
+                pose = registered.T_world_camera
+            elif look.dark[row]:
+                reason = "shows nothing"
+            elif blurred[row]:
+                reason = "blurred"
+            elif not wanted and frame.index not in picked:
+                reason = "moved too little"
+            else:
+                if anchor is not None and way - anchor[2] <= FOLLOWED:
+                    pose = follow_pose(*anchor[:2], _gray(self._lens.seen(frame.bgr)), scene.seen)
+                reason = "its place was not found" if pose is None else ""
+            if pose is not None:
+                last_way, last_ns = way, frame.stamp_ns
+            yield frame, pose, reason
 
-def _written(writer: LogWriter, frame: FilmFrame, rgb: UInt8, intrinsics: CameraIntrinsics, pose: Float64) -> str:
-    """Write a frame; why it cannot be written, else empty."""
-    try:
-        writer.write_frame(
-            PosedFrame(
-                stamp_ns=frame.stamp_ns,
-                seq=frame.index,
-                camera_id=CAMERA_ID,
-                rgb=rgb,
-                depth_m=None,
-                label=None,
-                intrinsics=intrinsics,
-                T_world_camera=pose,
-                pose_source="sfm",
-            )
-        )
-    except FrameError as error:
-        return str(error)
-    return ""
+    def _seconds(self, index: int) -> float:
+        return float(self._look.stamp_ns[np.searchsorted(self._look.index, index)]) / 1e9
 
 
-class _Chooser:
-    """Which frames come into the log, and with which pose; frames come in order."""
+def _log_frame(frame: FilmFrame, rgb: UInt8, intrinsics: CameraIntrinsics, pose: Float64) -> PosedFrame:
+    return PosedFrame(
+        stamp_ns=frame.stamp_ns,
+        seq=frame.index,
+        camera_id=CAMERA_ID,
+        rgb=rgb,
+        depth_m=None,
+        label=None,
+        intrinsics=intrinsics,
+        T_world_camera=pose,
+        pose_source="sfm",
+    )
 
-    def __init__(self, look: FilmLook, picked: set[int], registered: _Registered) -> None:
-        self._look, self._picked, self._registered = look, picked, registered
-        self._way, self._blurred = look.way, look.blurred
-        self._fill = max(FILL, float(self._way[-1]) / MAX_FRAMES)
-        self._anchor: Anchor | None = None
-        self._anchor_way = self._last_way = -np.inf
-        self._last_ns = -(1 << 62)
 
-    def pose(self, row: int, frame: FilmFrame, lens: _Lens) -> tuple[Float64 | None, str]:
-        """T_world_camera (4, 4) of a frame of the log; or None and why it is left out."""
-        way = float(self._way[row])
-        registered = self._registered.frames.get(frame.index)
-        if registered is not None:
-            self._anchor = Anchor(
-                _gray(lens.seen(frame.bgr)), self._registered.xy[frame.index], registered.xyz, registered.T_world_camera
-            )
-            self._anchor_way = way
-            return self._taken(registered.T_world_camera, way, frame.stamp_ns), ""
-        if self._look.dark[row]:
-            return None, "shows nothing"
-        if self._blurred[row]:
-            return None, "blurred"
-        moved, since_ns = way - self._last_way, frame.stamp_ns - self._last_ns
-        wanted = moved >= self._fill or (since_ns >= FILL_NS and moved >= FILL_LEAST)
-        if not wanted and frame.index not in self._picked:
-            return None, "moved too little"
-        if self._anchor is None or way - self._anchor_way > FOLLOWED:
-            return None, "its place was not found"
-        pose = follow_pose(self._anchor, _gray(lens.seen(frame.bgr)), self._registered.seen)
-        if pose is None:
-            return None, "its place was not found"
-        return self._taken(pose, way, frame.stamp_ns), ""
-
-    def _taken(self, pose: Float64, way: float, stamp_ns: int) -> Float64:
-        self._last_way, self._last_ns = way, stamp_ns
-        return pose
+def _poses(frames: dict[int, RegisteredFrame]) -> dict[int, Float64]:
+    return {index: frame.T_world_camera for index, frame in frames.items()}
 
 
 def _moved(frames: dict[int, RegisteredFrame], T: Float64, scale: float) -> dict[int, RegisteredFrame]:
@@ -613,26 +520,26 @@ def _moved(frames: dict[int, RegisteredFrame], T: Float64, scale: float) -> dict
     for index, frame in frames.items():
         pose = T @ frame.T_world_camera
         pose[:3, 3] *= scale
-        result[index] = RegisteredFrame(pose, scale * transform(T, frame.xyz))
+        result[index] = RegisteredFrame(pose, frame.xy, scale * transform(T, frame.xyz))
     return result
 
 
-def _floor_and_height(frames: dict[int, RegisteredFrame]) -> tuple[float | None, float | None]:
-    """z of the floor, where z is up, and the camera's median height over it; None if no floor is found."""
+def _floor_and_height(frames: dict[int, RegisteredFrame]) -> tuple[float, float | None]:
+    """z of the floor, where z is up, and the camera's median height over it; 0 and None if no floor is found."""
     camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames.values()]))
     floor = floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames.values()]), camera_z)
-    return floor, None if floor is None else camera_z - floor
+    return (0.0, None) if floor is None else (floor, camera_z - floor)
 
 
-def _parallax_deg(model: ColmapModel) -> float:
+def _parallax_deg(model: colmap.ColmapModel) -> float:
     """Median over the points of the largest angle between two of the rays that they are seen by."""
     centers: dict[int, list[Float64]] = {}
     for image in model.images:
-        for point in image.point_ids[image.point_ids >= 0].tolist():
+        for point in image.points.tolist():
             centers.setdefault(point, []).append(image.T_world_camera[:3, 3])
     angles: list[float] = []
     for point in sorted(centers)[:: max(1, len(centers) // 2000)]:
-        rays = model.points[point] - np.stack(centers[point])
+        rays = model.xyz[point] - np.stack(centers[point])
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         angles.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))))
     return float(np.median(angles)) if angles else 0.0
@@ -640,7 +547,3 @@ def _parallax_deg(model: ColmapModel) -> float:
 
 def _gray(bgr: UInt8) -> UInt8:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def _seconds(look: FilmLook, index: int) -> float:
-    return float(look.stamp_ns[np.searchsorted(look.index, index)]) / 1e9

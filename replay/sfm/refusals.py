@@ -7,14 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.sfm.colmap_process import (
-    LINK_MATCHES,
-    UNKNOWN_FOCAL,
-    FocalCheck,
-    Outcome,
-    only_turns,
-    turn_fraction,
-)
+from semantic_mapper.replay.sfm.colmap import LINK_MATCHES, UNKNOWN_FOCAL, FocalCheck, Outcome, turn_fraction
 from semantic_mapper.replay.sfm.film import FilmLook
 
 LEAST_PICKS = 8
@@ -37,20 +30,15 @@ TURNING = (
 
 
 def refuse_look(film: object, look: FilmLook, picks: int) -> None:
-    """Refuse a film by the first look at it.
-
-    Raises:
-        ImportSourceError: dark, still, or too short.
-    """
+    """Raises ImportSourceError where the first look at a film shows that it is dark, still, or too short."""
     count = len(look.index)
     if not count:
         raise ImportSourceError(f"{film}: holds no frame that can be decoded; copy or convert it again")
-    dark = float(look.dark.mean())
+    dark, seconds = float(look.dark.mean()), (look.stamp_ns[-1] - look.stamp_ns[0]) / 1e9
     if dark > MOST_DARK:
         raise ImportSourceError(
             f"{film}: {100 * dark:.0f} % of its frames are black or show nothing; is the lens covered? {_HOW}"
         )
-    seconds = (look.stamp_ns[-1] - look.stamp_ns[0]) / 1e9
     way = float(np.nansum(look.motion))
     if way < STILL and count >= LEAST_PICKS and np.isfinite(look.motion).mean() > 0.5:
         raise ImportSourceError(
@@ -66,11 +54,7 @@ def refuse_look(film: object, look: FilmLook, picks: int) -> None:
 
 
 def refuse_features(film: object, features: Sequence[int]) -> None:
-    """Refuse a film whose frames have nothing that can be found again.
-
-    Raises:
-        ImportSourceError: blurred, or without texture.
-    """
+    """Raises ImportSourceError for a film whose frames have too few features to be found again."""
     found = float(np.median(features))
     if found < LEAST_FEATURES:
         raise ImportSourceError(
@@ -80,42 +64,40 @@ def refuse_features(film: object, features: Sequence[int]) -> None:
 
 
 def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spans: Sequence[Sequence[int]]) -> None:
-    """Refuse what structure from motion could not put together.
+    """Raises ImportSourceError for what structure from motion could not put together.
 
     Args:
         film: Its name.
-        outcome: Of the process.
+        outcome: Of the mapping.
         times_s: Of the picked frames.
         spans: Places in the sequence of the frames of each model of the best attempt, the largest first.
-
-    Raises:
-        ImportSourceError: nothing matches, the camera only turns, or the film falls apart.
     """
     picks = len(times_s)
     complete = bool(spans) and len(spans[0]) >= LEAST_MODEL * picks
     linked = {p.second for p in outcome.pairs if p.matches >= LINK_MATCHES and p.second - p.first == 1}
+    reason = ""
     if len(linked) < LEAST_LINKED * (picks - 1) and not complete:
-        raise ImportSourceError(
-            f"{film}: its pictures do not match each other: {len(linked)} of {picks - 1} neighbours show the same "
-            f"place; the camera moves too fast, or what it sees changes or has no texture; {_HOW}"
+        reason = (
+            f"its pictures do not match each other: {len(linked)} of {picks - 1} neighbours show the same place; the "
+            f"camera moves too fast, or what it sees changes or has no texture; {_HOW}"
         )
-    # What models a camera that turns gives are noise.
-    if turn_fraction(outcome.pairs) >= MOST_TURNED or (not complete and only_turns(outcome.pairs)):
-        raise ImportSourceError(f"{film}: {TURNING}")
-    if not spans:
-        raise ImportSourceError(
-            f"{film}: no two of its pictures show one place from two sides far enough apart; give --calibration or "
+    elif turn_fraction(outcome.pairs) >= MOST_TURNED or (
+        not complete and turn_fraction(outcome.pairs, flat=True) >= 0.5
+    ):
+        reason = TURNING  # what models a camera that turns gives are noise
+    elif not spans:
+        reason = (
+            "no two of its pictures show one place from two sides far enough apart; give --calibration or "
             f"--focal-prior where the lens is unusual, film a longer way, or {_HOW}"
         )
-    if not complete:
-        listed = "; ".join(
-            f"{times_s[min(span)]:.1f} to {times_s[max(span)]:.1f} s ({len(span)} of {picks} views)"
-            for span in spans[:4]
-        )
-        raise ImportSourceError(
-            f"{film}: falls into parts that do not hang together: {listed}; cut it into one film for each scene, or "
+    elif not complete:
+        parts = [f"{times_s[min(s)]:.1f} to {times_s[max(s)]:.1f} s ({len(s)} of {picks} views)" for s in spans[:4]]
+        reason = (
+            f"falls into parts that do not hang together: {'; '.join(parts)}; cut it into one film for each scene, or "
             "film again a longer way, without cuts and fast turns"
         )
+    if reason:
+        raise ImportSourceError(f"{film}: {reason}")
 
 
 def focal_note(film: object, calibration: object, focal_px: float, check: FocalCheck) -> list[str]:
@@ -158,12 +140,10 @@ def baseline_notes(ahead: bool, angle_deg: float, focal_sigma: float | None) -> 
             f"from less than {angle_deg:.1f} degrees apart, so their depths are uncertain"
         )
     if focal_sigma is not None and focal_sigma > UNSURE_FOCAL:
-        percent = f"{100 * focal_sigma:.2g} %"
-        found = f"is exact to {percent} only"
-        if focal_sigma > UNKNOWN_FOCAL:
-            found = f"is assumed: by the film alone it is exact to {percent}"
+        assumed = "assumed: by the film alone it is " if focal_sigma > UNKNOWN_FOCAL else ""
         notes.append(
-            f"the focal length {found}; a straight way fits many nearly as well, and lengths along it against those "
-            "across are off by as much; calibrate the camera and give --calibration"
+            f"the focal length is {assumed}exact to {100 * focal_sigma:.2g} % only; a straight way fits many nearly as "
+            "well, and lengths along it against those across are off by as much; calibrate the camera and give "
+            "--calibration"
         )
     return notes

@@ -17,9 +17,9 @@ from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.replay.sfm.between import track
+from semantic_mapper.replay.sfm.between import RegisteredFrame, track
 from semantic_mapper.transport.messages import SCENE_DEPTH_KEY, StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float64, UInt8
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 
@@ -44,30 +44,17 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class MarkedDistance:
-    """Two marked points, and how far apart they are in metres."""
-
-    a: Mark
-    b: Mark
-    metres: float
-
-
-@dataclass(frozen=True, slots=True)
 class ScaleHint:
     """What tells the size of the scene; the first of these that is given."""
 
     factor: float | None = None  # metres per unit of the log that comes without a scale
-    distance: MarkedDistance | None = None
+    distance: tuple[Mark, Mark, float] | None = None  # two marked points, and how far apart they are in metres
     board: BoardPoses | None = None  # a printed board that is seen in the film
     camera_height_m: float | None = None  # of the camera over the floor, the median over the film
 
 
-def parse_distance(text: str) -> MarkedDistance:
-    """``"T:U,V T:U,V METRES"``: seconds within the film, pixel, twice, and the distance of what they show.
-
-    Raises:
-        ConfigError: another form.
-    """
+def parse_distance(text: str) -> tuple[Mark, Mark, float]:
+    """``ScaleHint.distance`` of ``"T:U,V T:U,V METRES"``; ConfigError for another form."""
     number = r"(\d+(?:\.\d+)?)"
     found = re.fullmatch(rf"\s*{number}:{number},{number}\s+{number}:{number},{number}\s+{number}\s*", text)
     if found is None or float(found[7]) <= 0:
@@ -75,24 +62,12 @@ def parse_distance(text: str) -> MarkedDistance:
             f"'{text}' marks no distance: write 'SECONDS:U,V SECONDS:U,V METRES', such as '3.2:310,220 3.2:560,231 0.9'"
         )
     a, b, c, d, e, f, metres = map(float, found.groups())
-    return MarkedDistance(Mark(a, b, c), Mark(d, e, f), metres)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RegisteredFrame:
-    """A frame of the model."""
-
-    T_world_camera: Float64  # (4, 4)
-    xyz: Float64  # (N, 3) the points that it sees, in the world
+    return Mark(a, b, c), Mark(d, e, f), metres
 
 
 def upright(T_world_first: Float64, up: Float64) -> Float64:
-    """T_level_world (4, 4) of a world with z up, and the first camera at its origin, looking along x.
-
-    Args:
-        T_world_first: (4, 4) pose of the first camera.
-        up: (3,) unit direction in the present world.
-    """
+    """T_level_world (4, 4) of a world with z up, and the first camera at its origin, looking along x; ``up`` (3,) is a
+    unit direction in the present world."""
     ahead = T_world_first[:3, 2] if abs(T_world_first[:3, 2] @ up) < 0.95 else -T_world_first[:3, 1]
     x = ahead - (ahead @ up) * up
     x /= np.linalg.norm(x)
@@ -111,7 +86,7 @@ def median_depth(frames: Sequence[RegisteredFrame]) -> float:
 
 
 def scene_depth(depth: float) -> dict[str, str]:
-    """Metadata of a log whose poses come from pictures: the median depth of the points, in the unit of the poses."""
+    """Metadata of a log whose poses come from pictures: median depth of the points, in the unit of the poses."""
     return {SCENE_DEPTH_KEY: f"{depth:.3g}"} if depth > 0 else {}
 
 
@@ -196,11 +171,7 @@ class BoardScale:
             self._seen.append((index, points, pixels))
 
     def metres_per_unit(self, poses: Mapping[int, Float64], intrinsics: CameraIntrinsics) -> tuple[float, str]:
-        """Scale, and a sentence on how it was found.
-
-        Args:
-            poses: T_world_camera by frame.
-            intrinsics: Of the frames.
+        """Scale by frames with poses T_world_camera, and a sentence on how it was found.
 
         Raises:
             ImportSourceError: the board was not seen from two sides by frames that have a pose.
@@ -239,12 +210,8 @@ def marked_place(
         intrinsics: Of all.
 
     Raises:
-        ImportSourceError: it lies outside of the picture, or cannot be followed.
+        ImportSourceError: it cannot be followed.
     """
-    if not (0 <= mark.u < intrinsics.width and 0 <= mark.v < intrinsics.height):
-        raise ImportSourceError(
-            f"the mark {mark.u:g},{mark.v:g} lies outside of the {intrinsics.width}x{intrinsics.height} pictures"
-        )
     order = sorted(pictures)
     at = order.index(marked)
     rays: list[tuple[Float64, Float64]] = []
@@ -265,11 +232,6 @@ def marked_place(
             "frames, from one side only; mark a corner with texture around it, at a time when the camera moves sideways"
         )
     return place
-
-
-def nearest_frame(time_s: float, stamps_ns: Int64) -> int:
-    """Row of the stamp (N,) that is nearest to a time within the film."""
-    return int(np.argmin(np.abs(stamps_ns - 1e9 * time_s)))
 
 
 MIN_LENGTH = 0.06  # of an edge, of the image's width
@@ -303,44 +265,42 @@ def vertical(
     """
     K, lens = camera_matrix(intrinsics), np.array(intrinsics.distortion or (0.0,) * 4)
     normals: list[Float64] = []
-    weights: list[Float64] = []
     for index, rows in edges.items():
-        if index not in poses or not len(rows):
-            continue
-        flat = cv2.undistortPoints(rows.reshape(-1, 1, 2), K, lens).reshape(-1, 2, 2)
-        rays = np.concatenate((flat, np.ones((*flat.shape[:2], 1))), axis=2)
-        across = np.cross(rays[:, 0], rays[:, 1])
-        length = np.linalg.norm(across, axis=1)
-        good = length > 1e-9
-        normals.append((across[good] / length[good, None]) @ poses[index][:3, :3].T)
-        weights.append(length[good])
-    if not normals or sum(map(len, normals)) < MIN_EDGES:
+        if index in poses and len(rows):
+            flat = cv2.undistortPoints(rows.reshape(-1, 1, 2), K, lens).reshape(-1, 2, 2)
+            rays = np.concatenate((flat, np.ones((*flat.shape[:2], 1))), axis=2)
+            normals.append(np.cross(rays[:, 0], rays[:, 1]) @ poses[index][:3, :3].T)
+    planes = np.concatenate([np.zeros((0, 3)), *normals])
+    weight = np.linalg.norm(planes, axis=1)
+    planes, weight = planes[weight > 1e-9] / weight[weight > 1e-9, None], weight[weight > 1e-9]
+    if len(planes) < MIN_EDGES:
         return None
-    planes, weight = np.concatenate(normals), np.concatenate(weights)
+
+    def near(directions: Float64) -> Bool:
+        """Which planes (N, D) directions (3, D) lie in."""
+        return np.abs(planes @ directions) < np.sin(np.radians(TOLERANCE_DEG))
+
     best = guess / np.linalg.norm(guess)
-    for cone, step in ((CONE_DEG, 1.5), (1.5, 0.25)):
-        directions = _cone(best, cone, step)
-        support = ((np.abs(planes @ directions.T) < np.sin(np.radians(TOLERANCE_DEG))) * weight[:, None]).sum(axis=0)
-        best = directions[int(np.argmax(support))]
+    for cone_deg, step_deg in ((CONE_DEG, 1.5), (1.5, 0.25)):
+        directions = _cone(best, cone_deg, step_deg)
+        best = directions[int(np.argmax(weight @ near(directions.T)))]
     for _ in range(5):
-        near = np.abs(planes @ best) < np.sin(np.radians(TOLERANCE_DEG))
-        if near.sum() < 8:
+        agree = near(best)
+        if agree.sum() < 8:
             return None
-        _, axes = np.linalg.eigh((planes[near] * weight[near, None]).T @ planes[near])
+        _, axes = np.linalg.eigh((planes[agree] * weight[agree, None]).T @ planes[agree])
         best = axes[:, 0] * np.sign(axes[:, 0] @ best)
-    near = np.abs(planes @ best) < np.sin(np.radians(TOLERANCE_DEG))
-    return best if weight[near].sum() > MIN_SUPPORT * weight.sum() else None
+    return best if weight[near(best)].sum() > MIN_SUPPORT * weight.sum() else None
 
 
 def _cone(axis: Float64, half_deg: float, step_deg: float) -> Float64:
     """Unit directions (N, 3) within an angle of an axis, about a step apart; the axis comes first."""
     side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     side /= np.linalg.norm(side)
-    other = np.cross(axis, side)
     rows = [axis]
     for tilt in np.radians(np.arange(step_deg, half_deg + 1e-9, step_deg)):
         count = max(6, int(np.ceil(2 * np.pi * np.sin(tilt) / np.radians(step_deg))))
-        turn = np.arange(count) * 2 * np.pi / count
-        ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other
+        turn = np.arange(count)[:, None] * 2 * np.pi / count
+        ring = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
         rows += list(np.cos(tilt) * axis + np.sin(tilt) * ring)
     return np.stack(rows)

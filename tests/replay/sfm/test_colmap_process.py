@@ -10,8 +10,9 @@ import pytest
 
 from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import look_at, transform
-from semantic_mapper.replay.sfm import colmap_process as colmap
-from semantic_mapper.replay.sfm.colmap_model import read_model
+from semantic_mapper.replay.sfm import colmap
+from semantic_mapper.replay.sfm.colmap import read_model
+from semantic_mapper.replay.sfm.colmap_process import main
 from semantic_mapper.types import Float64
 
 W, H, FOCAL, FRAMES = 640, 360, 400.0, 10
@@ -45,7 +46,7 @@ def reconstruct(folder: Path, poses: Float64, camera: colmap.Camera) -> colmap.O
             folder / colmap.FEATURES / f"{n:06d}.npz", xy=xy[rows].astype(np.float32), descriptors=descriptors[rows]
         )
     (folder / colmap.REQUEST).write_bytes(msgspec.json.encode(camera))
-    colmap.main(folder)
+    main(folder)
     return msgspec.json.decode((folder / colmap.RESULT).read_bytes(), type=colmap.Outcome)
 
 
@@ -67,7 +68,7 @@ def test_a_camera_that_goes_straight_ahead_is_placed(tmp_path: Path) -> None:
 
 def test_a_straight_way_does_not_tell_the_focal_length_and_says_so(tmp_path: Path) -> None:
     outcome = reconstruct(tmp_path, AHEAD, colmap.Camera(W, H, None, (1.2 * FOCAL,)))
-    best = outcome.attempts[colmap.best_attempt(outcome.attempts)]
+    best = outcome.best
     assert best.ahead and best.models[0].images == FRAMES
     kept = next(iter(read_model(tmp_path / best.models[0].folder).cameras.values())).fx
     assert outcome.focal_sigma is not None and outcome.focal_sigma > colmap.UNKNOWN_FOCAL

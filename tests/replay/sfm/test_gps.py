@@ -105,9 +105,10 @@ def test_a_colmap_model_of_pictures_with_gps_comes_in_metres(tmp_path: Path) -> 
         angle_axis = cv2.Rodrigues(inverse[:3, :3])[0].ravel()
         half = np.linalg.norm(angle_axis) / 2
         q = (np.cos(half), *(np.sin(half) * angle_axis / (2 * half)))
-        lines += [f"{n} {' '.join(map(repr, map(float, (*q, *inverse[:3, 3]))))} 1 {n}.jpg", ""]
+        lines += [f"{n + 1} {' '.join(map(repr, map(float, (*q, *inverse[:3, 3]))))} 1 {n}.jpg", ""]
         tag(picture(folder / "images" / f"{n}.jpg"), positions_of(5 * model[:, :3, 3])[n])
     (folder / "sparse" / "0" / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "sparse" / "0" / "points3D.txt").write_text("")
     report, frames = imported(folder)
     assert report.info.scale_known and "GPS of 4 pictures" in " ".join(report.notices)
     steps = np.stack([f.T_world_camera[:3, 3] for f in frames]) - frames[0].T_world_camera[:3, 3]

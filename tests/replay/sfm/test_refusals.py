@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair
+from semantic_mapper.replay.sfm.colmap import FocalCheck, Outcome, Pair
 from semantic_mapper.replay.sfm.film import FilmLook
 from semantic_mapper.replay.sfm.refusals import (
     baseline_notes,

@@ -13,7 +13,6 @@ from semantic_mapper.geometry import invert_pose, look_at, project, transform
 from semantic_mapper.replay.sfm.scale import (
     BoardScale,
     Mark,
-    MarkedDistance,
     fit_to_scene,
     marked_place,
     parse_distance,
@@ -31,7 +30,7 @@ UP = np.eye(3)[2]
 
 
 def test_marked_distances_are_read() -> None:
-    assert parse_distance("3.2:310,220 14:5.5,7 0.9") == MarkedDistance(Mark(3.2, 310, 220), Mark(14, 5.5, 7), 0.9)
+    assert parse_distance("3.2:310,220 14:5.5,7 0.9") == (Mark(3.2, 310, 220), Mark(14, 5.5, 7), 0.9)
     for text in ("", "3:1,2 0.9", "3:1,2 4:1,2 0", "3:1,2 4:1,2 -1", "a:1,2 4:1,2 1"):
         with pytest.raises(ConfigError, match="marks no distance"):
             parse_distance(text)
