@@ -84,15 +84,11 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
 
     Source views of a frame are those that ``replay`` and ``eval`` choose: the frame itself and earlier keyframes, the
     frames that the weights were finetuned on among them. A label that is there stays, unless it is a pseudo label or
-    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none.
-
-    Raises:
-        ConfigError: the new log would lie among the parts of the old one.
-        LabelError: labels stay whose classes are not those of the weights.
-        LogError: the log cannot be read, the new one is there already or cannot be written, or no frame could be
-            rendered. Nothing is left of the new one.
-        WeightsError: there are no such weights, or they tell no classes apart.
-        KeyboardInterrupt: it was stopped; nothing is left of the new log, nor of images of things.
+    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Raises ConfigError: the new log
+    would lie among the parts of the old one. LabelError: labels stay whose classes are not those of the weights.
+    LogError: the log cannot be read, the new one is there already or cannot be written, or no frame could be rendered.
+    Nothing is left of the new one. WeightsError: there are no such weights, or they tell no classes apart.
+    KeyboardInterrupt: it was stopped; nothing is left of the new log, nor of images of things.
     """
     monitor = monitor or JobMonitor()
     with open_log(request.logs) as log, ExitStack() as stack:
@@ -371,14 +367,9 @@ def _rounded(metres: Float32, how: Callable[[Float32], Float32]) -> Float32:
 class InstanceImages:
     """Writes images of things, ``CAMERA/NNNNNN.png``: uint16 ids of boxes, 0 = none; none is there before ``finish``.
 
-    ``instances.json`` has each thing's id, class, box, and pixels by frame ("CAMERA/NNNNNN").
-
-    Args:
-        folder: New, or of an earlier run, whose images of the same frames are replaced.
-        field: Whose boxes they are of.
-
-    Raises:
-        LogError: the folder cannot be made.
+    ``instances.json`` has each thing's id, class, box, and pixels by frame ("CAMERA/NNNNNN"). ``folder``: new, or of an
+    earlier run, whose images of the same frames are replaced. ``field``: whose boxes they are of. Raises LogError: the
+    folder cannot be made.
     """
 
     def __init__(self, folder: Path, field: Panoptic) -> None:
@@ -393,10 +384,7 @@ class InstanceImages:
 
     def add(self, number: int, frame: PosedFrame, label: UInt8) -> None:
         """Write the things of a frame, by its number in the log; ``label`` (H, W) says where their classes are.
-
-        Raises:
-            LogError: it cannot be written.
-        """
+        Raises LogError: it cannot be written."""
         ids = thing_image(self._field, frame, label)
         name = f"{frame.camera_id}/{number:06d}"
         path = self._unfinished / f"{name}.png"
@@ -407,10 +395,7 @@ class InstanceImages:
 
     def finish(self) -> None:
         """Put all images in place, then the list of things.
-
-        Raises:
-            LogError: they cannot be written.
-        """
+        Raises LogError: they cannot be written."""
         things: list[dict[str, Any]] = [
             {"id": b.id, "class": b.class_name, "box": msgspec.to_builtins(b), "pixels": self._pixels[b.id]}
             for b in self._field.shape.boxes

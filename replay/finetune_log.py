@@ -91,11 +91,8 @@ class FinetuneResult(NamedTuple):
 
 def finetune_log(request: FinetuneRequest, monitor: JobMonitor | None = None) -> FinetuneResult:
     """Finetune on keyframes of a log and write the weights: after a stop request, the best so far.
-
-    Raises:
-        LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong, and what to do.
-        KeyboardInterrupt: a stop request came before anything was learned.
-    """
+    Raises LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong, and what to do.
+    KeyboardInterrupt: a stop request came before anything was learned."""
     monitor = monitor or JobMonitor()
     if request.out.resolve() == request.log.resolve():
         raise ConfigError(f"{request.out}: is the log itself; choose another name for the weights")
@@ -292,10 +289,7 @@ class FrameSource:
 
     def named(self) -> dict[int, PosedFrame]:
         """The labelled frames that the request names, by number in the log.
-
-        Raises:
-            LogError: the log has no such frame, or it has no label image.
-        """
+        Raises LogError: the log has no such frame, or it has no label image."""
         frames: dict[int, PosedFrame] = {}
         for number in sorted(set(self.request.frames)):
             if number >= len(self.log):
@@ -312,10 +306,7 @@ class FrameSource:
         """The labelled frames that show most of what the log shows, by number in it.
 
         Of a log whose depth is computed, frames that it could be computed for. Without a number of keyframes, all.
-
-        Raises:
-            LogError: fewer usable labelled frames than requested.
-            KeyboardInterrupt: a stop request came.
+        Raises LogError: fewer usable labelled frames than requested. KeyboardInterrupt: a stop request came.
         """
         candidates, numbers = [], []
         size: tuple[int, int] | None = None
@@ -352,10 +343,7 @@ class FrameSource:
     def unlabelled(self, labelled: list[PosedFrame], monitor: JobMonitor) -> list[PosedFrame]:
         """The other frames of the log at working width, without labels: as many as requested, evenly spread.
 
-        Frames that cannot be read are left out and counted.
-
-        Raises:
-            KeyboardInterrupt: a stop request came.
+        Frames that cannot be read are left out and counted. Raises KeyboardInterrupt: a stop request came.
         """
         known = {(f.camera_id, f.stamp_ns) for f in labelled}
         frames: list[PosedFrame] = []
@@ -378,11 +366,8 @@ class FrameSource:
     def pseudo_labelled(self, labels: PseudoLabels, monitor: JobMonitor) -> list[PosedFrame]:
         """Frames at working width with their pseudo labels, as many as requested; see ``choose_frames``.
 
-        A frame whose label image is missing or cannot be used gives its colours alone; these are counted.
-
-        Raises:
-            LogError: no frame has a pseudo label.
-            KeyboardInterrupt: a stop request came.
+        A frame whose label image is missing or cannot be used gives its colours alone; these are counted. Raises
+        LogError: no frame has a pseudo label. KeyboardInterrupt: a stop request came.
         """
         frames: list[PosedFrame] = []
         reasons: list[str] = []
@@ -441,14 +426,8 @@ class PseudoLabels:
 
 def open_pseudo_labels(log: Log, pseudo: str | None) -> PseudoLabels:
     """The pseudo labels of a log.
-
-    Args:
-        log: The log.
-        pseudo: Folder of label images, or weights; None = the log's own label images, else the shipped weights.
-
-    Raises:
-        LabelError, LogError, WeightsError: they cannot be read.
-    """
+    ``log``: the log. ``pseudo``: folder of label images, or weights; None = the log's own label images, else the
+    shipped weights. Raises LabelError, LogError, WeightsError: they cannot be read."""
     if pseudo is not None and Path(pseudo).is_dir():
         folder = open_label_folder(Path(pseudo), log)
         source, numbers = f"the folder {pseudo}", frozenset(folder.numbers())
@@ -476,10 +455,7 @@ def choose_frames(total: int, count: int, labelled: frozenset[int] | None) -> li
 
 def match_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> tuple[BoxFile, LabelSet]:
     """Boxes that can go with pseudo labels, and the label set of a field of them; see ``with_classes``.
-
-    Raises:
-        ConfigError: a class that these lack, with where they come from and what may be done; or no box.
-    """
+    Raises ConfigError: a class that these lack, with where they come from and what may be done; or no box."""
     try:
         boxes, label_set = with_classes(boxes, labels.label_set, path)
     except ConfigError as error:
@@ -497,10 +473,7 @@ def boxed_field(
     boxes: BoxFile, frames: Sequence[PosedFrame], label_set: LabelSet, uncovered: str
 ) -> tuple[Panoptic, int]:
     """An empty field with the boxes that frames may see, and how many they cannot.
-
-    Raises:
-        ConfigError: they can see none.
-    """
+    Raises ConfigError: they can see none."""
     seen = boxes_in_view(boxes.primitives, frames)
     config = PanopticConfig(
         boxes=tuple(box_config(p) for p, there in zip(boxes.primitives, seen, strict=True) if there),

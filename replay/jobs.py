@@ -94,9 +94,8 @@ def replay_log(
         corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
         monitor: Gets the progress, and may end it early; ``stopped_by`` of the summary names the signal.
 
-    Raises:
-        LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
-        ImportSourceError: the corrections cannot be read.
+    Raises LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
+    ImportSourceError: the corrections cannot be read.
     """
     monitor = monitor or JobMonitor()
     trajectory = read_corrections(corrections) if corrections else None
@@ -173,8 +172,7 @@ def evaluate_log(
         instances: Folder with images of the frames' true objects; None = things are not scored.
         monitor: Gets the progress.
 
-    Raises:
-        LogError, LabelError, WeightsError: nothing can be scored.
+    Raises LogError, LabelError, WeightsError: nothing can be scored.
     """
     monitor, config = monitor or JobMonitor(), config or MapperConfig()
     from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=0)
@@ -276,9 +274,8 @@ def refine_map(
         by_name: Whether weights of other classes are matched by the names of these.
         monitor: Gets the progress.
 
-    Raises:
-        ConfigError: ``up`` is no direction, or the new map cannot be written there.
-        MapError, WeightsError: map and weights cannot be read, or do not go together.
+    Raises ConfigError: ``up`` is no direction, or the new map cannot be written there. MapError, WeightsError: map and
+    weights cannot be read, or do not go together.
     """
     monitor = monitor or JobMonitor()
     direction = parse_up(up)

@@ -166,10 +166,7 @@ class MapSession:
     def process(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
         """Take one frame and map what is ready: the frame itself, unless its depth waits for later ones, or its world
         has to be found in the map first (``odometry_sessions``).
-
-        Returns:
-            What became of each: the update, or why it was refused (counted and logged, the map unchanged).
-        """
+        Returns what became of each: the update, or why it was refused (counted and logged, the map unchanged)."""
         self.published += 1
         taken = self.odometry_sessions.take(frame)
         return [*self._give_up(taken), *(done for item in taken.ready for done in self._prepare(item))]

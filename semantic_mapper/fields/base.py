@@ -236,10 +236,8 @@ def own_view(rays: RayBatch, sources: EncodedViews) -> tuple[torch.Tensor, torch
     """The source view that each ray was taken from, if any.
 
     A ray starts at the centre of its camera, and its direction has depth 1 in its camera, so a view that turned on the
-    spot is distinguished too.
-
-    Returns:
-        index (R,) int64 of the best view, same (R,) bool: whether that view's camera is the ray's.
+    spot is distinguished too. Returns index (R,) int64 of the best view, same (R,) bool: whether that view's camera is
+    the ray's.
     """
     R_camera_world, t_camera_world = sources.T_camera_world[:, :3, :3], sources.T_camera_world[:, :3, 3]
     start = torch.einsum("mij,rj->mri", R_camera_world, rays.origin) + t_camera_world[:, None]  # (m, R, 3)

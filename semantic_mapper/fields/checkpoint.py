@@ -133,11 +133,7 @@ def describe(kind: str, config: Config, label_set: LabelSet, recipe: dict[str, A
 
 def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[str, str]) -> None:
     """``safetensors.save_file``, whole or not at all, with the mode that any new file has.
-
-    Raises:
-        SafetensorError: tensors that the format does not know.
-        OSError: it cannot be written.
-    """
+    Raises SafetensorError: tensors that the format does not know. OSError: it cannot be written."""
     write_bytes(path, save(tensors, metadata))
 
 

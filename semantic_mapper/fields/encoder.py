@@ -224,9 +224,7 @@ class ImageEncoder(nn.Module):
     Batch norm, because on a CPU it costs half of what group norm does and learns faster. Its statistics come from the
     images only inside ``batch_statistics`` (where the encoder is trained on many different images at once); everywhere
     else, in training mode too, they are constants, so that a view's features do not depend on the views next to it.
-
-    Raises:
-        ConfigError: a shape that cannot be built.
+    Raises ConfigError: a shape that cannot be built.
     """
 
     def __init__(self, config: EncoderConfig, feature_dim: int) -> None:

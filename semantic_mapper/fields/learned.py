@@ -139,12 +139,7 @@ def build_field(
     kind: str, config: dict[str, Any] | Config, label_set: LabelSet, sampling: SamplingConfig | None = None
 ) -> LearnedField:
     """A field with random weights.
-
-    Args:
-        config: Of that kind, or plain data for it.
-
-    Raises:
-        ConfigError: no such kind, or a config that does not fit it.
+    ``config``: of that kind, or plain data for it. Raises ConfigError: no such kind, or a config that does not fit it.
     """
     if kind not in field_kinds():
         raise ConfigError(f"no field of kind '{kind}'; there are {', '.join(sorted(field_kinds()))}")

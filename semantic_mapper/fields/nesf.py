@@ -429,14 +429,9 @@ def smoothed_votes(label_set: LabelSet) -> NesfWeights:
 
 def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
     """What refines maps of some classes.
-
-    Args:
-        weights: File or name; ``SMOOTHING``; None = the weights that ship, or smoothing where the classes are others.
-            Weights also refine maps of more classes behind their own, such as ``person`` behind those of rooms.
-
-    Raises:
-        WeightsError: no such file, damaged, or weights of another kind.
-    """
+    ``weights``: file or name; ``SMOOTHING``; None = the weights that ship, or smoothing where the classes are others.
+    Weights also refine maps of more classes behind their own, such as ``person`` behind those of rooms. Raises
+    WeightsError: no such file, damaged, or weights of another kind."""
     if weights == SMOOTHING:
         return smoothed_votes(label_set)
     found = load_nesf(weights or SHIPPED)

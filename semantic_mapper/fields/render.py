@@ -139,18 +139,10 @@ def render_sparse_view(
     stamp_ns: int | None = None,
 ) -> tuple[Float32, NDArray[np.bool_], Float32, int]:
     """As ``render_view``, with rays for at most a ``fraction`` of the pixels, and for every fourth a side at least.
-
-    Args:
-        rgb: (H, W, 3) uint8 colours of the view, whose edges tell where to look closer.
-        fraction: Of the pixels that may have rays of their own, the most uncertain first; 0..1.
-
-    Returns:
-        What ``render_view`` returns, and the number of rays rendered. Pixels without a ray hold the mean of the known
-        ones round them.
-
-    Raises:
-        ShapeError: images of another size than the view.
-    """
+    ``rgb``: (H, W, 3) uint8 colours of the view, whose edges tell where to look closer. ``fraction``: of the pixels
+    that may have rays of their own, the most uncertain first; 0..1. Returns what ``render_view`` returns, and the
+    number of rays rendered. Pixels without a ray hold the mean of the known ones round them. Raises ShapeError: images
+    of another size than the view."""
     height, width = intrinsics.height, intrinsics.width
     expect_shape(rgb, f"{height} {width} 3", "view rgb")
     expect_shape(prior_depth_m, f"{height} {width}", "depth prior")

@@ -95,12 +95,9 @@ class GeometryInit(nn.Module):
         spread: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Mixture parameters (m, 5, h, w) of features (m, C, h, w) and depths (m, h, w), 0 = none.
-
-        Args:
-            focal: (m,) focal length in image widths, which a predicted depth is proportional to: a thing looks the same
-                through a lens of twice the focal length at twice the distance. None = ``COMMON_FOCAL``.
-            spread: (m, h, w) of the given depth where it was computed from pictures, as a fraction of it; 0 = measured.
-        """
+        ``focal``: (m,) focal length in image widths, which a predicted depth is proportional to: a thing looks the same
+        through a lens of twice the focal length at twice the distance. None = ``COMMON_FOCAL``. ``spread``: (m, h, w)
+        of the given depth where it was computed from pictures, as a fraction of it; 0 = measured."""
         measured = depth_m > 0
         inverse = torch.where(measured, 1 / depth_m.clamp_min(NEAR_M), torch.zeros_like(depth_m))
         raw = self.net(torch.cat((feature, inverse[:, None], measured[:, None].to(feature.dtype)), dim=1))
@@ -122,11 +119,8 @@ def hit_and_visibility(
     geometry: torch.Tensor, z: torch.Tensor, half_interval: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Probability that a view ray ends within z +- half_interval, and that it is still free before it: (...) in [0, 1].
-
-    Args:
-        geometry: (..., 5) mixture parameters at the pixel that the sample lands on.
-        z, half_interval: (...) of the sample in the source camera, metres.
-    """
+    ``geometry``: (..., 5) mixture parameters at the pixel that the sample lands on. ``z, half_interval``: (...) of the
+    sample in the source camera, metres."""
     mu_1, s_1, mu_2, s_2, fraction = geometry.unbind(-1)
     near, far = z - half_interval, z + half_interval
     cdf_near = fraction * torch.sigmoid((near - mu_1) / s_1) + (1 - fraction) * torch.sigmoid((near - mu_2) / s_2)
@@ -455,10 +449,8 @@ class SRay(LearnedField):
         """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3).
 
         The weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see the sample alike.
-
-        Args:
-            content: (m, R, N, C) what is blended, where that is not what the weights are made of.
-            own_factor: (R,) times which the own view's weight counts; None = once.
+        ``content``: (m, R, N, C) what is blended, where that is not what the weights are made of. ``own_factor``: (R,)
+        times which the own view's weight counts; None = once.
         """
         semantic_score, colour_score = self.weights(self._normalised(refined), space.cues)
         colour_weight = softmax_weights(colour_score, space.valid)

@@ -36,11 +36,7 @@ from semantic_mapper.types import FieldRender, Float32, RayBatch, SourceViews
 
 class StreamingSRay:
     """Inference-only S-Ray on the CPU. Satisfies ``SemanticField``.
-
-    Args:
-        model: Trained field; its weights are copied.
-        sampling: Guided sampling round the depth prior.
-    """
+    ``model``: trained field; its weights are copied. ``sampling``: guided sampling round the depth prior."""
 
     def __init__(self, model: SRay, sampling: SamplingConfig | None = None) -> None:
         self.model = model

@@ -97,14 +97,8 @@ def merge_samples(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def interval_lengths(z: torch.Tensor, direction_norm: torch.Tensor) -> torch.Tensor:
     """Metric lengths delta_k = (z_{k+1} - z_k) |d|; the last interval repeats the one before it.
-
-    Args:
-        z: (R, N) ascending sample depths in metres, N >= 2.
-        direction_norm: (R,) length of the ray direction a metre of z.
-
-    Returns:
-        (R, N) metres.
-    """
+    ``z``: (R, N) ascending sample depths in metres, N >= 2. ``direction_norm``: (R,) length of the ray direction a
+    metre of z. Returns (R, N) metres."""
     expect_shape(z, "R N", "z")
     delta = z[:, 1:] - z[:, :-1]
     return torch.cat((delta, delta[:, -1:]), dim=1) * direction_norm[:, None]

@@ -71,10 +71,7 @@ class Kernel(Generic[P, R]):
 
     def pack(self, *args: Any, **kwargs: Any) -> bytes:
         """Arguments as C takes them; the arrays must live until the kernel has ended.
-
-        Raises:
-            ShapeError: an array has another dtype, more than 4 dimensions, or is not contiguous.
-        """
+        Raises ShapeError: an array has another dtype, more than 4 dimensions, or is not contiguous."""
         if kwargs:
             args = self._signature.bind(*(None,) * self._skip, *args, **kwargs).args[self._skip :]
         words: _Words = []
@@ -121,10 +118,7 @@ def kernel(declaration: Callable[P, R]) -> Kernel[P, R]:
 @functools.cache
 def load_library(folder: Path = LIBRARY_FOLDER) -> ctypes.CDLL:
     """The kernels of a folder, compiled for the best of the processors that they are there for and this one is.
-
-    Raises:
-        DependencyError: they are not there, or not for this machine.
-    """
+    Raises DependencyError: they are not there, or not for this machine."""
     for name in _variants():
         path = folder / f"{name}.so"
         if path.exists():
@@ -243,10 +237,8 @@ def parallel_kernel(
 
     The declaration's first argument is the number of iterations; C gets the range of a part of them as ``start`` and
     ``stop``, and returns 0, or 1 where it lacks memory for its buffers, which raises MemoryError. Iterations must not
-    depend on each other: the result is then the same to the bit for any number of threads.
-
-    Args:
-        chunks_per_thread: More than 1 where iterations differ in cost. A chunk costs some 20 microseconds.
+    depend on each other: the result is then the same to the bit for any number of threads. ``chunks_per_thread``: more
+    than 1 where iterations differ in cost. A chunk costs some 20 microseconds.
     """
 
     def decorate(declaration: Callable[Concatenate[int, P], None]) -> ParallelKernel[P]:

@@ -120,10 +120,9 @@ def finetune(
         seen_stamps_ns: Frames that ``start`` was fitted to; the result remembers them with its own.
         kind: Of the field; None = that of ``start``, or S-Ray.
 
-    Raises:
-        FrameError: too few frames or labels, or poses that do not fit the images.
-        ConfigError: no budget, boxes that cannot be, or no GPU where one is requested.
-        WeightsError: a ``start`` whose classes are others, of a kind that cannot be adapted.
+    Raises FrameError: too few frames or labels, or poses that do not fit the images. ConfigError: no budget, boxes that
+    cannot be, or no GPU where one is requested. WeightsError: a ``start`` whose classes are others, of a kind that
+    cannot be adapted.
     """
     budget = Budget(config.seconds, config.steps, config.evaluations, on_progress, stopped)
     fitter = FITTERS.get(kind or (SRay.kind if start is None else start.kind), _fit_keyframes)
@@ -381,11 +380,8 @@ def step_on_rays(
     encoded: EncodedViews | None = None,
 ) -> torch.Tensor | None:
     """Loss of rays of ``views[query]`` rendered from ``views[sources]``; None where the query has no labelled pixel.
-
-    Args:
-        encoded: All views, where the image encoder is frozen. Colours are not jittered and no depth of source views is
-            withheld then: both would need features of their own.
-    """
+    ``encoded``: all views, where the image encoder is frozen. Colours are not jittered and no depth of source views is
+    withheld then: both would need features of their own."""
     view, device = views[query], next(model.parameters()).device
     flat = draw_pixels(view.channel, config.rays, BALANCED_FRACTION, generator, len(model.label_set))
     if len(flat) == 0:

@@ -54,8 +54,7 @@ class Budget:
         on_progress: Called after every step.
         stopped: Called before every step; once it returns something true, the fit ends.
 
-    Raises:
-        ConfigError: neither seconds nor steps.
+    Raises ConfigError: neither seconds nor steps.
     """
 
     def __init__(
@@ -101,11 +100,8 @@ class Budget:
 
     def part(self, until: float, *, steps: int | None = None) -> Budget:
         """The budget of the next part of a fit, which ends at a fraction of this one: its time, and its progress.
-
-        Args:
-            until: A part that comes late has a twentieth of the time until there at least.
-            steps: Of the part; None = as many as the whole may have.
-        """
+        ``until``: A part that comes late has a twentieth of the time until there at least. ``steps``: of the part; None
+        = as many as the whole may have."""
         first, self._given = self._given, until
         seconds = max(until * self.seconds - self.elapsed_s, 0.05 * until * self.seconds)
 
@@ -142,13 +138,8 @@ class HeldOut:
 def fit(learn: Callable[[float], float | None], budget: Budget, held_out: HeldOut | None = None) -> int:
     """Learn until the budget is used; ``held_out`` then has the weights that were best.
 
-    A fit that is stopped ends after one more look.
-
-    Args:
-        learn: One step, at a fraction of the budget; returns its loss, None = there was nothing to learn from.
-
-    Returns:
-        The number of steps.
+    A fit that is stopped ends after one more look. ``learn``: one step, at a fraction of the budget; returns its loss,
+    None = there was nothing to learn from. Returns the number of steps.
     """
     step, stale = 0, 0
     loss_there, accuracy = (math.nan, math.nan) if held_out is None else (held_out.loss, held_out.accuracy)

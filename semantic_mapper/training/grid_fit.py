@@ -100,10 +100,8 @@ def fit_grid(
         budget: None = that of ``config``; without steps those of ``config.grid``.
         box: Instead of the one that ``config`` describes.
 
-    Raises:
-        FrameError: too few frames, poses that only turn, or held-out views rendered hardly better than by their mean
-            colour.
-        ConfigError: a box that cannot be.
+    Raises FrameError: too few frames, poses that only turn, or held-out views rendered hardly better than by their mean
+    colour. ConfigError: a box that cannot be.
     """
     budget = budget or Budget(config.seconds, config.steps or config.grid.steps)
     every = config.grid.held_out
@@ -356,8 +354,7 @@ def fit_geometry(
         shape: Config of the kind, but for the box.
         budget: Of this part; see ``fit_grid``.
 
-    Raises:
-        FrameError, ConfigError: of ``fit_grid``.
+    Raises FrameError, ConfigError: of ``fit_grid``.
     """
     box = start.config.grid if isinstance(start, GridField) and start.fitted and config.grid.box_m is None else None
     found = fit_grid(frames, config, budget, box, leave_out)

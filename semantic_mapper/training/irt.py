@@ -78,9 +78,8 @@ def fit_irt(
         start: Gives config and box; its weights are not looked at.
         budget: ``steps``, if not 0, is the number of steps of each of its three parts.
 
-    Raises:
-        FrameError: no labelled frame, one class only, or what ``fit_grid`` refuses.
-        WeightsError: ``start`` has other classes.
+    Raises FrameError: no labelled frame, one class only, or what ``fit_grid`` refuses. WeightsError: ``start`` has
+    other classes.
     """
     if start is not None and start.label_set != label_set:
         raise WeightsError(
@@ -152,10 +151,7 @@ class ClassFit:
 
     def run(self, budget: Budget) -> tuple[HeldOut, int]:
         """Learn until the budget is used; the field then has the weights that were best on what was held out.
-
-        Returns:
-            These weights, and the number of steps.
-        """
+        Returns these weights, and the number of steps."""
         held_out = HeldOut(self._look, self._state, best=self._state())
         steps = 0
         if not budget.stopped():

@@ -39,10 +39,7 @@ def semantic_loss(logits: torch.Tensor, channel: torch.Tensor, weight: torch.Ten
 
 def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> torch.Tensor:
     """Cross-entropy of logits (m, L, h, w) over labelled pixels (m, H, W), 0 without any.
-
-    Args:
-        balance: A class counts by its fraction of the pixels to the power of minus this: 0 as it comes, 1 all alike.
-    """
+    ``balance``: A class counts by its fraction of the pixels to the power of minus this: 0 as it comes, 1 all alike."""
     size = logits.shape[-2:]
     small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
     labelled = small != IGNORE
@@ -59,11 +56,8 @@ def guess_loss(geometry: torch.Tensor, given_m: torch.Tensor, depth_m: torch.Ten
     """Negative log likelihood of the true depth of views that were given none; 0 without such views.
 
     A Laplace distribution of log depth round the field's guess, as wide as the field says: near and far errors count
-    alike, and the width is learned with the guess.
-
-    Args:
-        geometry: (m, G, h, w) of ``EncodedViews``.
-        given_m, depth_m: (m, H, W) depth that the field was given, and that was measured; 0 = none.
+    alike, and the width is learned with the guess. ``geometry``: (m, G, h, w) of ``EncodedViews``. ``given_m,
+    depth_m``: (m, H, W) depth that the field was given, and that was measured; 0 = none.
     """
     size = geometry.shape[-2:]
     target = functional.interpolate(depth_m[:, None], size=size, mode="nearest-exact")[:, 0]

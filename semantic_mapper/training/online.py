@@ -85,10 +85,8 @@ class KeyframePool:
     def add(self, frame: PosedFrame, label_set: LabelSet) -> None:
         """Add a keyframe; one of the same camera and time is replaced, and no longer validated.
 
-        Its classes are translated by name; those that the weights lack are not learned.
-
-        Raises:
-            FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed.
+        Its classes are translated by name; those that the weights lack are not learned. Raises FrameError, PoseError,
+        LabelError: it cannot be learned from; nothing has changed.
         """
         frame = self._translated(frame, label_set)
         before = self._kept.pop(key_of(frame), None)
@@ -194,14 +192,10 @@ def learn(
     """Finetune ``current`` on the keyframes, and compare both on those held out.
 
     Each is judged as the mapper would use it: with the labels of the keyframes that it was finetuned on known.
-
-    Args:
-        keyframes: At least two to learn from and one to judge by.
-        on_progress, on_judged: Called after every step, and every held-out keyframe. What either raises ends the round.
-
-    Raises:
-        FrameError: too few keyframes, or those held out have nothing to judge by.
-        WeightsError: a kind of field whose encoder cannot rest, or one that is not trained yet.
+    ``keyframes``: at least two to learn from and one to judge by. ``on_progress, on_judged``: called after every step,
+    and every held-out keyframe. What either raises ends the round. Raises FrameError: too few keyframes, or those held
+    out have nothing to judge by. WeightsError: a kind of field whose encoder cannot rest, or one that is not trained
+    yet.
     """
     train, held_out = keyframes.train, keyframes.held_out
     if len(train) < 2 or not held_out:
@@ -249,9 +243,7 @@ def judge(
     """What a field says of the held-out keyframes against their labels, at the same rays whatever the field.
 
     Each is rendered as a mapper would: from the keyframes that see most of it, and from its own image without labels.
-
-    Args:
-        sources: Keyframes to render from, with the labels that are known to the field.
+    ``sources``: keyframes to render from, with the labels that are known to the field.
     """
     sampling, label_set = config.finetune.step.sampling, model.label_set
     views = [view_from_frame(f, label_set, config.finetune.width) for f in (*sources, *held_out)]

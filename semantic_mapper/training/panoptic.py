@@ -79,10 +79,8 @@ def fit_panoptic(
             where ``config`` leaves out the losses that need some.
         budget: ``steps``, if not 0, is the number of steps of each of its two parts.
 
-    Raises:
-        ConfigError: no boxes, none of them in view, or no class in common with the pseudo labels.
-        FrameError: no pseudo label, or what ``fit_grid`` refuses.
-        WeightsError: ``start`` has other classes.
+    Raises ConfigError: no boxes, none of them in view, or no class in common with the pseudo labels. FrameError: no
+    pseudo label, or what ``fit_grid`` refuses. WeightsError: ``start`` has other classes.
     """
     by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
     if not isinstance(start, Panoptic) or (by_boxes and not start.shape.boxes):
@@ -159,14 +157,9 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
 
 def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> dict[str, float]:
     """What boxes that stand still and pseudo labels have to do with each other, of some of the pixels.
-
-    Returns:
-        ``boxes``, and how many of these are ``seen``; fractions of the pixels whose ray meets one (``covered``), and of
-        those with a pseudo label whose class is possible on their ray (``matched``).
-
-    Raises:
-        ConfigError: no pixel meets a box, or boxes and pseudo labels have no class in common.
-    """
+    Returns ``boxes``, and how many of these are ``seen``; fractions of the pixels whose ray meets one (``covered``),
+    and of those with a pseudo label whose class is possible on their ray (``matched``). Raises ConfigError: no pixel
+    meets a box, or boxes and pseudo labels have no class in common."""
     if not len(field.primitives):
         return {"boxes": 0, "seen": 0, "covered": 0.0, "matched": 1.0}
     pixels = np.random.default_rng(config.seed).integers(0, len(data.rays), SURVEYED)

@@ -77,11 +77,9 @@ def suggest_frames(
 ) -> list[Suggestion]:
     """The most useful frames to label, best first; fewer where the others would add nothing.
 
-    Where no candidate has depth, each suggestion is the frame farthest in time from all labelled ones.
-
-    Args:
-        candidates: Frames in the order of the log, ``labelled`` ones (their indices) among them.
-        weights: (P,) what each of a candidate's pixels counts, one array a candidate; None = all alike.
+    Where no candidate has depth, each suggestion is the frame farthest in time from all labelled ones. ``candidates``:
+    frames in the order of the log, ``labelled`` ones (their indices) among them. ``weights``: (P,) what each of a
+    candidate's pixels counts, one array a candidate; None = all alike.
     """
     if not any(len(c.cells) for c in candidates):
         return [Suggestion(index, None, None) for index in _farthest_in_time(candidates, count, labelled)]

@@ -147,11 +147,8 @@ def query_rays(
     view: LabelledView, flat_index: torch.Tensor, *, near_m: float, far_m: float, prior: torch.Tensor | None
 ) -> tuple[RayBatch, RayTargets]:
     """Rays through chosen pixels of a view, with what they should render to.
-
-    Args:
-        flat_index: (R,) row-major pixel indices.
-        prior: (R,) depth priors in metres, 0 = none; None for none at all.
-    """
+    ``flat_index``: (R,) row-major pixel indices. ``prior``: (R,) depth priors in metres, 0 = none; None for none at
+    all."""
     width = view.intrinsics.width
     pixels = torch.stack((flat_index % width, flat_index // width), dim=-1).float()
     rays = pixel_rays(pixels, view.intrinsics, view.T_world_camera, near_m=near_m, far_m=far_m, prior_depth_m=prior)

@@ -154,10 +154,8 @@ def grid_box(
 ) -> GridConfig:
     """The grid of a box with ``long_side`` vertices along its longest side, or of voxels of this size.
 
-    A box that would have more than 16 M voxels gets larger ones.
-
-    Raises:
-        ConfigError: a box without a volume, or one that is too large for ``voxel_m``, with the size that fits.
+    A box that would have more than 16 M voxels gets larger ones. Raises ConfigError: a box without a volume, or one
+    that is too large for ``voxel_m``, with the size that fits.
     """
     sides = [high - low for low, high in zip(low_m, high_m, strict=True)]
     if not all(math.isfinite(s) and s > 0 for s in sides):
