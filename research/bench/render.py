@@ -19,7 +19,7 @@ from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.device import DeviceField
-from semantic_mapper.fields.render import render_view
+from semantic_mapper.fields.render import View, render_view
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import sample_guided
@@ -220,7 +220,7 @@ def _bench_device(
     for name, bfloat16 in (("gpu", False), ("gpu_bfloat16", True)):
         field = DeviceField(model, device, sampling, bfloat16=bfloat16)
         scene = (field, field.encode(views), query.intrinsics, query.T_world_camera, prior, sampling, 0)
-        (p, known, _), timing = _timed(lambda s=scene: render_view(*s, measured), prior.size, repeats)
+        (p, known, _), timing = _timed(lambda s=scene: render_view(View(*s, measured)), prior.size, repeats)
         predicted = model.label_set.to_ids(np.where(known, p.argmax(axis=2), -1)).reshape(-1)[some]
         renders[name] = (timing, predicted, truth)
     return renders

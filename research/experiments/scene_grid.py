@@ -29,7 +29,7 @@ from research.scenes.sequence import room_views
 from semantic_mapper.config import GridFieldConfig, SamplingConfig
 from semantic_mapper.fields.checkpoint import anchor_from_frame
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.render import View, render_image
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS
@@ -113,7 +113,7 @@ def _render(field: LearnedField, frame: PosedFrame) -> tuple[Float32, Float32]:
     field.sampling = FREE
     sources = field.encode(stack_sources([view_from_frame(frame, ROOMS, k.width)]))
     none = np.zeros((k.height, k.width), np.float32)
-    found = render_image(field, sources, k, frame.T_world_camera, none, FREE, 0)
+    found = render_image(View(field, sources, k, frame.T_world_camera, none, FREE))
     return found.rgb.view(k.height, k.width, 3).numpy(), found.depth_m.view(k.height, k.width).numpy()
 
 

@@ -14,7 +14,7 @@ from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import SemanticField
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.render import View, render_image
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import around_computed
@@ -71,7 +71,7 @@ def predict_view(
     shown = any(frame is query for frame in sources)
     prior = depth_prior(depth_m, resize_rgb(query, query.intrinsics)) if shown else fill_holes(depth_m)
     scene = (renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, tier.rays_per_chunk)
-    render = render_image(*scene, measured=depth_m > 0, stamp_ns=query.stamp_ns)
+    render = render_image(View(*scene, measured=depth_m > 0, stamp_ns=query.stamp_ns))
     return _as_prediction(render, field.label_set, label_set, (query.intrinsics.height, query.intrinsics.width))
 
 

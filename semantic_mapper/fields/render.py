@@ -10,7 +10,7 @@ from __future__ import annotations
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -40,81 +40,53 @@ def chunk_size(rays_per_chunk: int, device: torch.device, sampling: SamplingConf
     return max(1, min(GPU_CHUNK, GPU_PAIRS // samples**2))
 
 
-def _renders(
-    field: SemanticField,
-    sources: EncodedViews,
-    intrinsics: CameraIntrinsics,
-    T_world_camera: Float64,
-    prior_depth_m: Float32,
-    sampling: SamplingConfig,
-    rays_per_chunk: int,
-    measured: NDArray[np.bool_] | None,
-    stamp_ns: int | None,
-    flat: NDArray[np.int64],
-) -> Iterator[tuple[NDArray[np.int64], FieldRender]]:
-    """Pixels ``flat`` (R,) of a view, row by row, and what they render to, chunk by chunk; without gradients."""
-    device = sources.feature.device
-    pose = torch.tensor(T_world_camera, device=device, dtype=torch.float32)
-    rays_per_chunk = chunk_size(rays_per_chunk, device, sampling)
-    for start in range(0, len(flat), rays_per_chunk):
-        part = flat[start : start + rays_per_chunk]
-        v, u = np.divmod(part, intrinsics.width)
-        rays = pixel_rays(
-            torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(device),
-            intrinsics,
-            pose,
-            near_m=sampling.near_m,
-            far_m=sampling.far_m,
-            prior_depth_m=torch.from_numpy(prior_depth_m[v, u]).to(device),
-            measured=None if measured is None else torch.from_numpy(measured[v, u]).to(device),
-            stamp_ns=stamp_ns,
-        )
-        with torch.inference_mode():
-            yield part, field.render(rays, sources)
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A view (H, W) to render from a field, without gradients."""
+
+    field: SemanticField
+    sources: EncodedViews
+    intrinsics: CameraIntrinsics
+    T_world_camera: Float64
+    prior_depth_m: Float32  # (H, W), 0 = no prior
+    sampling: SamplingConfig  # for its near and far bounds
+    rays_per_chunk: int = 0  # rendered at once; 0 = what suits the device
+    measured: NDArray[np.bool_] | None = None  # (H, W), where the prior is not filled in; None = wherever there is one
+    stamp_ns: int | None = None  # for fields with things that move; None = such things are not there
+
+    def trace(self, flat: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], FieldRender]]:
+        """Pixels ``flat`` (R,), row by row, and what they render to, chunk by chunk."""
+        device, sampling, measured = self.sources.feature.device, self.sampling, self.measured
+        pose = torch.tensor(self.T_world_camera, device=device, dtype=torch.float32)
+        size = chunk_size(self.rays_per_chunk, device, sampling)
+        for start in range(0, len(flat), size):
+            part = flat[start : start + size]
+            v, u = np.divmod(part, self.intrinsics.width)
+            rays = pixel_rays(
+                torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(device),
+                self.intrinsics,
+                pose,
+                near_m=sampling.near_m,
+                far_m=sampling.far_m,
+                prior_depth_m=torch.from_numpy(self.prior_depth_m[v, u]).to(device),
+                measured=None if measured is None else torch.from_numpy(measured[v, u]).to(device),
+                stamp_ns=self.stamp_ns,
+            )
+            with torch.inference_mode():
+                yield part, self.field.render(rays, self.sources)
 
 
-def render_image(
-    field: SemanticField,
-    sources: EncodedViews,
-    intrinsics: CameraIntrinsics,
-    T_world_camera: Float64,
-    prior_depth_m: Float32,
-    sampling: SamplingConfig,
-    rays_per_chunk: int,
-    measured: NDArray[np.bool_] | None = None,
-    stamp_ns: int | None = None,
-) -> FieldRender:
-    """Render every pixel of a view without gradients: a ``FieldRender`` of H * W rays, row by row.
-
-    Args:
-        intrinsics: Of the view to render, (H, W).
-        prior_depth_m: (H, W), 0 = no prior.
-        sampling: Near and far bounds.
-        rays_per_chunk: Rays rendered at once; 0 = what suits the device.
-        measured: (H, W), where the prior is not filled in; None = wherever there is one.
-        stamp_ns: Of the view, for fields with things that move; None = such things are not there.
-    """
-    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk, measured, stamp_ns)
-    parts = [render for _, render in _renders(*scene, np.arange(prior_depth_m.size))]
+def render_image(view: View) -> FieldRender:
+    """Every pixel of a view: a ``FieldRender`` of H * W rays, row by row."""
+    parts = [render for _, render in view.trace(np.arange(view.prior_depth_m.size))]
     return FieldRender(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(FieldRender)))
 
 
-def render_view(
-    field: SemanticField,
-    sources: EncodedViews,
-    intrinsics: CameraIntrinsics,
-    T_world_camera: Float64,
-    prior_depth_m: Float32,
-    sampling: SamplingConfig,
-    rays_per_chunk: int,
-    measured: NDArray[np.bool_] | None = None,
-    stamp_ns: int | None = None,
-) -> tuple[Float32, NDArray[np.bool_], Float32]:
+def render_view(view: View) -> tuple[Float32, NDArray[np.bool_], Float32]:
     """``render_image`` as arrays: class probabilities (H, W, L), known (H, W), depth (H, W) in metres."""
-    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk, measured, stamp_ns)
-    parts = [_arrays(render) for _, render in _renders(*scene, np.arange(prior_depth_m.size))]
+    parts = [_arrays(render) for _, render in view.trace(np.arange(view.prior_depth_m.size))]
     probabilities, known, depth_m = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    shape = (intrinsics.height, intrinsics.width)
+    shape = (view.intrinsics.height, view.intrinsics.width)
     return probabilities.reshape(*shape, -1), known.reshape(shape), depth_m.reshape(shape)
 
 
@@ -125,34 +97,21 @@ def _arrays(render: FieldRender) -> tuple[Float32, NDArray[np.bool_], Float32]:
         return probabilities, render.known.cpu().numpy(), (render.depth_m * render.known).cpu().numpy()
 
 
-def render_sparse_view(
-    field: SemanticField,
-    sources: EncodedViews,
-    intrinsics: CameraIntrinsics,
-    T_world_camera: Float64,
-    prior_depth_m: Float32,
-    sampling: SamplingConfig,
-    rays_per_chunk: int,
-    rgb: UInt8,
-    fraction: float,
-    measured: NDArray[np.bool_] | None = None,
-    stamp_ns: int | None = None,
-) -> tuple[Float32, NDArray[np.bool_], Float32, int]:
-    """As ``render_view``, with rays for at most a ``fraction`` of the pixels, and for every fourth a side at least.
-    ``rgb``: (H, W, 3) uint8 colours of the view, whose edges tell where to look closer. ``fraction``: of the pixels
-    that may have rays of their own, the most uncertain first; 0..1. Returns what ``render_view`` returns, and the
-    number of rays rendered. Pixels without a ray hold the mean of the known ones round them. Raises ShapeError: images
-    of another size than the view."""
-    height, width = intrinsics.height, intrinsics.width
+def render_sparse_view(view: View, rgb: UInt8, fraction: float) -> tuple[Float32, NDArray[np.bool_], Float32, int]:
+    """As ``render_view``, with rays for at most a ``fraction`` (0..1) of the pixels, the most uncertain first, and for
+    every fourth a side at least; and the number of rays.
+
+    Edges of ``rgb`` (H, W, 3) tell where to look closer. Pixels without a ray hold the mean of the known ones round
+    them. Raises ShapeError: images of another size than the view."""
+    height, width = view.intrinsics.height, view.intrinsics.width
     expect_shape(rgb, f"{height} {width} 3", "view rgb")
-    expect_shape(prior_depth_m, f"{height} {width}", "depth prior")
-    rgb, prior_depth_m = np.ascontiguousarray(rgb), np.ascontiguousarray(prior_depth_m)
-    probabilities = np.zeros((height, width, len(field.label_set)), np.float32)
+    expect_shape(view.prior_depth_m, f"{height} {width}", "depth prior")
+    rgb, prior_depth_m = np.ascontiguousarray(rgb), np.ascontiguousarray(view.prior_depth_m)
+    probabilities = np.zeros((height, width, len(view.field.label_set)), np.float32)
     known, depth_m = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float32)
-    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk, measured, stamp_ns)
 
     def trace(flat: NDArray[np.int64]) -> None:
-        for part, render in _renders(*scene, flat):
+        for part, render in view.trace(flat):
             v, u = np.divmod(part, width)
             probabilities[v, u], known[v, u], depth_m[v, u] = _arrays(render)
 
@@ -187,12 +146,5 @@ def fill_between_rays(
     colour_step: float,
     unsure: float,
 ) -> None:
-    """Give the pixels half way between those of a grid the mean of the known grid pixels round them; in place.
-
-    Args:
-        count: Rows of pixels, half a step apart.
-        step: Pixels between those of the grid.
-        probabilities, known, depth: (H, W, L), (H, W), (H, W) metres: zeros but at the grid; written between it.
-        uncertainty: (H, W), written: how little the grid says of such a pixel, 0 = enough.
-    """
-    ...
+    """Give pixels half way between those of a grid (``step`` apart) the mean of the known grid pixels round them, in
+    ``count`` rows half a step apart; ``uncertainty`` (H, W) gets how little the grid says of such a pixel."""

@@ -21,7 +21,7 @@ from torch.nn import functional
 from semantic_mapper.config import RenderConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews, ImageClassifier, Sampled, SemanticField
-from semantic_mapper.fields.render import render_sparse_view, render_view
+from semantic_mapper.fields.render import View, render_sparse_view, render_view
 from semantic_mapper.fields.volume import around_computed
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
@@ -110,12 +110,12 @@ class ViewRenderer:
         if isinstance(self.field, Sampled) and sampling.mode == "streaming":
             self.field.sampling = sampling
             samples = sampling.guided
-        scene = (self.field, sources, intrinsics, T_world_camera, prior_m, sampling, 0)
+        view = View(self.field, sources, intrinsics, T_world_camera, prior_m, sampling, 0, measured, stamp_ns)
         if fraction == 1:
-            probabilities, known, depth_m = render_view(*scene, measured, stamp_ns)
+            probabilities, known, depth_m = render_view(view)
             rays = prior_m.size
         else:
-            probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, fraction, measured, stamp_ns)
+            probabilities, known, depth_m, rays = render_sparse_view(view, rgb, fraction)
         self._last = (0 if blind else rays, samples)
         return RenderedView(probabilities, known, depth_m, rays, samples)
 

@@ -6,7 +6,7 @@ from semantic_mapper.config import MapperConfig, SamplingConfig, convert_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.device import DeviceField
-from semantic_mapper.fields.render import render_sparse_view, render_view
+from semantic_mapper.fields.render import View, render_sparse_view, render_view
 from semantic_mapper.mapper import make_field
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_field, tiny_frames
@@ -25,8 +25,8 @@ def rendered(field, fraction: float | None = None):
         sources = field.encode(stack_sources([view_from_frame(f, field.label_set, 96) for f in frames[:4]]))
     scene = (field, sources, query.intrinsics, query.T_world_camera, query.depth_m, SAMPLING, 0)
     if fraction is None:
-        return render_view(*scene)
-    return render_sparse_view(*scene, query.rgb, fraction)[:3]
+        return render_view(View(*scene))
+    return render_sparse_view(View(*scene), query.rgb, fraction)[:3]
 
 
 @pytest.mark.parametrize("device", DEVICES)

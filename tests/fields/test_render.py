@@ -11,6 +11,7 @@ from semantic_mapper.fields.render import (
     COLOUR_STEP,
     DEPTH_STEP,
     UNSURE,
+    View,
     fill_between_rays,
     render_sparse_view,
     render_view,
@@ -47,12 +48,12 @@ class Halves:
 def sparse(field: Halves, prior: np.ndarray | None = None, fraction: float = 0.99, rgb: np.ndarray | None = None):
     prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
     rgb = np.full((30, 40, 3), 90, np.uint8) if rgb is None else rgb
-    return render_sparse_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128, rgb, fraction)  # type: ignore[arg-type]
+    return render_sparse_view(View(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128), rgb, fraction)  # type: ignore[arg-type]
 
 
 def dense(field: Halves, prior: np.ndarray | None = None):
     prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
-    return render_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128)  # type: ignore[arg-type]
+    return render_view(View(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("border", [15.5, 16.5, 17.5, 18.5])

@@ -14,7 +14,7 @@ import torch
 
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.render import View, render_image
 from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
@@ -53,7 +53,7 @@ def accuracy(field: IRT, query: PosedFrame) -> float:
     view = view_from_frame(query, HEIGHTS, 64)
     encoded = field.encode(stack_sources([view]))
     none = np.zeros((48, 64), np.float32)
-    render = render_image(field, encoded, CAMERA, query.T_world_camera, none, field.sampling, 0)
+    render = render_image(View(field, encoded, CAMERA, query.T_world_camera, none, field.sampling))
     found = render.logits.argmax(1)
     return float(((found == view.channel.flatten()) & render.known).float().mean())
 
