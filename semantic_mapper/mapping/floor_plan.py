@@ -95,7 +95,7 @@ def _normal(xyz: Float64) -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
-    """A floor plan in the grid's frame: z up, the floor at z = 0, x and y those of the world where the world has z up"""
+    """A floor plan in the grid's frame: z up, the floor at z = 0; x and y are those of a world that has z up, too."""
 
     # (H, W) int8, ``FREE``, ``OCCUPIED`` or ``UNKNOWN``; row j, column i is the square from ``origin_m + (i, j) *
     # resolution_m`` on: rows run along +y
