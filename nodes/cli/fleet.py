@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import csv as csv_files
 import io
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import typer
 from rich.table import Table
 
-from semantic_mapper.config import MapperConfig
+from semantic_mapper.config import AtLeastZero, MapperConfig
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOption, Settings, show_error, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, EXIT_USAGE, JsonOutput, SetOption, Settings, show_error, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.store import Store
-from semantic_mapper.nodes.fleet.table import Tables
-from semantic_mapper.nodes.fleet.urls import find_inputs
+from semantic_mapper.nodes.fleet.results import FleetComparison, LogChange, Rows, Tables, compare_stores
+from semantic_mapper.nodes.fleet.store import Store, find_inputs
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted, without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_SUFFIX, prepare_file
 
-if TYPE_CHECKING:
-    from semantic_mapper.nodes.fleet.compare import FleetComparison, LogChange
-
-EXIT_USAGE = 2
 MAX_SHOWN = 500  # rows that are printed
 MAX_LOGS = 40
 
@@ -42,40 +36,20 @@ app = typer.Typer(
 @app.command()
 @verb
 def run(
-    operation: Annotated[
-        Literal["replay", "eval", "autolabel", "finetune", "refine"],
-        typer.Argument(metavar="OPERATION", help="replay, eval, autolabel, finetune or refine; as the verb."),
-    ],
-    logs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="LOG...",
-            help="Paths, URLs (s3, gs, http), globs in quotes, or manifests (CSV with a column `log`; others are "
-            "tags). refine: maps (.npz).",
-        ),
-    ],
-    out: Annotated[str, typer.Option("--out", metavar="STORE", help="Folder or URL for the results.")],
-    weights: Annotated[
-        str | None, typer.Option(help="File, URL, or name of weights in the package.  [default: as of the verb]")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Setting of the operation or mapper; may be repeated."),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="TOML file with settings; --set goes before it.")
-    ] = None,
-    address: Annotated[
-        str | None,
-        typer.Option(metavar="HOST:PORT", help="Ray cluster to join.  [default: Ray starts here, on loopback only]"),
-    ] = None,
-    cpus: Annotated[float, typer.Option(min=0.1, help="CPUs of a task.")] = 1.0,
-    gpus: Annotated[float, typer.Option(min=0.0, help="GPUs of a task; views are rendered there then.")] = 0.0,
-    memory: Annotated[
-        float | None,
-        typer.Option(metavar="GB", min=0.1, help="Memory of a task.  [default: 2; finetune and refine: 4]"),
-    ] = None,
-    json: JsonOption = False,
+    output: JsonOutput,
+    operation: Literal["replay", "eval", "autolabel", "finetune", "refine"],  # as the verb
+    # paths, URLs (s3, gs, http), globs in quotes, or manifests (CSV with a column `log`; others are tags). refine: maps
+    # (.npz)
+    logs: list[str],
+    *,
+    out: str,  # folder or URL for the results
+    weights: str | None = None,  # file, URL, or name of weights in the package; without it those of the verb
+    settings: SetOption = None,
+    config: Path | None = None,  # TOML file with settings; --set goes before it
+    address: str | None = None,  # HOST:PORT of a Ray cluster to join; without it Ray starts here, on loopback only
+    cpus: Annotated[float, msgspec.Meta(ge=0.1)] = 1.0,  # CPUs of a task
+    gpus: AtLeastZero = 0.0,  # GPUs of a task; views are rendered there then
+    memory: Annotated[float, msgspec.Meta(ge=0.1)] | None = None,  # GB of a task; without it 2, finetune and refine 4
 ) -> int:
     """Do an operation with many logs, once each, and keep the results in a store.
 
@@ -87,11 +61,8 @@ def run(
     Example: semantic-mapper fleet run eval robots.csv --out s3://maps/week --address head:6379
     Example: semantic-mapper fleet run replay "logs/*.mcap" --out runs/fleet --set voxel_map.voxel_size_m=0.05
     """
-    output = Output.guarded()
-    output.quiet = json
     inputs = find_inputs(logs, MAP_SUFFIX if operation == "refine" else LOG_SUFFIX)  # before what is heavy
-    from semantic_mapper.nodes.fleet.operations import OPERATIONS
-    from semantic_mapper.nodes.fleet.run import make_task, run_fleet
+    from semantic_mapper.nodes.fleet.run import OPERATIONS, make_task, run_fleet
 
     kind = OPERATIONS[operation]
     on_gpu = ["render.device=cuda"] if gpus and issubclass(kind.settings, MapperConfig) else []
@@ -110,34 +81,28 @@ def run(
             stopped=lambda: stop,
             on_progress=lambda now: bar.set(now.over),
         )
-    shown = without_secrets(out)
-    failed = len(report.failures)
-    output.print(f"{shown}: {report.done} done, {report.existing} were there, {failed} failed, of {report.total}")
-    for failure in report.failures[:MAX_LOGS]:
+    shown, failures = without_secrets(out), report.failures
+    output.print(
+        f"{shown}: {report.done} done, {report.existing} were there, {len(failures)} failed, of {report.total}"
+    )
+    for failure in failures[:MAX_LOGS]:
         output.print(f"  failed: {failure.log}: {failure.error}")
-    if json:
-        output.json({"store": shown, **msgspec.to_builtins(report)})
+    output.json({"store": shown, **msgspec.to_builtins(report)})
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the same command continues it", style="yellow")
         return stop.exit_code
-    return EXIT_FAILED if report.failures else 0
+    return EXIT_FAILED if failures else 0
 
 
 @app.command()
 @verb
 def table(
-    store: Annotated[
-        str, typer.Argument(metavar="STORE", help="Path or URL of a store, as `fleet run --out` has written it.")
-    ],
-    query: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="QUERY",
-            help='Columns of `logs`, such as "log, miou", or a SELECT on logs, classes, events and failures.',
-        ),
-    ] = None,
-    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all rows here, as CSV.")] = None,
-    json: JsonOption = False,
+    output: JsonOutput,
+    store: str,  # path or URL of a store, as `fleet run --out` has written it
+    query: str
+    | None = None,  # columns of `logs`, such as "log, miou", or a SELECT on logs, classes, events and failures
+    *,
+    csv: Path | None = None,  # write all rows to this file, as CSV
 ) -> None:
     """Query the results of a fleet with SQL (DuckDB); without a query, show an overview and the columns.
 
@@ -148,48 +113,41 @@ def table(
     Example: semantic-mapper fleet table runs/fleet "log, miou" --csv miou.csv
     Example: semantic-mapper fleet table runs/fleet "SELECT log, miou FROM logs WHERE tag_robot = 'r2' ORDER BY miou"
     """
-    output = Output.guarded()
-    output.quiet = json
     tables = Tables(Store(store))
     rows = tables.overview() if query is None else tables.query(query)
+    plain: Any = [dict(zip(rows.names, row, strict=True)) for row in rows.values]
     if csv is not None:
         prepare_file(csv)
         text = io.StringIO(newline="")
         csv_files.writer(text).writerows([rows.names, *rows.values])
         write_bytes(csv, text.getvalue().encode())
         output.print(f"{counted(len(rows.values), 'row')} written to {csv}")
-    elif not json:
-        output.print(_rows_table(rows.names, rows.values[:MAX_SHOWN]))
+    else:
+        output.print(_shown(rows))
         if len(rows.values) > MAX_SHOWN:
             output.print(f"{len(rows.values) - MAX_SHOWN} more rows; --csv and --json give all")
     if query is None:
+        plain = {"overview": plain, "columns": tables.columns()}
         for name, columns in tables.columns().items():
             output.print(f"{name}: {', '.join(columns)}")
-    if json:
-        plain = [dict(zip(rows.names, row, strict=True)) for row in rows.values]
-        output.json(plain if query is not None else {"overview": plain, "columns": tables.columns()})
+    output.json(plain)
 
 
 @app.command()
 @verb
 def compare(
-    store_a: Annotated[str, typer.Argument(metavar="STORE_A", help="Path or URL of the store with results before.")],
-    store_b: Annotated[str, typer.Argument(metavar="STORE_B", help="Of that with results after.")],
-    operation: Annotated[
-        str, typer.Option(metavar="NAME", help="replay, eval, ...; not needed where both stores share only one.")
-    ] = "",
-    metric: Annotated[
-        str, typer.Option(metavar="NAME", help='miou, "miou METHOD", iou:CLASS, or another metric or cost.')
-    ] = "miou",
-    threshold: Annotated[
-        float, typer.Option(min=0, help="Allowed loss of the mean over logs, in units of the metric.")
-    ] = 0.0,
-    log_threshold: Annotated[float, typer.Option(min=0, help="Allowed loss of a single log.")] = 0.02,
+    output: JsonOutput,
+    store_a: str,  # path or URL of the store with results before
+    store_b: str,  # of that with results after
+    *,
+    operation: str = "",  # replay, eval, ...; not needed where A has results of one only
+    metric: str = "miou",  # miou, "miou METHOD", iou:CLASS, or another metric or cost
+    threshold: AtLeastZero = 0.0,  # allowed loss of the mean over logs, in units of the metric
+    log_threshold: AtLeastZero = 0.02,  # allowed loss of a single log
     lower_is_better: Annotated[
         bool | None,
         typer.Option("--lower-is-better/--higher-is-better", help="Of the metric.  [default: as declared for it]"),
     ] = None,
-    json: JsonOption = False,
 ) -> int:
     """Say which logs of a fleet got better or worse, beyond noise: a gate for releases.
 
@@ -202,25 +160,13 @@ def compare(
     Example: semantic-mapper fleet compare runs/released runs/candidate --metric iou:person --log-threshold 0.05 --json
     Example: semantic-mapper fleet compare runs/released runs/candidate --metric step_ms_p50 --threshold 5
     """
-    output = Output.guarded()
-    output.quiet = json
-    from semantic_mapper.nodes.fleet.compare import compare_stores
-
+    limits = {"threshold": threshold, "log_threshold": log_threshold, "lower_is_better": lower_is_better}
     try:
-        found = compare_stores(
-            Store(store_a),
-            Store(store_b),
-            operation,
-            metric,
-            threshold=threshold,
-            log_threshold=log_threshold,
-            lower_is_better=lower_is_better,
-        )
+        found = compare_stores(Store(store_a), Store(store_b), operation, metric, **limits)
     except SemanticMapperError as error:
         show_error(str(error))
         return EXIT_USAGE
-    if json:
-        output.json({"worse": bool(found.reasons), **msgspec.to_builtins(found)})
+    output.json({"worse": bool(found.reasons), **msgspec.to_builtins(found)})
     _show_comparison(output, found)
     return EXIT_FAILED if found.reasons else 0
 
@@ -228,20 +174,12 @@ def compare(
 @app.command()
 @verb
 def merge(
-    maps: Annotated[
-        list[str],
-        typer.Argument(metavar="MAPS...", help="Stores with replays, saved maps, folders with one, or URLs of these."),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Map to write (.npz).")],
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="JSON",
-            help="Poses of maps: an object of [x, y, z, yaw_deg] or 4 rows of 4 by name. Those of other maps are found "
-            "by what they show.",
-        ),
-    ] = None,
-    json: JsonOption = False,
+    output: JsonOutput,
+    maps: list[str],  # stores with replays, saved maps, folders with one, or URLs of these
+    *,
+    out: Path,  # map to write (.npz)
+    # JSON: an object of [x, y, z, yaw_deg] or 4 rows of 4 by names of maps; poses of others are found by what they show
+    poses: Path | None = None,
 ) -> None:
     """Fuse maps of one building into one map, which keeps what does not fit in memory on disk.
 
@@ -251,8 +189,6 @@ def merge(
     Example: semantic-mapper fleet merge runs/east runs/west runs/attic --out house.npz
     Example: semantic-mapper fleet merge runs/fleet --poses poses.json --out house.npz
     """
-    output = Output.guarded()
-    output.quiet = json
     from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
 
     given = {} if poses is None else read_poses(poses)
@@ -262,31 +198,28 @@ def merge(
         report = merge_maps(sources, given, bar.advance)
         report.merged.save(out)
     frames, blocks = report.merged.frames, report.merged.block_count
-    if json:
-        found = {name: T.tolist() for name, T in report.poses.items()}
-        output.json({"map": str(out), "poses": found, "frames": frames, "blocks": blocks})
+    found = {name: T.tolist() for name, T in report.poses.items()}
+    output.json({"map": str(out), "poses": found, "frames": frames, "blocks": blocks})
     for note in report.notes:
         output.print(note)
     output.print(f"{out}: {counted(len(sources), 'map')}, {counted(frames, 'frame')}, {counted(blocks, 'block')}")
 
 
-def _rows_table(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+def _shown(rows: Rows) -> Table:
     """Rows for people; columns of numbers end at the right."""
-    found = Table()
-    for number, name in enumerate(names):
-        numbers = all(isinstance(row[number], (int, float)) for row in rows if row[number] is not None)
-        found.add_column(name, justify="right" if rows and numbers else "left")
-    for row in rows:
+    values, found = rows.values[:MAX_SHOWN], Table()
+    for number, name in enumerate(rows.names):
+        numbers = values and all(isinstance(row[number], int | float | None) for row in values)
+        found.add_column(name, justify="right" if numbers else "left")
+    for row in values:
         found.add_row(*map(_cell, row))
     return found
 
 
 def _cell(value: Any) -> str:
-    if value is None:
-        return "-"
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 10_000 else f"{value:.0f}"
-    return str(value)
+    return "-" if value is None else str(value)
 
 
 def _show_comparison(output: Output, found: FleetComparison) -> None:
@@ -294,7 +227,7 @@ def _show_comparison(output: Output, found: FleetComparison) -> None:
     changed = [log for log in found.logs if log.status != "same"]
     names = ("log", "A", "B", "difference", "95 % interval", "")
     rows = [_change_row(change) for change in (*changed[:MAX_LOGS], found.mean)]
-    output.print(f"{found.operation}, {found.metric} ({direction} is better)", _rows_table(names, rows))
+    output.print(f"{found.operation}, {found.metric} ({direction} is better)", _shown(Rows(names, rows)))
     counts = ", ".join(f"{counted(found.count(status), 'log')} {status}" for status in ("worse", "better", "same"))
     output.print(f"{counts}; --json gives all")
     if unknown := sum(log.estimate is None and log.b is not None for log in found.logs):

@@ -52,7 +52,10 @@ def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool
         raise DependencyError(
             f'the fleet needs the package ray ({error}): pip install "semantic-mapper[fleet]"'
         ) from error
+    is_local = address is None or _check_address(address)
     with contextlib.ExitStack() as stack:
+        variables = _COMMON
+        arguments: dict[str, Any] = {"address": address}
         if address is None:
             # Not where TMPDIR says: Ray puts sockets there, whose paths may be 107 bytes long.
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sm-ray-", dir="/tmp")))
@@ -61,58 +64,46 @@ def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool
             token.write_text(secrets.token_hex(32), encoding="ascii")
             # A path, because programs that report errors often send the environment with them.
             security = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), "RAY_USE_TLS": "0"}
-            stack.enter_context(_environment({**_COMMON, **_PATIENT, **security}))
-            stack.enter_context(_on_loopback())
-            found = {
+            variables = {**_COMMON, **_PATIENT, **security}
+            arguments = {
                 "address": "local",
                 "num_cpus": cpus or len(os.sched_getaffinity(0)),
                 "include_dashboard": False,
                 "object_store_memory": _OBJECT_STORE_BYTES,
                 "_temp_dir": str(folder / "ray"),  # open to everybody; nobody else comes through the folder above
             }
-        else:
-            _check_reachable(address)
-            stack.enter_context(_environment(_COMMON))
-            if _is_loopback(address):
-                stack.enter_context(_on_loopback())
-            found = {"address": address}
+        stack.enter_context(_settings_of_ray(variables, is_local=is_local))
         stack.callback(ray.shutdown)
-        _start(ray, {**found, "log_to_driver": worker_logs})
+        handler = signal.getsignal(signal.SIGTERM)
+        try:
+            ray.init(logging_level=logging.ERROR, log_to_driver=worker_logs, **arguments)
+        except Exception as error:  # Ray raises this very class for a node that is late
+            reason = " ".join(str(error).split())[:400] or type(error).__name__
+            raise FleetError(f"the Ray cluster at '{arguments['address']}' cannot be used: {reason}") from error
+        finally:
+            if handler not in (signal.SIG_DFL, None):  # Ray puts its own there
+                signal.signal(signal.SIGTERM, handler)
         yield
 
 
-def _start(ray: Any, arguments: Mapping[str, Any]) -> None:
-    """``ray.init``, with its many errors as one, and without its handler of SIGTERM where the program has its own."""
-    handler = signal.getsignal(signal.SIGTERM)
-    try:
-        ray.init(logging_level=logging.ERROR, **arguments)
-    except Exception as error:  # Ray raises this very class for a node that is late
-        reason = " ".join(str(error).split())[:400] or type(error).__name__
-        raise FleetError(f"the Ray cluster at '{arguments['address']}' cannot be used: {reason}") from error
-    finally:
-        if handler not in (signal.SIG_DFL, None):
-            signal.signal(signal.SIGTERM, handler)
-
-
-def _check_reachable(address: str) -> None:
-    """Ray waits for minutes for what is not there, and its core aborts the process where a token is missing.
-
-    Raises:
-        FleetError: no address, nobody there, or no token where one is needed.
-    """
+def _check_address(address: str) -> bool:
+    """Whether the cluster is on this machine. Ray waits for minutes for what is not there, and its core aborts the
+    process where a token is missing: ``FleetError`` for these, and for a network without tokens."""
     parts = urlsplit(f"//{address}")
     try:
         host, port = parts.hostname or "", parts.port or 0
-    except ValueError:
-        host, port = "", 0
-    if not host or not port or parts.netloc != address or "@" in address:
-        raise FleetError(f"'{address}' is not the address of a Ray cluster; give HOST:PORT")
+        if not host or not port or parts.netloc != address or "@" in address:
+            raise ValueError("not HOST:PORT")
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except (ValueError, OSError) as error:
+        raise FleetError(f"'{address}' is not the address of a Ray cluster, HOST:PORT ({error})") from error
+    is_local = all(ipaddress.ip_address(str(entry[4][0]).partition("%")[0]).is_loopback for entry in found)
     has_token = os.environ.get("RAY_AUTH_MODE", "").lower() == "token"
     if has_token and not os.environ.get("RAY_AUTH_TOKEN"):
         path = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
         if not path.is_file() or not path.stat().st_size:
             raise FleetError(f"{path}: there is no token of the cluster; copy it there, or set RAY_AUTH_TOKEN_PATH")
-    if not has_token and not _is_loopback(address):
+    if not has_token and not is_local:
         raise FleetError(
             f"{address} is reached through a network, and RAY_AUTH_MODE=token is not set, so that anybody there can "
             "run code; start every node with RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH, and set both here, too"
@@ -123,53 +114,35 @@ def _check_reachable(address: str) -> None:
         raise FleetError(
             f"no Ray cluster answers at {address} ({error}); start its head (ray start --head), or correct the address"
         ) from error
-
-
-def _is_loopback(address: str) -> bool:
-    host = urlsplit(f"//{address}").hostname or ""
-    try:
-        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-    except OSError as error:
-        raise FleetError(f"{address}: there is no host '{host}' ({error}); name the head of the cluster") from error
-    return all(ipaddress.ip_address(str(entry[4][0]).partition("%")[0]).is_loopback for entry in found)
+    return is_local
 
 
 @contextlib.contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables for Ray and the processes it starts; afterwards everything is as before."""
-    before = dict(os.environ)
+def _settings_of_ray(variables: Mapping[str, str], *, is_local: bool) -> Iterator[None]:
+    """What Ray and the processes that it starts go by; afterwards everything is as before.
+
+    Ray replaces 127.0.0.1 by the machine's own address, and then its servers listen on every address; where it is to
+    stay ``is_local``, Ray takes 127.0.0.1 for this machine's address, as it does on Windows and macOS.
+    """
+    from ray import _raylet
+    from ray._private import ray_constants
+
+    core: Any = _raylet  # compiled, without stubs
+
+    def read_again() -> None:  # token and mode, which Ray's core reads once in a process
+        core.Config.initialize("")
+        core.AuthenticationTokenLoader.instance().reset_cache()
+
+    before, enabled = dict(os.environ), ray_constants.ENABLE_RAY_CLUSTER
     os.environ.update(variables)
     if "RAY_AUTH_TOKEN_PATH" in variables:
         os.environ.pop("RAY_AUTH_TOKEN", None)  # it would go before the path
-    _reread_environment()
+    read_again()
+    ray_constants.ENABLE_RAY_CLUSTER = enabled and not is_local
     try:
         yield
     finally:
+        ray_constants.ENABLE_RAY_CLUSTER = enabled
         os.environ.clear()
         os.environ.update(before)
-        _reread_environment()
-
-
-def _reread_environment() -> None:
-    """Ray's core reads token and mode once in a process, which may have been in another cluster before."""
-    from ray import _raylet
-
-    core: Any = _raylet  # compiled, without stubs
-    core.Config.initialize("")
-    core.AuthenticationTokenLoader.instance().reset_cache()
-
-
-@contextlib.contextmanager
-def _on_loopback() -> Iterator[None]:
-    """Let Ray take 127.0.0.1 for this machine's address, as it does on Windows and macOS.
-
-    It replaces 127.0.0.1 by the machine's own address otherwise, and then its servers listen on every address.
-    """
-    from ray._private import ray_constants
-
-    before = ray_constants.ENABLE_RAY_CLUSTER
-    ray_constants.ENABLE_RAY_CLUSTER = False
-    try:
-        yield
-    finally:
-        ray_constants.ENABLE_RAY_CLUSTER = before
+        read_again()

@@ -17,8 +17,7 @@ from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.map_file import MapManifest, describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.fleet.store import Store, is_store
-from semantic_mapper.nodes.fleet.urls import is_url, open_url, reaching
+from semantic_mapper.nodes.fleet.store import Store, fetch, is_store, is_url
 from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX
 from semantic_mapper.types import Float64
@@ -32,7 +31,7 @@ _WAY_OUT = "Give its pose in the file of --poses"
 class MergeReport:
     """What a merge has done."""
 
-    merged: VoxelMap  # the map
+    merged: VoxelMap
     poses: Mapping[str, Float64]  # T_world_map (4, 4) float64 by name, in the order in which the maps were added
     notes: tuple[str, ...]  # how the pose of each is known, likewise
 
@@ -63,7 +62,7 @@ def merge_maps(
     poses: dict[str, Float64] = {}
     notes: list[str] = []
     with tempfile.TemporaryDirectory(prefix="semantic-mapper-merge-") as folder:
-        files = {name: _fetch(url, Path(folder) / f"{n}.npz") for n, (name, url) in enumerate(sources.items())}
+        files = {name: fetch(url, Path(folder) / f"{n}.npz") for n, (name, url) in enumerate(sources.items())}
         whole = _empty_map({name: describe_map(file) for name, file in files.items()})
         waiting = sorted(names, key=lambda name: name not in known)
         while waiting:
@@ -103,13 +102,16 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
         itself where two have the same name.
 
     Raises:
-        ConfigError: fewer than two maps, a store without maps, or no such file.
+        ConfigError: fewer than two maps, or no such file.
         StoreError: a store cannot be reached.
     """
     found: list[tuple[str, str]] = []
     for argument in arguments:
         if not argument.endswith(MAP_SUFFIX) and is_store(argument):
-            found += _maps_of_store(Store(argument))
+            store = Store(argument)
+            replays = sorted((r for r in store.results() if r.operation == "replay"), key=lambda r: r.finished_ns)
+            latest = {result.log_digest: result for result in replays}.values()
+            found += sorted((_stem(r.log), f"{store.url}/{r.folder}/{MAP_NAME}") for r in latest)
             continue
         url = argument if is_url(argument) else str(Path(argument).absolute())
         url = url if url.endswith(MAP_SUFFIX) else f"{url.rstrip('/')}/{MAP_NAME}"
@@ -119,18 +121,15 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
     stems = [stem for stem, _ in found]
     named = {stem if stems.count(stem) == 1 else without_secrets(url): url for stem, url in found}
     if len(named) < 2:
-        raise ConfigError("a merge needs two maps or more")
+        raise ConfigError(f"a merge needs two maps or more; these are: {', '.join(named) or 'none'}")
     return named
 
 
 def read_poses(path: Path) -> dict[str, Float64]:
-    """Poses of maps by their names.
+    """T_world_map (4, 4) float64 by the names of maps.
 
     Args:
         path: JSON, an object whose values are 4 rows of 4 numbers (T_world_map) or [x, y, z, yaw_deg], yaw about +z.
-
-    Returns:
-        T_world_map (4, 4) float64 by name.
 
     Raises:
         ConfigError: the file cannot be read, or holds something else.
@@ -141,23 +140,12 @@ def read_poses(path: Path) -> dict[str, Float64]:
         where = f"{path}: {name}"
         try:
             T = np.array(values, np.float64)
+            T = yaw_transform(T[:3], float(T[3])) if T.shape == (4,) else T.reshape(4, 4)
         except (TypeError, ValueError) as error:
-            raise ConfigError(f"{where}: {error}") from error
-        if T.shape == (4,):
-            T = yaw_transform(T[:3], float(T[3]))
-        if T.shape != (4, 4):
-            raise ConfigError(f"{where}: expected 4 rows of 4 numbers or [x, y, z, yaw_deg], got shape {T.shape}")
+            raise ConfigError(f"{where}: expected 4 rows of 4 numbers or [x, y, z, yaw_deg] ({error})") from error
         check_pose(T, where)
         poses[name] = T
     return poses
-
-
-def _maps_of_store(store: Store) -> list[tuple[str, str]]:
-    replays = sorted((r for r in store.results() if r.operation == "replay"), key=lambda r: r.finished_ns)
-    latest = {result.log_digest: result for result in replays}.values()
-    if not latest:
-        raise ConfigError(f"{store.shown}: has no maps; `fleet run replay` makes them")
-    return [(_stem(r.log), f"{store.url}/{r.folder}/{MAP_NAME}") for r in sorted(latest, key=lambda r: r.log)]
 
 
 def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
@@ -184,16 +172,6 @@ def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
 
 def _memory_mb(manifest: MapManifest) -> int:
     return min(manifest.config.memory_mb or MEMORY_MB, MEMORY_MB)
-
-
-def _fetch(url: str, target: Path) -> Path:
-    """The map as a local file; ``target`` where it is elsewhere."""
-    fs, path = open_url(url)
-    if "file" in fs.protocol:
-        return Path(path)
-    with reaching(url):
-        fs.get_file(path, str(target))
-    return target
 
 
 def _stem(url: str) -> str:

@@ -1,10 +1,12 @@
 """``fleet run``: one task for each log, scheduled and tried again by Ray; what is done is in the store alone.
 
-So a run that was stopped or killed goes on with the same command, and nothing has to be repaired before.
+So a run that was stopped or killed goes on with the same command, and nothing has to be repaired before. A task is one
+of the jobs of ``replay.jobs``, with its settings and its findings.
 """
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import os
 import random
@@ -17,30 +19,73 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
 import semantic_mapper
-from semantic_mapper.config import convert_config, to_plain
+from semantic_mapper.config import (
+    Config,
+    DepthConfig,
+    Fraction,
+    MapperConfig,
+    NotNegative,
+    assign,
+    check_quality,
+    convert_config,
+    parse_assignments,
+    read_toml,
+    to_plain,
+)
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError, WeightsError
+from semantic_mapper.evaluation.metrics import Segments, class_sums
 from semantic_mapper.fields.checkpoint import load_checkpoint, shipped_checkpoint
 from semantic_mapper.fields.nesf import SMOOTHING, load_nesf
+from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.nodes.fleet.operations import OPERATIONS, read_settings
-from semantic_mapper.nodes.fleet.store import Failure, Store, TaskResult, file_digest
-from semantic_mapper.nodes.fleet.urls import LogInput, MissingError, full_url, is_url, open_url, reaching
+from semantic_mapper.nodes.fleet.store import (
+    Failure,
+    Findings,
+    LogInput,
+    MethodScores,
+    MissingError,
+    Store,
+    TaskResult,
+    fetch,
+    file_digest,
+    full_url,
+    is_url,
+    open_url,
+    reaching,
+)
 from semantic_mapper.plain_text import without_secrets
-from semantic_mapper.replay.run_folder import LOG_SUFFIX
+from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
+from semantic_mapper.replay.jobs import (
+    OFFLINE,
+    AutolabelRequest,
+    FinetuneRequest,
+    autolabel_log,
+    evaluate_log,
+    finetune_log,
+    refine_map,
+    replay_log,
+)
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME
+from semantic_mapper.replay.summary import dig, notes
+from semantic_mapper.training.config import FinetuneConfig
 
 MAX_RETRIES = 3  # of a task whose process died, whose node was lost, or that could not reach log or store
 _MAX_ERROR = 2000  # letters
+_MAX_EVENTS = 200  # of one log
+_SCORES = ("miou", "total_accuracy", "average_accuracy", "coverage")
 _PACKAGE = Path(semantic_mapper.__file__).parent
 _SOURCES = (".py", ".c", ".h", ".jinja", ".js", ".safetensors")
 _COMPUTING = ("torch", "numpy", "scipy", "open3d", "opencv-contrib-python-headless")
 _VERSIONS = ("ETag", "etag", "md5Hash", "crc32c", "mtime", "LastModified", "updated")  # of s3, http, gs, file
 
 _log = get_logger(__name__)
+
+ConfigT = TypeVar("ConfigT", bound=Config)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +98,13 @@ class Task:
     shown_settings: Mapping[str, Any]  # what was set, for people
     weights: str  # their file's name, or the name of weights that ship with the package; empty = the default ones
     weights_data: bytes  # content of their file; empty = they ship with the package
-    weights_digest: str  # SHA-256 of it
     code: str  # digest of the code that the driver has
 
     def key(self, log: str) -> str:
         """Digest of all that decides the result for a log, which is named by the digest of its content."""
         settings = msgspec.json.encode(self.settings, order="deterministic").decode()
-        return _digest(self.operation, log, self.weights_digest or self.weights, settings, self.code)
+        weights = hashlib.sha256(self.weights_data).hexdigest() if self.weights_data else self.weights
+        return _digest(self.operation, log, weights, settings, self.code)
 
 
 @dataclass(slots=True)
@@ -93,18 +138,27 @@ def make_task(
         operation: Of ``OPERATIONS``.
         out: Path or URL of the store, which is made where nothing is.
         weights: File, URL, or name of weights that ship; None = the default ones.
-        assignments, config: See ``read_settings``.
+        assignments: What ``--set NAME=VALUE`` says, such as ``max_frames=100`` or ``voxel_map.voxel_size_m=0.05``.
+        config: TOML file with the same names; assignments go before it.
 
     Raises:
-        ConfigError: a setting cannot be used, or no store can be there.
+        ConfigError: a setting cannot be used (the nearest one is named), or no store can be there.
         WeightsError: the weights cannot.
         StoreError: they cannot be fetched.
     """
-    settings, given = read_settings(operation, assignments, config)
+    found = OPERATIONS[operation]
+    given = {} if config is None else read_toml(config)
+    for name, value in parse_assignments(assignments).items():
+        assign(given, name, value, "--set")
+    data = copy.deepcopy(given)
+    for name, value in found.defaults.items():
+        assign(data, name, value, "--set", replace=False)
+    settings = convert_config(data, found.settings, "--set")
+    if isinstance(settings, MapperConfig):
+        check_quality(given, settings.quality, "--set")
+    name, content = ("", b"") if weights is None else _read_weights(operation, weights)
     store = Store(out, create=True)
-    name, data = ("", b"") if weights is None else _read_weights(operation, weights)
-    digest = hashlib.sha256(data).hexdigest() if data else ""
-    return Task(operation, store.url, to_plain(settings), given, name, data, digest, code_digest())
+    return Task(operation, store.url, to_plain(settings), given, name, content, code_digest())
 
 
 def run_fleet(
@@ -159,12 +213,25 @@ def run_fleet(
     while running and not stopped():
         ready, _ = ray.wait(list(running), num_returns=len(running), timeout=0.2)
         for reference in ready:
-            key, error = task.key(running[reference].url), _count(reference, report)
+            log = running.pop(reference)
+            key, error = task.key(log.url), _count(reference, report)
             if error:
-                report.failures.append(_note_failure(store, task, key, running[reference], error))
+                error = without_secrets(" ".join(error.split()))[:_MAX_ERROR]
+                shown, version = without_secrets(log.url), code_version()
+                failure = Failure(
+                    key=key,
+                    operation=task.operation,
+                    log=shown,
+                    tags=log.tags,
+                    version=version,
+                    error=error,
+                    finished_ns=time.time_ns(),
+                )
+                _log.error("log_failed", log=shown, error=error)
+                store.note_failure(failure)
+                report.failures.append(failure)
             elif f"{key}.json" in failed_before:
                 store.remove(f"failures/{key}.json")
-            del running[reference]
             on_progress(report)
     for reference in running:
         ray.cancel(reference, force=True)
@@ -172,11 +239,7 @@ def run_fleet(
 
 
 def _count(reference: Any, report: RunReport) -> str:
-    """Count a task that has ended; what went wrong, or an empty text.
-
-    Raises:
-        FleetError: every log would fail like that.
-    """
+    """Count a task that has ended; what went wrong, or an empty text. A ``FleetError`` is that of every log."""
     import ray
     from ray.exceptions import RayError, RayTaskError
 
@@ -193,33 +256,15 @@ def _count(reference: Any, report: RunReport) -> str:
     return ""
 
 
-def _note_failure(store: Store, task: Task, key: str, log: LogInput, error: str) -> Failure:
-    failure = Failure(
-        key=key,
-        operation=task.operation,
-        log=without_secrets(log.url),
-        tags=log.tags,
-        version=code_version(),
-        error=without_secrets(" ".join(error.split()))[:_MAX_ERROR],
-        finished_ns=time.time_ns(),
-    )
-    _log.error("log_failed", log=failure.log, error=failure.error)
-    store.note_failure(failure)
-    return failure
-
-
 def _read_weights(operation: str, weights: str) -> tuple[str, bytes]:
     """Name and content; no content for weights that ship."""
     refines = operation == "refine"
     is_file = is_url(weights) or Path(weights).is_file()
     if not is_file and ((refines and Path(weights) == SMOOTHING) or shipped_checkpoint(Path(weights)) is not None):
         return weights, b""
-    fs, path = open_url(weights)
-    with reaching(weights):
-        data = fs.cat_file(path)
-    with tempfile.TemporaryDirectory() as folder:
-        local = Path(folder) / _name_of(path)
-        local.write_bytes(data)
+    with tempfile.TemporaryDirectory() as folder, reaching(weights):
+        local = fetch(weights, Path(folder) / _name_of(weights))
+        data = local.read_bytes()
         try:
             (load_nesf if refines else load_checkpoint)(local)
         except WeightsError as error:
@@ -253,15 +298,16 @@ def run_task(task: Task, log: LogInput) -> bool:
     versions = _versions(log.url)
     source = f"sources/{_digest(log.url, *versions.values())}"
     known = store.find(source) if all(versions.values()) else None  # the log was read before
-    if known is not None and store.exists(f"results/{task.key(known.decode())}.json"):
+    if known is not None and store.find(f"results/{task.key(known.decode())}.json") is not None:
         return False
     with tempfile.TemporaryDirectory(prefix="semantic-mapper-fleet-") as name:
         folder = Path(name)
-        paths = [_local(url, folder / "log") for url in versions]
+        paths = [fetch(url, folder / "log" / _name_of(url)) for url in versions]
         digests = [file_digest(path) for path in paths]
         digest = digests[0] if len(digests) == 1 else _digest(*digests)
         store.write(source, digest.encode())
-        if store.exists(f"results/{task.key(digest)}.json"):  # another URL of the same log
+        key = task.key(digest)
+        if store.find(f"results/{key}.json") is not None:  # another URL of the same log
             return False
         out = folder / "out"
         out.mkdir()
@@ -273,12 +319,10 @@ def run_task(task: Task, log: LogInput) -> bool:
             weights.write_bytes(task.weights_data)
         findings = operation.run(paths[0] if len(paths) == 1 else paths[0].parent, out, weights, settings)
         if _versions(log.url) != versions:
-            raise LogError(
-                f"{without_secrets(log.url)}: has changed while it was read; run it again once it is written"
-            )
-        place = f"files/{task.key(digest)}/{secrets.token_hex(6)}"
+            raise LogError(f"{without_secrets(log.url)}: changed while it was read; run it again once it is written")
+        place = f"files/{key}/{secrets.token_hex(6)}"
         result = TaskResult(
-            key=task.key(digest),
+            key=key,
             operation=task.operation,
             log=without_secrets(log.url),
             log_digest=digest,
@@ -298,35 +342,27 @@ def run_task(task: Task, log: LogInput) -> bool:
 
 def _upload(store: Store, out: Path, place: str) -> dict[str, str]:
     """Put files of a result into the store, their digests by name; after an error nothing of them stays."""
-    files: dict[str, str] = {}
+    files = {path.relative_to(out).as_posix(): path for path in sorted(out.rglob("*")) if path.is_file()}
     try:
-        for path in sorted(p for p in out.rglob("*") if p.is_file()):
-            name = path.relative_to(out).as_posix()
-            files[name] = file_digest(path)
+        for name, path in files.items():
             store.upload(path, f"{place}/{name}")
     except StoreError:
         store.remove(place)
         raise
-    return files
+    return {name: file_digest(path) for name, path in files.items()}
 
 
 def _versions(url: str) -> dict[str, str]:
-    """URLs of the files of a log: itself, or the parts in its folder; with size and version, empty where not known.
-
-    Raises:
-        LogError: nothing is there.
-        StoreError: it cannot be reached.
-    """
+    """URLs of the files of a log: itself, or the parts in its folder; with size and version, empty where not known."""
     fs, path = open_url(url)
     fs.invalidate_cache()
     try:
         with reaching(url):
             info = fs.info(path)
-            is_folder = info["type"] == "directory"
-            parts = fs.ls(path, detail=True) if is_folder else [{**info, "name": path}]
+            parts = fs.ls(path, detail=True) if info["type"] == "directory" else [{**info, "name": path}]
     except MissingError as error:
         raise LogError(f"{without_secrets(url)}: no such log") from error
-    if is_folder:
+    if info["type"] == "directory":
         parts = sorted((p for p in parts if p["name"].lower().endswith(LOG_SUFFIX)), key=lambda p: p["name"])
     if not parts:
         raise LogError(f"{without_secrets(url)}: a folder without logs ({LOG_SUFFIX})")
@@ -334,27 +370,13 @@ def _versions(url: str) -> dict[str, str]:
     return dict(zip((full_url(fs, part["name"], url) for part in parts), versions, strict=True))
 
 
-def _local(url: str, folder: Path) -> Path:
-    """A file of a log on this machine, downloaded to a folder where it is elsewhere."""
-    fs, path = open_url(url)
-    if "file" in fs.protocol:
-        return Path(path)
-    folder.mkdir(exist_ok=True)
-    with reaching(url):
-        fs.get_file(path, str(folder / _name_of(path)))
-    return folder / _name_of(path)
-
-
-def _name_of(path: str) -> str:
+def _name_of(url: str) -> str:
     """Of a file, without what signs a web address."""
-    return Path(path.split("?", 1)[0]).name
+    return Path(url.split("?", 1)[0]).name
 
 
 def _digest(*texts: str) -> str:
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:40]
-
-
-# The code
 
 
 @cache
@@ -375,3 +397,151 @@ def code_digest() -> str:
 def code_version() -> str:
     """Of the package, with the first digits of ``code_digest``, such as ``0.1.0+1a2b3c4d``."""
     return f"{semantic_mapper.__version__}+{code_digest()[:8]}"
+
+
+# The operations
+
+
+class LogSettings(MapperConfig, frozen=True):
+    """Of ``replay`` and ``eval``: those of the mapper, and ``max_frames`` (0 = all)."""
+
+    max_frames: NotNegative = 0
+
+
+class AutolabelSettings(LogSettings, frozen=True):
+    """Of ``autolabel``."""
+
+    write_depth: bool = False
+    min_confidence: Fraction = 0.0
+    overwrite_labels: bool = False
+
+
+class FinetuneSettings(FinetuneConfig, frozen=True):
+    """Of ``finetune``: those of finetuning, and which field learns from what."""
+
+    keyframes: Annotated[int, msgspec.Meta(ge=2)] = 8
+    # Of a field of one scene; empty = finetune the weights. No "panoptic", which needs boxes of each log.
+    kind: Literal["", "irt", "grid"] = ""
+
+
+class RefineSettings(Config, frozen=True):
+    """Of ``refine``."""
+
+    fill: Fraction = 0.5
+    up: str = "auto"
+    by_name: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """One of ``OPERATIONS``."""
+
+    settings: type[Config]  # kind of its settings
+    # does it: log, empty folder for files of the result, weights (None = those that ship), settings
+    run: Callable[[Path, Path, Path | None, Any], Findings]
+    memory_gb: float = 2.0  # a task is given at least so much, unless the user says otherwise
+    defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])  # settings that differ from those of the kind
+
+
+def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
+    result = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
+    summary = result.summary
+    metrics = {name: dig(summary, f"metrics.{name}") for name in (*_SCORES, "map_miou")}
+    metrics |= {f"frames_{name}": count for name, count in summary["frames"].items()}
+    metrics |= {name: summary["map"][name] for name in ("surface_points", "blocks", "cleared_voxels", "unknown")}
+    metrics["depth_disagreement"] = dig(summary, "pose_check.worst_depth_disagreement")
+    costs = {f"step_ms_{name}": value for name, value in summary["latency_ms"].items()}
+    events = [("note", text) for text in notes(summary)]
+    events += [("damaged", text) for text in summary["damaged_stretches"]]
+    events += [("refused", f"frame {r['seq']}: {r['reason']}") for r in summary["refusals"]]
+    return Findings(
+        metrics=metrics,
+        costs={**costs, "map_memory_mb": summary["map"]["memory_mb"]},
+        scores=(_scores("replay", dig(summary, "metrics.per_class") or {}, result.session.segments),),
+        events=tuple(events[:_MAX_EVENTS]),
+    )
+
+
+def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
+    result = evaluate_log(log, weights, _part(settings, MapperConfig), settings.max_frames)
+    scores = result.plain()
+    found: dict[str, Any] = {"replays": {}, "logs": {log.name: scores}}
+    write_json(out / "eval.json", found)
+    write_eval_report(out / "eval.html", {}, [], {log.name: score_table(log.name, scores)}, found)
+    methods: Mapping[str, Mapping[str, Any]] = scores["methods"]
+    main = next(iter(methods.values()))
+    metrics = {key: main.get(key) for key in (*_SCORES, "ece")}
+    metrics |= {f"miou {method}": figures.get("miou") for method, figures in methods.items()}
+    metrics |= {f"frames_{key}": scores[key] for key in ("scored", "excluded", "refused", "damaged", "pseudo_labelled")}
+    return Findings(
+        metrics=metrics,
+        scores=tuple(_scores(method, f["per_class"], result.segments.get(method)) for method, f in methods.items()),
+    )
+
+
+def _autolabel(log: Path, out: Path, weights: Path | None, settings: AutolabelSettings) -> Findings:
+    request = AutolabelRequest(
+        (log,),
+        out / "labelled.mcap",
+        weights,
+        _part(settings, MapperConfig),
+        settings.write_depth,
+        settings.min_confidence,
+        settings.overwrite_labels,
+        settings.max_frames,
+    )
+    report = autolabel_log(request)
+    figures = ("frames", "labelled", "kept", "replaced", "unlabelled", "depth_written", "mean_confidence")
+    events = [("unlabelled", text) for text in report.unlabelled]
+    events += [("damaged", text) for text in report.damage]
+    return Findings(
+        metrics={name: getattr(report.note, name) for name in (*figures, "labelled_pixels")},
+        events=tuple(events[:_MAX_EVENTS]),
+    )
+
+
+def _finetune(log: Path, out: Path, weights: Path | None, settings: FinetuneSettings) -> Findings:
+    request = FinetuneRequest(
+        log,
+        out / "weights.safetensors",
+        0 if settings.kind == "grid" else settings.keyframes,  # a grid learns no classes
+        _part(settings, FinetuneConfig),
+        None if settings.kind else weights,
+        depth=DepthConfig(source="sensor"),
+        kind=settings.kind or None,
+    )
+    result = finetune_log(request)
+    recipe = result.checkpoint.recipe
+    names = ("steps", "best_step", "held_out_loss", "held_out_accuracy", "psnr")
+    return Findings(
+        metrics={name: recipe[name] for name in names if name in recipe},
+        costs={"fit_s": recipe.get("seconds")},
+        events=(("keyframes", ", ".join(map(str, result.chosen))),),
+    )
+
+
+def _refine(log: Path, out: Path, weights: Path | None, settings: RefineSettings) -> Findings:
+    report = refine_map(log, out / MAP_NAME, weights, **to_plain(settings)).report
+    return Findings(metrics={name: getattr(report, name) for name in ("surface", "relabelled", "filled")})
+
+
+OPERATIONS: Mapping[str, Operation] = {
+    "replay": Operation(LogSettings, _replay, defaults=OFFLINE),
+    "eval": Operation(LogSettings, _eval),
+    "autolabel": Operation(AutolabelSettings, _autolabel, defaults=OFFLINE),
+    "finetune": Operation(FinetuneSettings, _finetune, memory_gb=4.0),
+    "refine": Operation(RefineSettings, _refine, memory_gb=4.0),
+}
+
+
+def _part(settings: Config, kind: type[ConfigT]) -> ConfigT:
+    """Those settings that a job's own config has."""
+    return kind(**{name: getattr(settings, name) for name in kind.__struct_fields__})
+
+
+def _scores(method: str, iou: dict[str, float | None], segments: Segments | None) -> MethodScores:
+    if segments is None:
+        return MethodScores(method, iou)
+    parts = segments.all()
+    stretches = tuple(tuple(tuple(row) for row in class_sums(part.confusion.counts).tolist()) for part in parts)
+    return MethodScores(method, iou, tuple(segments.label_set.names), stretches, tuple(part.first for part in parts))

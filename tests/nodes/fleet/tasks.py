@@ -9,7 +9,7 @@ from pathlib import Path
 
 from semantic_mapper.errors import LogError, StoreError
 from semantic_mapper.nodes.fleet.run import Task
-from semantic_mapper.nodes.fleet.urls import LogInput
+from semantic_mapper.nodes.fleet.store import LogInput
 
 
 def do_as_named(task: Task, log: LogInput) -> bool:

@@ -87,10 +87,10 @@ def test_a_signal_ends_the_cluster_of_this_machine(signum: signal.Signals) -> No
 @pytest.mark.parametrize(
     ("address", "said"),
     [
-        ("localhost", "give HOST:PORT"),
-        ("ray://10.0.0.1:10001", "give HOST:PORT"),
-        ("127.0.0.1:99999", "give HOST:PORT"),
-        ("no-such-host.invalid:6379", "there is no host"),
+        ("localhost", "not the address of a Ray cluster"),
+        ("ray://10.0.0.1:10001", "not the address of a Ray cluster"),
+        ("127.0.0.1:99999", "not the address of a Ray cluster"),
+        ("no-such-host.invalid:6379", "not the address of a Ray cluster"),
         ("192.0.2.1:6379", "RAY_AUTH_MODE=token is not set, so that anybody there can run code"),
     ],
 )

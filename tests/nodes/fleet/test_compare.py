@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.fleet.compare import FleetComparison, compare_stores
+from semantic_mapper.nodes.fleet.results import FleetComparison, compare_stores
 from semantic_mapper.nodes.fleet.store import TaskResult
 from tests.nodes.fleet.made_up import FINISHED_NS, failure_of, made_up, store_of
 
@@ -121,5 +121,5 @@ def test_what_cannot_be_compared_says_what_there_is(compared: Any) -> None:
         compared([made_up(1)], [made_up(2)])
     with pytest.raises(ConfigError, match="'moiu'; there are: blocks, frames_fused, iou:chair"):
         compared(both, both, operation="eval", metric="moiu")
-    with pytest.raises(ConfigError, match="has no results of `finetune`"):
+    with pytest.raises(ConfigError, match=r"\(--operation\): eval, replay"):
         compared(both, both, operation="finetune")

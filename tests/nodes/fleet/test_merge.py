@@ -145,7 +145,7 @@ def test_maps_that_cannot_be_merged_are_refused(maps: list[str], tmp_path: Path)
         merged(maps, {"d": np.eye(4)})
     with pytest.raises(ConfigError, match="no such map file"):
         merged([*maps, str(tmp_path / "none.npz")])
-    with pytest.raises(ConfigError, match="has no maps"):
+    with pytest.raises(ConfigError, match="two maps or more; these are: none"):
         merged([store_of(tmp_path / "store").url])
     place = Place("camera", 5, np.eye(4), np.ones((5, 3), np.float32), np.ones((5, 128), np.uint8))
     for name, folder in zip("ab", maps, strict=False):

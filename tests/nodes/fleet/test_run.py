@@ -14,10 +14,8 @@ import pytest
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError
 from semantic_mapper.nodes.fleet import run
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.operations import read_settings
 from semantic_mapper.nodes.fleet.run import RunReport, Task, run_fleet, run_task
-from semantic_mapper.nodes.fleet.store import Store, TaskResult
-from semantic_mapper.nodes.fleet.urls import LogInput
+from semantic_mapper.nodes.fleet.store import LogInput, Store, TaskResult
 from semantic_mapper.replay.summary import read_summary
 from tests.nodes.fleet.tasks import do_as_named
 
@@ -60,7 +58,7 @@ def test_a_replay_of_the_fleet_is_that_of_the_verb(
 
 def test_other_settings_weights_content_or_code_are_another_result(tmp_path: Path, weights: Path) -> None:
     task = task_of("replay", tmp_path, weights)
-    others = [replace(task, weights_digest="other"), replace(task, code="other"), replace(task, operation="eval")]
+    others = [replace(task, weights_data=b"other"), replace(task, code="other"), replace(task, operation="eval")]
     others.append(task_of("replay", tmp_path, weights, None, "max_frames=2"))
     keys = {task.key("digest"), task.key("other"), *(other.key("digest") for other in others)}
     assert len(keys) == 6
@@ -111,24 +109,20 @@ def test_what_a_worker_cannot_do_says_why(tmp_path: Path, log: Path, weights: Pa
 
 
 @pytest.mark.parametrize(
-    ("operation", "text", "why"),
+    ("operation", "weights", "sets", "why"),
     [
-        ("replay", "max_frame=3", "did you mean `max_frames`"),
-        ("finetune", "second=3", "did you mean `seconds`"),
-        ("replay", "voxel_map.voxel_size=3", "voxel_size_m"),
+        ("replay", None, "max_frame=3", "did you mean `max_frames`"),
+        ("finetune", None, "second=3", "did you mean `seconds`"),
+        ("replay", None, "voxel_map.voxel_size=3", "voxel_size_m"),
+        ("replay", "none.safetensors", "max_frames=3", r"none\.safetensors: is missing"),
     ],
 )
-def test_settings_that_cannot_be_used_say_why(operation: str, text: str, why: str) -> None:
-    with pytest.raises(ConfigError, match=why):
-        read_settings(operation, [text])
-
-
-def test_a_store_is_not_made_for_what_cannot_be_run(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        run.make_task("replay", str(tmp_path / "store"), None, ["no=1"])
+def test_no_store_is_made_for_what_cannot_be_run(
+    tmp_path: Path, operation: str, weights: str | None, sets: str, why: str
+) -> None:
+    with pytest.raises((ConfigError, StoreError), match=why):
+        run.make_task(operation, str(tmp_path / "store"), weights, [sets])
     assert not (tmp_path / "store").exists()
-    with pytest.raises(StoreError, match=r"none\.safetensors: is missing"):
-        run.make_task("replay", str(tmp_path / "store"), str(tmp_path / "none.safetensors"))
 
 
 # The driver
@@ -142,7 +136,7 @@ def _cluster() -> Iterator[None]:
 
 def run_logs(folder: Path, *logs: str, **options: Any) -> RunReport:
     (folder / "traces").mkdir(exist_ok=True)
-    task = Task("replay", Store(str(folder / "store"), create=True).url, {}, {}, "", b"", "", "")
+    task = Task("replay", Store(str(folder / "store"), create=True).url, {}, {}, "", b"", "")
     inputs = [LogInput(log, {"traces": str(folder / "traces")}) for log in logs]
     return run_fleet(task, inputs, memory_gb=0.001, function=do_as_named, **options)
 
@@ -187,6 +181,6 @@ def test_a_stop_ends_tasks_at_once(tmp_path: Path) -> None:
     ("needs", "what"), [({"cpus": 64}, "64 CPUs"), ({"gpus": 1}, "1 GPUs"), ({"memory_gb": 1e6}, "1e.06 GB of memory")]
 )
 def test_what_no_node_has_is_refused_at_once(tmp_path: Path, needs: dict[str, Any], what: str) -> None:
-    task = Task("replay", Store(str(tmp_path), create=True).url, {}, {}, "", b"", "", "")
+    task = Task("replay", Store(str(tmp_path), create=True).url, {}, {}, "", b"", "")
     with pytest.raises(FleetError, match=what):
         run_fleet(task, [LogInput("a")], function=do_as_named, **needs)

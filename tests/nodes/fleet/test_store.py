@@ -11,9 +11,8 @@ from fsspec.config import conf, set_conf_env
 from moto.server import ThreadedMotoServer
 
 from semantic_mapper.errors import ConfigError, StoreError
-from semantic_mapper.nodes.fleet.store import Store, is_store
-from semantic_mapper.nodes.fleet.table import Tables
-from semantic_mapper.nodes.fleet.urls import find_inputs
+from semantic_mapper.nodes.fleet.results import Tables
+from semantic_mapper.nodes.fleet.store import Store, find_inputs, is_store
 from tests.nodes.fleet.made_up import failure_of, made_up, store_of
 
 RESULT = made_up(1)
@@ -105,8 +104,8 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
         Store("memory://bucket/fleet?X-Amz-Signature=abc", create=True)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     for place in (tmp_path, tmp_path / "notes.txt"):
-        with pytest.raises((ConfigError, StoreError), match=r"choose another --out|is refused"):
+        with pytest.raises((ConfigError, StoreError), match=r"choose another --out|cannot be reached"):
             Store(str(place), create=True)
     (tmp_path / "fleet.json").write_text('{"format": "semantic-mapper-fleet", "version": 99}', encoding="utf-8")
-    with pytest.raises(ConfigError, match="damaged or of another version"):
+    with pytest.raises(ConfigError, match="no fleet store of this version"):
         Store(str(tmp_path))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.fleet.table import Tables
+from semantic_mapper.nodes.fleet.results import Tables
 from tests.nodes.fleet.made_up import NAMES, failure_of, made_up, store_of
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.errors import ConfigError, FleetError, StoreError
-from semantic_mapper.nodes.fleet.urls import find_inputs, is_url, open_url, reaching
+from semantic_mapper.nodes.fleet.store import find_inputs, is_url, open_url, reaching
 
 SECRET = "wJalrXUtnFEMI/K7MDENG/bPxRfiCYEXAMPLEKEY"
 
@@ -84,9 +84,9 @@ def test_a_manifest_gives_tags_and_counts_from_its_own_folder(logs: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("path,robot\na.mcap,r1\n", "no column 'log'"),
-        ("log,robot\n,r1\n", "line 2 names no log"),
-        ("log,robot\na.mcap\n", "another number of columns"),
+        ("path,robot\na.mcap,r1\n", "in the column 'log'"),
+        ("log,robot\n,r1\n", "line 2 must have a path"),
+        ("log,robot\na.mcap\n", "as many columns as the first"),
         ("log,robot\n", "no logs are given"),
         ("log,robot\n\xff,b", "no CSV in UTF-8"),
     ],
@@ -98,7 +98,7 @@ def test_a_manifest_that_cannot_be_used_says_why(logs: Path, text: str, why: str
 
 
 @pytest.mark.parametrize(
-    ("name", "why"), [("c.mcap", "no such log"), ("d*.mcap", "matches no file"), ("c*/", "folder")]
+    ("name", "why"), [("c.mcap", "no such log"), ("d*.mcap", "matches no file"), ("c*/", "matches no directory")]
 )
 def test_nothing_there_is_an_error(logs: Path, name: str, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
