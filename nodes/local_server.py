@@ -19,4 +19,5 @@ class LocalServer(ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A request that its handler could not answer, such as of a browser that has left."""
         error = sys.exc_info()[1]
-        _log.warning("request_not_served", reason=f"{type(error).__name__}: {error}")
+        report = _log.debug if isinstance(error, OSError) else _log.warning  # the browser has left
+        report("request_not_served", reason=f"{type(error).__name__}: {error}")

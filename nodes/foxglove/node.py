@@ -91,11 +91,7 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
 
 
 def _hand_on(parts: list[bytes], server: FoxgloveServer, sender: _MapSender, streams: Streams, poses: MapPoses) -> None:
-    """One message of a node.
-
-    Raises:
-        CodecError: it cannot be decoded.
-    """
+    """One message of a node."""
     envelope = read_envelope(parts)
     match envelope.topic:
         case "frame":

@@ -11,8 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from types import TracebackType
+from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import cv2
@@ -50,18 +49,16 @@ PATH_COLOR = messages.Color(r=1.0, g=0.85, b=0.2, a=1.0)
 ROOM_COLOR = messages.Color(r=0.9, g=0.9, b=0.95, a=1.0)
 DOOR_COLOR = messages.Color(r=1.0, g=0.5, b=0.1, a=1.0)
 BOX_OPACITY = 0.35
+_TEXT, _OBJECT = {"type": "string"}, {"type": "object"}
 STATUS_SCHEMA = {
     "type": "object",
     "properties": {
-        "node": {"type": "string"},
-        "state": {"type": "string"},
-        "stamp_ns": {"type": "integer"},
-        "counters": {"type": "object"},
-        "ages_s": {"type": "object"},
-        "degraded": {"type": "array", "items": {"type": "string"}},
+        **{"node": _TEXT, "state": _TEXT, "stamp_ns": {"type": "integer"}, "counters": _OBJECT, "ages_s": _OBJECT},
+        "degraded": {"type": "array", "items": _TEXT},
     },
 }
 Subject = Literal["map", "graph"]
+_ORIGIN = messages.Pose(position=messages.Vector3(), orientation=messages.Quaternion(w=1.0))
 _TYPES = {"<f4": messages.PackedElementFieldNumericType.Float32, "|u1": messages.PackedElementFieldNumericType.Uint8}
 _MAPS: dict[str, Subject] = {"/map/classes": "map", "/map/colors": "map", "/map/info": "map", "/graph": "graph"}
 
@@ -113,7 +110,7 @@ class FoxgloveServer:
         self._path = channels.SceneUpdateChannel("/path", context=context)
         self._classes = channels.PointCloudChannel("/map/classes", context=context)
         self._colors = channels.PointCloudChannel("/map/colors", context=context)
-        self._info = foxglove.Channel("/map/info", schema={"type": "object"}, context=context)
+        self._info = foxglove.Channel("/map/info", schema=_OBJECT, context=context)
         self._graph = channels.SceneUpdateChannel("/graph", context=context)
         self._status = foxglove.Channel("/status", schema=STATUS_SCHEMA, context=context)
 
@@ -125,9 +122,7 @@ class FoxgloveServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._server.stop()
 
     def requests(self, subject: Subject) -> int:
@@ -150,9 +145,11 @@ class FoxgloveServer:
 
     def send_frame(self, frame: PosedFrame, T_map_camera: Float64 | None) -> None:
         """One camera image with its pose in the map; None while that is not known."""
-        camera, when, name = self._camera(frame.camera_id), frame.stamp_ns, _camera_frame(frame.camera_id)
+        camera, when, name = self._camera(frame.camera_id), frame.stamp_ns, f"camera/{frame.camera_id}"
         if T_map_camera is not None and self._tf.has_sinks():
-            moved = _transform(T_map_camera, name, when)
+            position, rotation = _pose(T_map_camera[:3, :3], T_map_camera[:3, 3])
+            places = {"parent_frame_id": WORLD, "child_frame_id": name, "translation": position, "rotation": rotation}
+            moved = messages.FrameTransform(timestamp=_stamp(when), **places)
             self._tf.log(messages.FrameTransforms(transforms=[moved]), log_time=when)
         if camera.calibration.has_sinks():
             camera.calibration.log(_calibration(frame.intrinsics, name, when), log_time=when)
@@ -161,15 +158,14 @@ class FoxgloveServer:
             camera.rgb.log(_picture(picture, "jpeg", name, when), log_time=when)
         if camera.depth.has_sinks() and frame.depth_m is not None:
             height, width = frame.depth_m.shape
-            data = np.ascontiguousarray(frame.depth_m, "<f4").tobytes()
             form = {"width": width, "height": height, "encoding": "32FC1", "step": 4 * width}
-            image = messages.RawImage(timestamp=_stamp(when), frame_id=name, data=data, **form)
-            camera.depth.log(image, log_time=when)
+            data = np.ascontiguousarray(frame.depth_m, "<f4").tobytes()
+            camera.depth.log(messages.RawImage(timestamp=_stamp(when), frame_id=name, data=data, **form), log_time=when)
 
     def send_update(self, update: MapUpdate) -> None:
         """What was rendered for a frame."""
         camera, labels, when = self._camera(update.camera_id), self._labels, update.stamp_ns
-        name = _camera_frame(update.camera_id)
+        name = f"camera/{update.camera_id}"
         if labels is not None and camera.semantics.has_sinks():
             picture = _png(class_colors(update.label, labels))
             camera.semantics.log(_picture(picture, "png", name, when), log_time=when)
@@ -179,7 +175,9 @@ class FoxgloveServer:
         paths = {name: camera.path.poses for name, camera in self._cameras.items() if camera.path.poses}
         if paths and self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
             self._path_sent = time.monotonic()
-            self._path.log(_draw_path(paths, when), log_time=when)
+            ways = {name: _line([T[:3, 3] for T in poses], PATH_COLOR, closed=False) for name, poses in paths.items()}
+            drawn = [_entity(f"path/{name}", when, lines=[way]) for name, way in ways.items()]
+            self._path.log(messages.SceneUpdate(entities=drawn), log_time=when)
 
     def send_status(self, status: Status) -> None:
         """What a node says of itself."""
@@ -243,8 +241,7 @@ def _png(image: UInt8) -> bytes:
 
 def _encoded(kind: str, image: UInt8, *flags: int) -> bytes:
     """File of an image (H, W, 3) or of one channel (H, W)."""
-    turned = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    return cv2.imencode(kind, turned, flags)[1].tobytes()
+    return cv2.imencode(kind, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image, flags)[1].tobytes()
 
 
 def _picture(data: bytes, form: str, frame_id: str, when: int) -> messages.CompressedImage:
@@ -275,39 +272,16 @@ def _cloud(points: MapPoints, rgb: Any, when: int) -> messages.PointCloud:
     return messages.PointCloud(
         timestamp=_stamp(when),
         frame_id=WORLD,
-        pose=messages.Pose(position=messages.Vector3(), orientation=messages.Quaternion(w=1.0)),
+        pose=_ORIGIN,
         point_stride=POINT.itemsize,
         fields=fields,
         data=pack_points(points, rgb),
     )
 
 
-def _camera_frame(camera_id: str) -> str:
-    """Name of a camera's frame (x right, y down, z forward), a child of ``WORLD``."""
-    return f"camera/{camera_id}"
-
-
 def _stamp(stamp_ns: int) -> messages.Timestamp:
     """Capture time, on the robot's clock."""
     return messages.Timestamp(stamp_ns // 10**9, stamp_ns % 10**9)
-
-
-def _transform(T_map_camera: Float64, child: str, stamp_ns: int) -> messages.FrameTransform:
-    """Where a camera is."""
-    pose = _pose(T_map_camera[:3, :3], T_map_camera[:3, 3])
-    return messages.FrameTransform(
-        timestamp=_stamp(stamp_ns), parent_frame_id=WORLD, child_frame_id=child, translation=pose[0], rotation=pose[1]
-    )
-
-
-def _draw_path(paths: Mapping[str, Sequence[Float64]], stamp_ns: int) -> messages.SceneUpdate:
-    """The way of each camera, of poses (4, 4)."""
-    return messages.SceneUpdate(
-        entities=[
-            _entity(f"path/{name}", stamp_ns, lines=[_line([T[:3, 3] for T in poses], PATH_COLOR, closed=False)])
-            for name, poses in paths.items()
-        ]
-    )
 
 
 def _draw_graph(graph: SceneGraph, label_set: LabelSet, stamp_ns: int) -> messages.SceneUpdate:
@@ -327,13 +301,11 @@ def _draw_graph(graph: SceneGraph, label_set: LabelSet, stamp_ns: int) -> messag
 
 def _thing(thing: Instance, label_set: LabelSet, stamp_ns: int) -> messages.SceneEntity:
     r, g, b = (value / 255 for value in label_set.colors[label_set.ids.index(thing.class_id)])
-    position, rotation = _pose(thing.box.R_world_box, thing.box.center)
-    cube = messages.CubePrimitive(
-        pose=messages.Pose(position=position, orientation=rotation),
-        size=_vector(thing.box.size),
-        color=messages.Color(r=r, g=g, b=b, a=BOX_OPACITY),
-    )
-    top = thing.box.center + thing.box.R_world_box[:, 2] * (thing.box.size[2] / 2 + TEXT_M)
+    box = thing.box
+    position, rotation = _pose(box.R_world_box, box.center)
+    pose = messages.Pose(position=position, orientation=rotation)
+    cube = messages.CubePrimitive(pose=pose, size=_vector(box.size), color=messages.Color(r=r, g=g, b=b, a=BOX_OPACITY))
+    top = box.center + box.R_world_box[:, 2] * (box.size[2] / 2 + TEXT_M)
     name = _text(f"{thing.class_name} {thing.id}", top, messages.Color(r=r, g=g, b=b, a=1.0))
     return _entity(f"thing/{thing.id}", stamp_ns, cubes=[cube], texts=[name])
 
@@ -346,7 +318,7 @@ def _line(points: Sequence[Float64] | Float64, color: messages.Color, *, closed:
     kinds = messages.LinePrimitiveLineType
     return messages.LinePrimitive(
         type=kinds.LineLoop if closed else kinds.LineStrip,
-        pose=messages.Pose(position=messages.Vector3(), orientation=messages.Quaternion(w=1.0)),
+        pose=_ORIGIN,
         thickness=LINE_M,
         points=[messages.Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in points],
         color=color,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
+import math
 import re
 import secrets
 import threading
@@ -17,7 +18,6 @@ from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import cv2
@@ -69,6 +69,10 @@ def revision_of(label: bytes) -> str:
 class LabelSession:
     """One log being labelled. Any thread may call.
 
+    Methods that take the number of a frame raise ``LogError`` or ``FrameError`` where there is no such frame, or it or
+    its label image is damaged. Labels are class ids of the pixels, row by row, a byte each; the ignore id where nothing
+    is labelled.
+
     Args:
         log: Open as long as the session.
         folder: Where label images are read from and written to.
@@ -78,7 +82,7 @@ class LabelSession:
     def __init__(self, log: Log, folder: LabelFolder, order: Sequence[int]) -> None:
         self._log, self._folder, self._order = log, folder, list(order)
         self._sizes: dict[int, tuple[int, int]] = {}
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def describe(self) -> dict[str, Any]:
         """What the page shows: plain data."""
@@ -95,79 +99,50 @@ class LabelSession:
         }
 
     def image(self, number: int) -> bytes:
-        """Colour image of a frame, as JPEG.
-
-        Raises:
-            LogError, FrameError: no such frame, or a damaged one.
-        """
-        with self._lock:
-            frame = self._frame(number)
+        """Colour image of a frame, as JPEG."""
         options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-        return cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes()
+        return cv2.imencode(".jpg", cv2.cvtColor(self._frame(number).rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes()
 
     def label(self, number: int) -> bytes:
-        """Class ids of a frame's pixels, row by row, a byte each; the ignore id where nothing is labelled.
-
-        Raises:
-            LogError, FrameError: no such frame, a damaged one, or a damaged label image.
-        """
+        """Label of a frame."""
         with self._lock:
-            return self._label(number)
+            size = self.size(number)
+            if number in self._folder.numbers():
+                return self._folder.read(number, size).tobytes()
+            return np.full(size, self._folder.label_set.ignore_id, np.uint8).tobytes()
 
     def grown(self, number: int) -> bytes:
-        """What the strokes of a frame grow to, in the form of ``label``.
-
-        Raises:
-            LogError, FrameError: as ``label``.
-        """
-        label_set = self._folder.label_set
+        """What the strokes of a frame grow to, as a label."""
         with self._lock:
-            frame = self._frame(number)
-            label = np.frombuffer(self._label(number), np.uint8).reshape(self._size(number))
-        grown = grow_strokes(replace(frame, label=label), label_set).label
+            label = np.frombuffer(self.label(number), np.uint8).reshape(self.size(number))
+            frame = replace(self._frame(number), label=label)
+        grown = grow_strokes(frame, self._folder.label_set).label
         assert grown is not None
         return grown.tobytes()
 
-    def _label(self, number: int) -> bytes:
-        size = self._size(number)
-        if number in self._folder.numbers():
-            return self._folder.read(number, size).tobytes()
-        return np.full(size, self._folder.label_set.ignore_id, np.uint8).tobytes()
-
     def save(self, number: int, data: bytes, revision: str | None = None) -> None:
-        """Write what ``label`` gives, as changed by a person.
+        """Write a label, as changed by a person.
 
         Args:
             number: Of the frame.
-            data: Class ids.
+            data: The label.
             revision: ``revision_of`` what the person changed; None = whatever is there is replaced.
 
         Raises:
             ChangedElsewhereError: somebody else has changed it since.
             LabelError: not a byte a pixel, or an id that is no class.
-            LogError, FrameError: no such frame, or it cannot be written.
+            LogError: it cannot be written.
         """
         with self._lock:
-            height, width = self._size(number)
+            height, width = self.size(number)
             if len(data) != height * width:
-                raise LabelError(
-                    f"frame {number}: {len(data):,} bytes came for {width}x{height} pixels; send one class id a pixel"
-                )
-            if revision is not None and revision != revision_of(self._label(number)):
+                raise LabelError(f"frame {number}: {len(data):,} bytes for {width}x{height} pixels; send one a pixel")
+            if revision is not None and revision != revision_of(self.label(number)):
                 raise ChangedElsewhereError(f"frame {number} was changed elsewhere, in another tab or by a program")
             self._folder.write(number, np.frombuffer(data, np.uint8).reshape(height, width))
 
-    def pixels(self, number: int) -> int:
-        """How many a frame has: bytes of its label.
-
-        Raises:
-            LogError, FrameError: no such frame, or a damaged one.
-        """
-        with self._lock:
-            height, width = self._size(number)
-        return height * width
-
-    def _size(self, number: int) -> tuple[int, int]:
+    def size(self, number: int) -> tuple[int, int]:
+        """Height and width of a frame."""
         if number not in self._sizes:
             self._frame(number)
         return self._sizes[number]
@@ -175,7 +150,8 @@ class LabelSession:
     def _frame(self, number: int) -> PosedFrame:
         if not 0 <= number < len(self._log):
             raise LogError(f"{self._log.path}: has no frame {number}; it has {len(self._log)}")
-        frame = self._log.frame(number)
+        with self._lock:
+            frame = self._log.frame(number)
         self._sizes[number] = frame.intrinsics.height, frame.intrinsics.width
         return frame
 
@@ -210,9 +186,7 @@ class LabelServer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -247,15 +221,9 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
                 self._refuse(HTTPStatus.PRECONDITION_FAILED, str(error))
             except (LabelError, LogError, FrameError) as error:
                 self._refuse(HTTPStatus.BAD_REQUEST, str(error))
-            except OSError as error:  # the browser has left
-                _log.debug("page_not_served", reason=str(error))
 
         def _path(self) -> str:
-            """What is requested, behind the token.
-
-            Raises:
-                _RefusedError: by somebody who may not.
-            """
+            """What is requested, behind the token; refused is who may not."""
             host = self.headers.get("Host", "")  # of a tunnel, the port may be another
             own = f"http://{host}"
             if host.rpartition(":")[0] not in (HOST, "localhost") or self.headers.get("Origin", own) != own:
@@ -288,7 +256,7 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             length = self.headers.get("Content-Length", "")
             if not length.isascii() or not length.isdigit():
                 raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "say how long the label is")
-            if length.lstrip("0") != str(pixels := session.pixels(number)):
+            if length.lstrip("0") != str(pixels := math.prod(session.size(number))):
                 said = f"frame {number} has {pixels} pixels, and got {length:.20}"
                 raise _RefusedError(HTTPStatus.BAD_REQUEST, said)
             label, seen = self.rfile.read(pixels), self.headers.get("If-Match")
@@ -300,18 +268,13 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             self._send(status, json.dumps({"error": message}).encode(), "application/json")
 
         def _send(self, status: HTTPStatus, body: bytes, kind: str, revision: str = "") -> None:
-            try:
-                self.send_response(status)
-                for name, value in _HEADERS.items():
-                    self.send_header(name, value)
-                self.send_header("Content-Type", kind)
-                self.send_header("Content-Length", str(len(body)))
-                if revision:
-                    self.send_header("ETag", f'"{revision}"')
-                self.end_headers()
-                self.wfile.write(body)
-            except OSError as error:  # the browser has left
-                _log.debug("page_not_served", reason=str(error))
+            headers = {**_HEADERS, "Content-Type": kind, "Content-Length": str(len(body))}
+            headers |= {"ETag": f'"{revision}"'} if revision else {}
+            self.send_response(status)
+            for name, value in headers.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002 (its name there)
             _log.debug("page_served", request=(format % args).replace(token, "TOKEN"))

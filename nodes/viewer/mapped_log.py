@@ -27,16 +27,9 @@ def show_log(
     going: Callable[[], bool],
     monitor: JobMonitor,
 ) -> None:
-    """Map a log and show it meanwhile, its map every n seconds and at the end.
+    """Map a log, at most ``frames`` of it (0 = all), and show it meanwhile, its map every ``refresh_s`` and at the end.
 
-    Args:
-        path: The log.
-        weights, config: See ``Mapper.load``.
-        frames: At most this many; 0 = all.
-        begin: Says where to write it, once log and weights are open.
-        refresh_s: Time between two maps.
-        going: Whether to go on.
-        monitor: Hears how many frames there are, and how many are done.
+    ``begin`` is called once log and weights are open; it goes on while ``going()``.
 
     Raises:
         LogError, WeightsError, ConfigError, MapError: it cannot be mapped.

@@ -16,11 +16,10 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 from urllib.parse import quote
 
@@ -58,12 +57,7 @@ class WebViewer:
         self._folder = OwnFolder("view-")  # where we are killed, `up` removes it
 
     def __enter__(self) -> Self:
-        """Start the servers and wait until they answer.
-
-        Raises:
-            DependencyError: the program is not there.
-            TransportError: a port is taken, or the servers do not come up.
-        """
+        """Start the servers and wait until they answer: ``DependencyError``, ``TransportError`` where they do not."""
         try:
             self._start()
         except BaseException:
@@ -71,9 +65,7 @@ class WebViewer:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -160,11 +152,7 @@ def _find_program() -> str:
 
 @contextmanager
 def _hold_port(port: int, option: str) -> Iterator[int]:
-    """The port itself where it is free, a free one for 0; nobody else gets it meanwhile.
-
-    Raises:
-        TransportError: it is taken.
-    """
+    """The port itself where it is free, a free one for 0; nobody else gets it meanwhile."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -192,22 +180,14 @@ class QuietPage:
         address: Where; port 0 = any that is free.
         source: Host and port of the other server.
         allowed: Origins that the page may fetch from, in addition to this server.
-
-    Raises:
-        TransportError: the port is taken.
     """
 
     def __init__(self, address: tuple[str, int], source: tuple[str, int], allowed: tuple[str, ...]) -> None:
-        own = "'self'"
         policy = (
-            f"default-src {own} 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
-            f"connect-src {' '.join((own, 'data:', 'blob:', *allowed))}; "
-            "form-action 'none'; base-uri 'self'"
+            "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
+            f"connect-src 'self' data: blob: {' '.join(allowed)}; form-action 'none'; base-uri 'self'"
         )
-        try:
-            self._server = LocalServer(address, _make_handler(source, policy))
-        except OSError as error:
-            raise TransportError(f"port {address[1]} cannot be had: {error.strerror}; choose another one") from error
+        self._server = LocalServer(address, _make_handler(source, policy))
         self.port = int(self._server.server_address[1])
         self._thread = threading.Thread(target=self._server.serve_forever, name="web page", daemon=True)
         self._thread.start()
@@ -226,26 +206,26 @@ def _make_handler(source: tuple[str, int], policy: str) -> type[BaseHTTPRequestH
         timeout = TIMEOUT_S
 
         def do_GET(self) -> None:
-            connection = http.client.HTTPConnection(*source, timeout=TIMEOUT_S)
             path = self.path.partition("?")[0]
             if not path.isascii():
                 self.send_error(HTTPStatus.BAD_REQUEST, "addresses are ASCII")
                 return
-            try:
-                connection.request("GET", path)
-                answer = connection.getresponse()
-                self.send_response(answer.status)
-                for name in _KEPT:
-                    if (value := answer.headers.get(name)) is not None:
+            with closing(http.client.HTTPConnection(*source, timeout=TIMEOUT_S)) as connection:
+                try:
+                    connection.request("GET", path)
+                    answer = connection.getresponse()
+                    kept = {name: answer.headers[name] for name in _KEPT if name in answer.headers}
+                    self.send_response(answer.status)
+                    for name, value in {
+                        **kept,
+                        "Content-Security-Policy": policy,
+                        "Referrer-Policy": "no-referrer",
+                    }.items():
                         self.send_header(name, value)
-                self.send_header("Content-Security-Policy", policy)
-                self.send_header("Referrer-Policy", "no-referrer")
-                self.end_headers()
-                shutil.copyfileobj(answer, self.wfile)
-            except (OSError, http.client.HTTPException) as error:  # the browser has left, or the server has ended
-                _log.debug("page_not_served", path=self.path, reason=str(error))
-            finally:
-                connection.close()
+                    self.end_headers()
+                    shutil.copyfileobj(answer, self.wfile)
+                except (OSError, http.client.HTTPException) as error:  # the browser has left, or the server has ended
+                    _log.debug("page_not_served", path=self.path, reason=str(error))
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002 (its name there)
             _log.debug("page_served", request=format % args)

@@ -96,16 +96,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
     """Show a running system until its streams have ended or somebody asks to stop.
 
     The mapper is queried first, and waited for: a camera that waits for its listeners would else count this one in.
-
-    Args:
-        live: Where it is.
-        begin: Says where to write it, once the endpoint is known to be one.
-        refresh_s: Time between two maps.
-        stop: Somebody wants to end it.
-        tell: Called with a line of progress.
-
-    Raises:
-        TransportError: an invalid endpoint.
+    ``begin`` is called once the endpoint is known to be one (else ``TransportError``), ``tell`` with lines of progress.
     """
     with MapClient(live.query, identity=live.identity, attempts=1) as client:
         stream = begin()
@@ -116,15 +107,15 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
         log.note_scale(snapshot.scale_known)
         show = MapShow(log)
         show.show(snapshot, time.monotonic_ns())
-        heard = _Heard()
+        newest_ns = [0]  # stamp of the newest frame
 
         def look() -> None:
-            show.show(client.mirror().snapshot(), heard.stamp_ns or time.monotonic_ns())
+            show.show(client.mirror().snapshot(), newest_ns[0] or time.monotonic_ns())
 
         try:
             with MapFollower(look, refresh_s):
                 if live.nodes:
-                    _follow_nodes(live, log, heard, stop)
+                    _follow_nodes(live, log, newest_ns, stop)
                     tell("the stream has ended" if not stop else "stopped")
                 while not stop and not live.nodes:
                     time.sleep(POLL_S)
@@ -134,24 +125,19 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
 
 def _first_snapshot(client: MapClient, stop: StopRequest, tell: Callable[[str], None]) -> MapSnapshot | None:
     """The map as it is, once its mapper answers; None where a stop request came first."""
-    logged = False
+    said = False
     while not stop:
         try:
             return client.mirror().snapshot()
         except (TransportError, MapError) as error:
-            if not logged:
+            if not said:
                 tell(f"waiting for the mapper: {error}")
-            logged = True
+            said = True
             time.sleep(ASK_AGAIN_S)
     return None
 
 
-@dataclass(slots=True)
-class _Heard:
-    stamp_ns: int = 0  # of the newest frame
-
-
-def _follow_nodes(live: Live, log: RerunLog, heard: _Heard, stop: StopRequest) -> None:
+def _follow_nodes(live: Live, log: RerunLog, newest_ns: list[int], stop: StopRequest) -> None:
     """Show frames and what was rendered for them until all streams have ended: cameras wait for their listeners."""
     intrinsics: dict[str, CameraIntrinsics] = {}
     streams, poses = Streams(live.streams), MapPoses()
@@ -161,7 +147,7 @@ def _follow_nodes(live: Live, log: RerunLog, heard: _Heard, stop: StopRequest) -
             match message:
                 case PosedFrame():
                     intrinsics[message.camera_id] = message.intrinsics
-                    heard.stamp_ns = message.stamp_ns
+                    newest_ns[0] = message.stamp_ns
                     pose = poses.place(message.world, message.T_world_camera)
                     if pose is None:  # the mapper does not know yet where in the map it was taken
                         log.log_frame(message, posed=False)
