@@ -35,8 +35,8 @@ from semantic_mapper.replay.page import (
     write_page,
 )
 from semantic_mapper.replay.run_folder import MAP_NAME
-from semantic_mapper.replay.session import MAX_LISTED, LatencyHistogram, MapSession, Refusal
-from semantic_mapper.replay.summary import SUMMARY_FILE, describe_depth, notes, summary_table
+from semantic_mapper.replay.session import MAX_LISTED, LatencyHistogram, MapSession
+from semantic_mapper.replay.summary import SUMMARY_FILE, describe_depth, notes, percent, summary_table
 from semantic_mapper.types import Float64
 
 _log = get_logger(__name__)
@@ -59,7 +59,7 @@ def finish_session(
     progress: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Map what still waits, and write everything to ``out`` (made if missing): the map first, then the summary,
-    pictures and the report last.
+    pictures and the report last. Returns the summary.
 
     Each file is there whole or not at all, whenever the process is killed; what an earlier run left is removed first,
     but for its map. A summary that is there means that the map next to it is whole, and the one that it is of.
@@ -70,9 +70,6 @@ def finish_session(
         stopped_by: What ended it early; empty = nothing.
         restarted: What became of the map of a process before this one; empty = there was none.
         progress: Called after each step.
-
-    Returns:
-        The summary.
 
     Raises:
         MapError: the map cannot be written.
@@ -100,10 +97,10 @@ def finish_session(
     graph = find_graph(voxel_map)
     progress()
     _draw_overview(session, points, graph, summary, out / OVERVIEW_NAME)
-    progress()
     if session.rerun is not None:
-        session.rerun.finish(points, graph)
         progress()
+        session.rerun.finish(points, graph)
+    progress()
     _write_report(session, points, summary, out)
     progress()
     return summary
@@ -125,7 +122,7 @@ def _draw_overview(
         points,
         session.pipeline.label_set,
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
-        subtitle=_subtitle(session, summary),
+        subtitle="; ".join(_said(session, summary)),
         up=map_up(session),
         unit=picture_unit(session),
         rooms=[(f"room {room.id}: {room.area_m2:.0f} m²", room.outline) for room in graph.rooms] if graph else (),
@@ -133,23 +130,18 @@ def _draw_overview(
     write_picture(path, picture)
 
 
-def _subtitle(session: MapSession, summary: Mapping[str, Any]) -> str:
+def _said(session: MapSession, summary: Mapping[str, Any]) -> Iterator[str]:
     """What is to be known of a picture of the map: what is wrong, its score, and where depth comes from."""
-    said: list[str] = []
     if summary["pose_check"]["warning"]:
-        said.append("POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json)")
+        yield "POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json)"
     if summary["map"]["nearly_empty"]:
-        said.append("MAP NEARLY EMPTY (see summary.json)")
-    miou = summary["metrics"]["miou"]
-    if miou is not None:
-        said.append(f"mIoU {100 * miou:.1f} % over {session.scored} labelled frames that the weights have not seen")
+        yield "MAP NEARLY EMPTY (see summary.json)"
+    if (miou := summary["metrics"]["miou"]) is not None:
+        yield f"mIoU {percent(miou)} over {session.scored} labelled frames that the weights have not seen"
     else:
-        said.append(
-            "no score: its labels are pseudo labels" if session.pseudo_labelled else "no labels to score against"
-        )
+        yield "no score: its labels are pseudo labels" if session.pseudo_labelled else "no labels to score against"
     if summary["depth"]["source"] != "sensor":
-        said.append(f"depth: {describe_depth(summary['depth'])}")
-    return "; ".join(said)
+        yield f"depth: {describe_depth(summary['depth'])}"
 
 
 def picture_unit(session: MapSession) -> str:
@@ -177,35 +169,31 @@ def view_strips(session: MapSession, count: int) -> list[ViewStrip]:
 
 
 def nearly_empty(session: MapSession, points: int) -> str | None:
-    """Why a map has hardly any surface for the space that its frames measured, and what to do; None where it has.
-
-    Args:
-        session: With at least one frame that had depth to map, else None is returned.
-        points: Surface points of the map.
-    """
+    """Why a map of this many surface points has hardly any for the space that its frames measured, and what to do; None
+    where it has, or where no frame had depth to map."""
     blocks = session.pipeline.voxel_map.block_count
     mapped = max(session.fused, session.computed_depth)  # a camera that stands still fuses nothing
     if not mapped or (points and points >= MIN_POINTS_A_BLOCK * blocks):
         return None
-    found = f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {mapped} frames"
     if 2 * session.without_depth >= mapped:
-        return (
-            f"{found}; {session.without_depth} of them have no sensor depth, and depth that the field renders does not "
-            "agree well enough from frame to frame to make a surface: record with a depth camera, or import depth "
-            'images, too; or have it computed from the pictures (depth.source = "auto")'
+        why = (
+            f"{session.without_depth} of them have no sensor depth, and depth that the field renders does not agree "
+            "from frame to frame: record or import depth images, too; or have depth computed from the pictures "
+            '(depth.source = "auto")'
         )
-    if 2 * session.computed_depth >= mapped:
-        return (
-            f"{found}; depth computed from their pictures is missing ({session.too_little_motion} frames moved too "
-            "little), too unsure, or does not agree from frame to frame: move the camera sideways, a few centimetres a "
-            "frame and half a metre or more in all, with views that overlap; it needs poses that are exact "
-            "(T_world_camera, metres, stamped with the time of capture), rectified, sharp images and surfaces with "
-            "texture"
+    elif 2 * session.computed_depth >= mapped:
+        why = (
+            f"depth computed from their pictures is missing ({session.too_little_motion} frames moved too little), too "
+            "unsure, or does not agree from frame to frame: move the camera sideways, half a metre or more in all, "
+            "with views that overlap; it needs exact poses (T_world_camera, metres, stamped with the time of capture), "
+            "rectified, sharp images and surfaces with texture"
         )
-    return (
-        f"{found}; their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
-        "(T_world_camera, metres, stamped with the time of capture)"
-    )
+    else:
+        why = (
+            "their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
+            "(T_world_camera, metres, stamped with the time of capture)"
+        )
+    return f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {mapped} frames; {why}"
 
 
 def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
@@ -218,7 +206,8 @@ def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
 def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
     """The summary of a session as plain data."""
     pipeline, bundle = session.pipeline, session.bundle
-    voxel_map, label_set = pipeline.voxel_map, pipeline.label_set
+    voxel_map, label_set, poses = pipeline.voxel_map, pipeline.label_set, pipeline.pose_check
+    refusals = sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)
     return {
         "source": session.source,
         "frames": {
@@ -238,12 +227,12 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         "depth": _depth_source(session),
         "scale": scale_name(voxel_map.scale_known),
         "pose_check": {
-            "keyframes_compared": pipeline.pose_check.compared,
-            "depth_disagreement": _rounded(pipeline.pose_check.recent, 4),
-            "worst_depth_disagreement": _rounded(pipeline.pose_check.worst, 4),
-            "contradicting_pairs": _rounded(pipeline.pose_check.contradicting, 4),
-            "worst_contradicting_pairs": _rounded(pipeline.pose_check.worst_contradicting, 4),
-            "warning": pipeline.pose_check.warning or None,
+            "keyframes_compared": poses.compared,
+            "depth_disagreement": _rounded(poses.recent, 4),
+            "worst_depth_disagreement": _rounded(poses.worst, 4),
+            "contradicting_pairs": _rounded(poses.contradicting, 4),
+            "worst_contradicting_pairs": _rounded(poses.worst_contradicting, 4),
+            "warning": poses.warning or None,
         },
         "pictures": {
             "checked": pipeline.picture_check.checked,
@@ -287,7 +276,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         "seed": pipeline.config.seed,
         "quality": pipeline.config.quality,
         "config": to_plain(pipeline.config),  # as it was in force: with what the quality sets
-        "refusals": [{"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason} for r in _first_refusals(session)],
+        "refusals": [{"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason} for r in refusals[:MAX_LISTED]],
         "damaged_stretches": session.damages.first,
         "versions": versions(),
     }
@@ -319,10 +308,6 @@ def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:
     return {**scores, "map_miou": surface.metrics().miou}
 
 
-def _first_refusals(session: MapSession) -> list[Refusal]:
-    return sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)[:MAX_LISTED]
-
-
 def _percentiles(times: LatencyHistogram) -> dict[str, float | None]:
     """Median and 95th percentile, null for nothing."""
     return {"p50": _rounded(times.percentile(50)), "p95": _rounded(times.percentile(95))}
@@ -340,30 +325,30 @@ def versions() -> dict[str, str]:
 
 def _write_report(session: MapSession, points: MapPoints, summary: Mapping[str, Any], out: Path) -> None:
     """Write ``report.html`` to the folder of a replay, with what is there already."""
-    label_set = session.pipeline.label_set
+    label_set, unit = session.pipeline.label_set, picture_unit(session)
     overview = out / OVERVIEW_NAME, "Frames, what was rendered for them, and the map from above and aside"
     strips = [
-        picture(
-            draw_strip(s, label_set, picture_unit(session)),
-            f"{s.name}: camera, and what was rendered for it",
-            photo=True,
-        )
+        picture(draw_strip(s, label_set, unit), f"{s.name}: camera, and what was rendered for it", photo=True)
         for s in view_strips(session, STRIPS)
     ]
     counts = [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()]
+    refused = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in summary["refusals"]]
     sections = [
         Section(notes=notes(summary)),
-        *([Section("The map", view=point_view(points, label_set, map_up(session)))] if len(points.xyz) else []),
+        Section("The map", view=point_view(points, label_set, map_up(session)) if len(points.xyz) else None),
         Section("Overview", pictures=list(picture_files(overview))),
         Section("Figures", tables=[summary_table({out.resolve().name: summary})]),
-        *([Section("Frames", pictures=strips)] if strips else []),
+        Section("Frames", pictures=strips),
         *stage_sections({"this replay": summary}),
         Section(
             "Frames that came, and what became of them",
             notes=[f"Damaged: {stretch}" for stretch in summary["damaged_stretches"]],
             tables=[table_of(("frames", ""), counts)],
         ),
-        *_refused(summary["refusals"]),
+        Section(
+            f"Refused, the first {MAX_LISTED}",
+            tables=[table_of(("seq", "stamp, ns", "reason"), refused)] if refused else [],
+        ),
         Section(
             "Configuration",
             tables=[table_of(("package", "version"), list(summary["versions"].items()))],
@@ -371,9 +356,3 @@ def _write_report(session: MapSession, points: MapPoints, summary: Mapping[str, 
         ),
     ]
     write_page(out / REPORT_NAME, f"Replay of {summary['source'] or 'a session'}", sections)
-
-
-def _refused(refusals: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
-    rows = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in refusals]
-    if rows:
-        yield Section(f"Refused, the first {MAX_LISTED}", tables=[table_of(("seq", "stamp, ns", "reason"), rows)])

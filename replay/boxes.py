@@ -12,7 +12,7 @@ from __future__ import annotations
 import codecs
 import json
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -54,11 +54,14 @@ MERGE = {
 _XML_NAMES = {name.replace(" ", ""): name for name in KITTI360_LABELS.names}
 _XML_NAMES |= {"driveway": "parking", "ground": "terrain", "bigpole": "pole", "pedestrian": "person"}
 
+_FORMATS = "give a boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360's data_3d_bboxes"
+
 _log = get_logger(__name__)
 
 Row = tuple[float, float, float, float]
 Pose = tuple[Row, Row, Row, Row]
 Place = tuple[float, float, float]
+NotNegative = Annotated[float, Meta(ge=0)]
 WholeNumber = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
@@ -93,10 +96,16 @@ class _Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"cla
     frames: list[tuple[WholeNumber, Pose]] | None = None
 
 
-class _QueryBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _QueryBox(msgspec.Struct, frozen=True):
     center: Place
-    size: Place
+    size: tuple[NotNegative, NotNegative, NotNegative]
     R_world_box: tuple[Place, Place, Place]
+
+
+class _Instance(msgspec.Struct, frozen=True, rename={"class_name": "class"}):
+    id: int
+    class_name: str
+    box: _QueryBox
 
 
 def load_boxes(path: Path) -> BoxFile:
@@ -126,20 +135,26 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
     """Boxes that a field can be fitted with, and the label set of the field: that of the pseudo labels, and classes of
     boxes that one of its classes stands for, as ``merge`` says, or else ``MERGE``.
 
-    Boxes of XML of any other class that it lacks are left out, with a warning.
-
-    Args:
-        boxes: Of a file.
-        label_set: Of the pseudo labels.
-        path: Of the file, for errors.
+    Boxes of XML of any other class that it lacks are left out, with a warning. ``path`` is the file, for errors.
 
     Raises:
         ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name.
     """
-    boxes = _merged(boxes, label_set)
-    merged = {name for others in boxes.merge.values() for name in others}
-    if boxes.is_xml:
-        boxes = _of_known_classes(boxes, merged.union(label_set.names), label_set, path)
+    names = {*label_set.names, *(name for others in boxes.merge.values() for name in others)}
+    lacking = {p.class_name for p in boxes.primitives} - names
+    merge = dict(boxes.merge)
+    for name, others in MERGE.items():
+        if name in label_set.names and (found := tuple(o for o in others if o in lacking)):
+            merge[name] = (*merge.get(name, ()), *found)
+    boxes = replace(boxes, merge=merge)
+    merged = {name for others in merge.values() for name in others}
+    unknown = sorted(lacking - merged)
+    if boxes.is_xml and unknown:
+        kept = tuple(p for p in boxes.primitives if p.class_name not in unknown)
+        count = len(boxes.primitives) - len(kept)
+        reason = f"label set '{label_set.name}' has no class {', '.join(unknown)}"
+        _log.warning("boxes_left_out", file=str(path), count=count, reason=reason)
+        boxes = replace(boxes, primitives=kept, left_out=boxes.left_out + count)
     boxed = dict.fromkeys(p.class_name for p in boxes.primitives)
     known = label_set.with_names([name for name in boxed if name in merged and name not in label_set.names])
     named = [("merge", name, label_set) for name in boxes.merge]
@@ -154,17 +169,8 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
 
 
 def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]]:
-    """Boxes with poses by frame of a drive of KITTI-360, with the times of these frames in a log of it instead.
-
-    Poses at frames that the log lacks are dropped, and boxes without any other.
-
-    Args:
-        boxes: Of a file.
-        path: Of the file, for errors.
-        log: Imported from KITTI-360.
-
-    Returns:
-        The boxes, and the ids of those that were dropped.
+    """Boxes with poses by frame of a drive of KITTI-360, with the times of these frames in a log of it instead; and the
+    ids of boxes of which the log lacks all frames, which are dropped. ``path`` is the file of the boxes, for errors.
 
     Raises:
         ConfigError: the log is of something else, or has none of the frames at which any box is.
@@ -197,7 +203,6 @@ def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]
 
 
 def _metres(value: Any, name: str) -> Float64:
-    """Lengths or places as an array."""
     array = np.array(value, np.float64)
     if not (np.abs(array) <= MAX_TRANSLATION_M).all():
         raise ConfigError(f"{name} must be metres within {MAX_TRANSLATION_M / 1000:g} km")
@@ -238,47 +243,19 @@ def _parse_all(
     return good, bad
 
 
-def _merged(boxes: BoxFile, label_set: LabelSet) -> BoxFile:
-    """Boxes whose ``merge`` also has what ``MERGE`` says of their classes that neither it nor the label set has."""
-    named = {*label_set.names, *(name for others in boxes.merge.values() for name in others)}
-    lacking = {p.class_name for p in boxes.primitives} - named
-    merge = dict(boxes.merge)
-    for name, others in MERGE.items():
-        if name in label_set.names and (found := tuple(o for o in others if o in lacking)):
-            merge[name] = (*merge.get(name, ()), *found)
-    return replace(boxes, merge=merge)
-
-
-def _of_known_classes(boxes: BoxFile, known: Collection[str], label_set: LabelSet, path: Path) -> BoxFile:
-    """Boxes of XML of classes that are known; the others are counted."""
-    kept = tuple(p for p in boxes.primitives if p.class_name in known)
-    count = len(boxes.primitives) - len(kept)
-    if count:
-        lacking = ", ".join(sorted({p.class_name for p in boxes.primitives} - set(known)))
-        reason = f"label set '{label_set.name}' has no class {lacking}"
-        _log.warning("boxes_left_out", file=str(path), count=count, reason=reason)
-    return replace(boxes, primitives=kept, left_out=boxes.left_out + count)
-
-
 def _read_json(text: bytes, path: Path) -> BoxFile:
     try:
-        data = json.loads(text)
+        data: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
-        reason = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
-        raise ConfigError(f"{path} is neither JSON nor XML: {reason}") from error
+        raise ConfigError(f"{path} is neither JSON nor XML: {str(error):.200}") from error
     table = cast("dict[str, Any]", data) if isinstance(data, dict) else {}
     of_query = table.get("question") == "instances"
     if of_query:
         table = {"boxes": table.get("instances"), "merge": table.get("merge", {})}
     elif not get_close_matches("boxes", table, n=1):
-        raise ConfigError(
-            f"{path} holds no boxes; give a boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360"
-        )
-    listed = table.get("boxes")
-    table["boxes"] = [] if isinstance(listed, list) else listed  # each is checked by itself
+        raise ConfigError(f"{path} holds no boxes: {_FORMATS}")
     file = convert_config(table, _File, str(path))
-    numbered = enumerate(cast("list[Any]", listed), 1)
-    good, bad = _parse_all(numbered, _from_query if of_query else _from_json, _id_in_json)
+    good, bad = _parse_all(enumerate(file.boxes, 1), _from_query if of_query else _from_json, _id_in_json)
     return BoxFile(tuple(good.values()), file.merge, bad=tuple(bad.values()))
 
 
@@ -301,7 +278,10 @@ def _from_json(entry: Any) -> Primitive:
     if size is None:
         raise ConfigError("size, three metres, is missing")
     if box.shape == "prism":
-        polygon = _outline(box.polygon or [])
+        polygon = _metres(box.polygon or [], "polygon").reshape(-1, 2)
+        polygon = polygon[(polygon != np.roll(polygon, 1, axis=0)).any(axis=1)]  # a closed ring repeats its first one
+        if len(polygon) < 3:
+            raise ConfigError(f"polygon must have at least 3 different corners, got {len(polygon)}")
         size = np.array([*np.ptp(polygon, axis=0), size[2]])
     stamps, frames = _poses(box.stamps, "stamps"), _poses(box.frames, "frames")
     return _box_of(
@@ -321,15 +301,6 @@ def _from_json(entry: Any) -> Primitive:
     )
 
 
-def _outline(corners: list[tuple[float, float]]) -> Float64:
-    """Corners (N, 2) of a polygon, without those that repeat the one before, as the last of a closed ring does."""
-    polygon = _metres(corners, "polygon").reshape(-1, 2)
-    polygon = polygon[(polygon != np.roll(polygon, 1, axis=0)).any(axis=1)]
-    if len(polygon) < 3:
-        raise ConfigError(f"polygon must have at least 3 different corners, got {len(polygon)}")
-    return polygon
-
-
 def _poses(known: list[tuple[int, Pose]] | None, name: str) -> tuple[tuple[int, Float64], ...] | None:
     """Poses of one that moves, by ascending time or number of the frame."""
     if known is None:
@@ -342,17 +313,11 @@ def _poses(known: list[tuple[int, Pose]] | None, name: str) -> tuple[tuple[int, 
 
 def _from_query(entry: Any) -> Primitive:
     """One instance of `query MAP instances`."""
-    given = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
-    box_id, name, box = given.get("id"), given.get("class"), given.get("box")
-    if type(box_id) is not int or not isinstance(name, str) or not isinstance(box, dict):
-        raise ConfigError("an instance must have an id, a class and a box, as `query MAP instances` writes them")
-    found = convert_config({k: v for k, v in box.items() if k in _QueryBox.__struct_fields__}, _QueryBox, "its box")
+    thing = convert_config(entry, _Instance, "an instance, as `query MAP instances` writes it")
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.array(found.R_world_box), _metres(found.center, "center")
-    size = _metres(found.size, "size")
-    if (size < 0).any():
-        raise ConfigError(f"size must not be below 0 m, got {size.tolist()}")
-    return _box_of(Primitive(box_id, name, "box", pose, size + 2 * QUERY_MARGIN_M, name not in BOX_STUFF))
+    pose[:3, :3], pose[:3, 3] = np.array(thing.box.R_world_box), thing.box.center
+    size = [metres + 2 * QUERY_MARGIN_M for metres in thing.box.size]
+    return _from_json({"id": thing.id, "class": thing.class_name, "T_world_box": pose.tolist(), "size": size})
 
 
 def _read_xml(text: bytes, path: Path) -> BoxFile:
@@ -363,13 +328,11 @@ def _read_xml(text: bytes, path: Path) -> BoxFile:
     and becomes one box with its poses by frame; -1 says that it stands still."""
     try:
         root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ConfigError(f"{path} is no XML: {error}") from error
-    except (ValueError, LookupError) as error:  # of another character set
-        raise ConfigError(f"{path}: cannot be read: {error}; save it as UTF-8") from error
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # or of another character set
+        raise ConfigError(f"{path} is no XML in UTF-8: {error}") from error
     nodes = [node for node in root if node.find("transform") is not None]
     if not nodes:
-        raise ConfigError(f"{path} holds no boxes; give XML of KITTI-360's data_3d_bboxes")
+        raise ConfigError(f"{path} holds no boxes: {_FORMATS}")
     known = [(n, node) for n, node in enumerate(nodes, 1) if not _text(node, "label").lower().startswith("unknown")]
     good, bad = _parse_all(known, _from_node, _id_in_xml)
     place: dict[tuple[str, str], int] = {}  # of the first node of an object that moves
@@ -377,7 +340,9 @@ def _read_xml(text: bytes, path: Path) -> BoxFile:
         if number in good and (later := good[number]).frames is not None:
             first = place.setdefault(_object_of(node), number)
             if first != number:
-                good[first] = _also(good[first], later)
+                box = good[first]  # in the shape that it had at first
+                frames = tuple(sorted({**dict(later.frames or ()), **dict(box.frames or ())}.items()))
+                good[first] = replace(box, frames=frames, T_world_box=frames[0][1])
                 del good[number]
     return BoxFile(
         tuple(good.values()), left_out=len(nodes) - len(known), bad=tuple(bad[n] for n in sorted(bad)), is_xml=True
@@ -388,10 +353,8 @@ def _from_node(node: ElementTree.Element) -> Primitive:
     """One object in axes of its own, with its pose at a frame if it moves."""
     transform, local, faces = (_matrix(node, name) for name in ("transform", "vertices", "faces"))
     if transform.shape != (4, 4) or local.shape[1] != 3 or faces.shape[1] not in (3, 4):
-        raise ConfigError(
-            f"transform must be 4 x 4, vertices N x 3 and faces N x 3 or N x 4, got {transform.shape}, {local.shape} "
-            f"and {faces.shape}"
-        )
+        shapes = f"{transform.shape}, {local.shape} and {faces.shape}"
+        raise ConfigError(f"transform must be 4 x 4, vertices N x 3 and faces N x 3 or N x 4, got {shapes}")
     if (faces != np.round(faces)).any() or (faces < 0).any() or (faces > 1e9).any():
         raise ConfigError("faces must be whole numbers: those of the vertices of each, from 0")
     u, _, v = np.linalg.svd(_metres(transform, "transform")[:3, :3])  # the nearest rotation to a matrix that may scale
@@ -430,12 +393,6 @@ def _object_of(node: ElementTree.Element) -> tuple[str, str]:
     return _text(node, "label"), instance if instance.strip("0") else f"index {_text(node, 'index')}"
 
 
-def _also(box: Primitive, later: Primitive) -> Primitive:
-    """A box that is also there at the frame of another, in the shape that it had at first."""
-    frames = tuple(sorted({**dict(later.frames or ()), **dict(box.frames or ())}.items()))
-    return replace(box, frames=frames, T_world_box=frames[0][1])
-
-
 def _text(node: ElementTree.Element, name: str) -> str:
     return (node.findtext(name) or "").strip()
 
@@ -456,8 +413,6 @@ def _matrix(node: ElementTree.Element, name: str) -> Float64:
     except ValueError as error:
         raise ConfigError(f"{name} must be numbers: {error}") from error
     rows, columns = _whole(found, "rows"), _whole(found, "cols")
-    if rows < 1 or columns < 1 or rows * columns != len(values):
-        raise ConfigError(f"<{name}> says {rows} x {columns} numbers and holds {len(values)}")
-    if not np.isfinite(values).all():
-        raise ConfigError(f"{name} holds NaN or infinity")
+    if rows < 1 or columns < 1 or rows * columns != len(values) or not np.isfinite(values).all():
+        raise ConfigError(f"<{name}> says {rows} x {columns} numbers and holds {len(values)}, or NaN or infinity")
     return values.reshape(rows, columns)

@@ -113,37 +113,28 @@ def compare_runs(a: Run, b: Run, tolerances: Tolerances) -> Comparison:
     figures = [*_map_figures(a.voxel_map, b.voxel_map, tolerances)]
     if a.summary is None or b.summary is None:
         alone = [run.name for run in (a, b) if run.summary is None]
-        notes = [f"{name} is a map alone: counts and scores are not compared" for name in alone]
-    else:
-        figures = [*_summary_figures(a.summary, b.summary, tolerances.score), *figures]
-        notes = [*_notes(a.summary, b.summary)]
-    return Comparison(figures, notes)
+        return Comparison(figures, [f"{name} is a map alone: counts and scores are not compared" for name in alone])
+    return Comparison([*_summary_figures(a.summary, b.summary, tolerances.score), *figures], [*_notes(a, b)])
 
 
 def _summary_figures(a: Mapping[str, Any], b: Mapping[str, Any], score: float) -> Iterator[Difference]:
-    for name in COUNTS:
-        yield _difference(f"frames.{name}", dig(a, f"frames.{name}"), dig(b, f"frames.{name}"))
+    for path, allowed in {**{f"frames.{name}": 0.0 for name in COUNTS}, **dict.fromkeys(SCORES, score)}.items():
+        of_a, of_b = dig(a, path), dig(b, path)
+        if path not in SCORES or (of_a, of_b) != (None, None):
+            apart = None if of_a is None or of_b is None else abs(of_a - of_b)
+            yield Difference(path, of_a, of_b, apart, allowed)
     refused = [{(r["seq"], r["stamp_ns"]) for r in summary.get("refusals") or []} for summary in (a, b)]
     only_a, only_b = len(refused[0] - refused[1]), len(refused[1] - refused[0])
     yield Difference("refused alone", only_a, only_b, only_a + only_b)
-    for path in SCORES:
-        of_a, of_b = dig(a, path), dig(b, path)
-        if (of_a, of_b) != (None, None):
-            yield _difference(path, of_a, of_b, score)
-
-
-def _difference(name: str, a: float | None, b: float | None, allowed: float = 0.0) -> Difference:
-    return Difference(name, a, b, None if a is None or b is None else abs(a - b), allowed)
 
 
 def _map_figures(a: VoxelMap, b: VoxelMap, tolerances: Tolerances) -> Iterator[Difference]:
     require_same_scale(a.scale_known, b.scale_known, "compare")
-    yield _difference("voxel_size_m", a.config.voxel_size_m, b.config.voxel_size_m)
+    sizes = a.config.voxel_size_m, b.config.voxel_size_m
+    yield Difference("voxel_size_m", *sizes, abs(sizes[0] - sizes[1]))
     names = set(a.label_set.names), set(b.label_set.names)
     yield Difference("classes", len(names[0]), len(names[1]), len(names[0] ^ names[1]))
-    there, back = _distances(a, b), _distances(b, a)
-    for n, name in enumerate(("surface_m", "labels")):
-        mine, theirs = there[n], back[n]
+    for name, mine, theirs in zip(("surface_m", "labels"), _distances(a, b), _distances(b, a), strict=True):
         largest = None if mine is None or theirs is None else max(mine, theirs)
         yield Difference(name, mine, theirs, largest, getattr(tolerances, name))
 
@@ -166,16 +157,12 @@ def _names(voxel_map: VoxelMap) -> NDArray[np.str_]:
     return np.array([names.get(i, "unknown") for i in range(256)])
 
 
-def _notes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
-    for name, path in (("log", "source"), ("weights", "weights.file"), ("stopped by", "stopped_by")):
-        values = dig(a, path), dig(b, path)
-        if values[0] != values[1]:
-            yield f"{name}: {values[0]} and {values[1]}"
-    for section in ("config", "versions"):
-        of_a, of_b = (_flat(summary.get(section) or {}) for summary in (a, b))
+def _notes(a: Run, b: Run) -> Iterator[str]:
+    for path in ("source", "weights.file", "stopped_by", "config", "versions"):
+        of_a, of_b = (_flat({path: dig(run.summary or {}, path)}) for run in (a, b))
         for key in sorted(of_a.keys() | of_b.keys()):
             if of_a.get(key) != of_b.get(key):
-                yield f"{section} {key}: {of_a.get(key)} and {of_b.get(key)}"
+                yield f"{key}: {of_a.get(key)} and {of_b.get(key)}"
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

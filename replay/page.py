@@ -47,14 +47,13 @@ class Section:
     heading: str = ""  # none of its own where empty
     notes: Sequence[str] = ()  # paragraphs that the reader must not miss
     view: Mapping[str, Any] | None = None  # what ``point_view`` returns; at most once a page
-    # pictures, tables: The tables are those that the console shows.
     pictures: Sequence[Picture] = ()
-    tables: Sequence[Table] = ()
+    tables: Sequence[Table] = ()  # those that the console shows
     folded: Mapping[str, str] = field(default_factory=dict)  # texts that a click unfolds, by their heads
 
 
 def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
-    """Write a page, whole or not at all.
+    """Write a page, whole or not at all; sections with nothing but a heading are left out.
 
     Raises:
         ConfigError: it cannot be written.
@@ -69,7 +68,7 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
     )
     pages.filters["lines"] = lambda text: Markup(escape(visible(without_secrets(text), keep="\n")))
     script = (_TEMPLATES / "points.js").read_text(encoding="utf-8")
-    parts = [_plain(section) for section in sections]
+    parts = [_plain(s) for s in sections if s.notes or s.view or s.pictures or s.tables or s.folded]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     page = pages.get_template("report.html.jinja").render(
         title=title, sections=parts, script=Markup(script), script_digest=digest

@@ -27,16 +27,10 @@ def read_summary(folder: Path) -> dict[str, Any]:
     path = folder / SUMMARY_FILE
     try:
         summary = json.loads(read_regular(path, MAX_SUMMARY_BYTES))
-    except (FileNotFoundError, NotADirectoryError) as error:
+    except (OSError, ValueError, RecursionError, ConfigError) as error:
         raise ConfigError(
-            f"{folder}: no summary.json; give a folder that `semantic-mapper replay` has written"
+            f"{path}: cannot be read; give a folder that `semantic-mapper replay` has written ({error})"
         ) from error
-    except RecursionError as error:
-        raise ConfigError(f"{path}: cannot be read: too many values inside each other") from error
-    except (OSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
     if not isinstance(summary, dict) or "frames" not in summary or "metrics" not in summary:
         raise ConfigError(f"{path}: is not the summary of a replay")
     return summary
@@ -85,29 +79,13 @@ def result_lines(out: Path) -> list[str]:
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures has to know."""
     frames, lines = summary["frames"], []
-    if dig(summary, "map.nearly_empty"):
-        lines.append(f"warning: {summary['map']['nearly_empty']}")
-    if dig(summary, "pose_check.warning"):
-        lines.append(f"warning: {summary['pose_check']['warning']}")
-    lines.extend(f"warning: {note}" for note in dig(summary, "pictures.notes") or ())
-    if fraction := dig(summary, "depth.computed_fraction"):
-        lines.append(
-            f"depth: computed from the pictures for {percent(fraction)} of the frames, which have no sensor depth; "
-            "expect a surface less exact than a sensor's, and holes in plain walls"
-        )
-    if fraction := dig(summary, "depth.rendered_fraction"):
-        lines.append(
-            f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
-            "is less exact than with a depth sensor"
-        )
-    if fraction := dig(summary, "map.computed"):
-        lines.append(
-            f"surface: {percent(fraction)} of its points were computed, not measured by a sensor; "
-            "`export --min-weight 1` leaves them out"
-        )
-    unused = sum(
-        frames.get(k, 0) * sign for k, sign in (("published", 1), ("dropped", -1), ("refused", -1), ("fused", -1))
-    )
+    for warning in (dig(summary, "map.nearly_empty"), dig(summary, "pose_check.warning")):
+        lines += [f"warning: {warning}"] if warning else []
+    lines += [f"warning: {note}" for note in dig(summary, "pictures.notes") or ()]
+    for path, text in _DEPTH_NOTES.items():
+        if fraction := dig(summary, path):
+            lines.append(text.format(percent(fraction)))
+    unused = frames.get("published", 0) - sum(frames.get(name, 0) for name in ("dropped", "refused", "fused"))
     if unused and dig(summary, "depth.computed_fraction"):
         lines.append(
             f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure, as at "
@@ -117,32 +95,36 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {SCALE_FIX}"
         )
-    if frames.get("left_out"):
-        lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
-    if frames.get("excluded_from_scores"):
-        lines.append(
-            f"{counted(frames['excluded_from_scores'], 'frame')} left out of the scores: weights were finetuned on them"
-        )
-    if frames.get("pseudo_labels"):
-        lines.append(
-            f"{counted(frames['pseudo_labels'], 'frame')} not scored: their labels are pseudo labels, which weights "
-            "have rendered (`autolabel`)"
-        )
-    if frames.get("refused"):
-        first = summary["refusals"][0]["reason"] if summary.get("refusals") else ""
-        lines.append(f"{counted(frames['refused'], 'frame')} refused; the first: {first}")
-    if frames.get("labels_refused"):
-        lines.append(f"{counted(frames['labels_refused'], 'frame')} mapped, but not scored: labels that cannot be used")
+    reason = f"refused; the first: {summary['refusals'][0]['reason'] if summary.get('refusals') else ''}"
+    for name, text in {**_FRAME_NOTES, "refused": reason}.items():
+        if frames.get(name):
+            lines.append(f"{counted(frames[name], 'frame')} {text}")
     if summary.get("damaged_stretches"):
         damaged = counted(len(summary["damaged_stretches"]), "damaged stretch", "damaged stretches")
         lines.append(f"{damaged} of the log passed over")
-    if summary.get("map", {}).get("unfinished_correction"):
+    if dig(summary, "map.unfinished_correction"):
         lines.append(summary["map"]["unfinished_correction"])
     if summary.get("stopped_by"):
         lines.append(f"stopped by {summary['stopped_by']}: the results are those of the frames so far")
     if summary.get("restarted"):
         lines.append(f"{summary['restarted']}; frames are counted since then")
     return lines
+
+
+_DEPTH_NOTES = {
+    "depth.computed_fraction": "depth: computed from the pictures for {} of the frames, which have no sensor depth; "
+    "expect a surface less exact than a sensor's, and holes in plain walls",
+    "depth.rendered_fraction": "depth: rendered by the field for {} of the frames, which have no sensor depth; "
+    "geometry is less exact than with a depth sensor",
+    "map.computed": "surface: {} of its points were computed, not measured by a sensor; `export --min-weight 1` leaves "
+    "them out",
+}
+_FRAME_NOTES = {
+    "left_out": "of the film left out by the import; its report says why",
+    "excluded_from_scores": "left out of the scores: weights were finetuned on them",
+    "pseudo_labels": "not scored: their labels are pseudo labels, which weights have rendered (`autolabel`)",
+    "labels_refused": "mapped, but not scored: labels that cannot be used",
+}
 
 
 def percent(value: float) -> str:

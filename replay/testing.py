@@ -18,12 +18,10 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.nearest import NearestSurface, at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.replay.compare import Comparison, Run, Tolerances, compare_runs, read_run
+from semantic_mapper.replay.compare import Run, Tolerances, compare_runs, read_run
 from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.run_folder import MAP_NAME
 from semantic_mapper.replay.summary import SUMMARY_FILE
-
-UPDATE_OPTION = "--update-runs"
 
 Settings = Mapping[str, Any] | Path | str | None
 Quality = Literal["fast", "balanced", "reference"] | None
@@ -34,7 +32,7 @@ class ReplayedMap:
     """The map that a log has become, and the questions of tests to it. Points are (3,) metres in the world."""
 
     folder: Path  # what ``semantic-mapper replay`` would have written: map, picture, summary
-    voxel_map: VoxelMap  # the map
+    voxel_map: VoxelMap
     summary: Mapping[str, Any]  # as in ``summary.json``
     root: Path  # what paths of stored runs are relative to
     update: bool = False  # store runs instead of comparing with them
@@ -48,20 +46,12 @@ class ReplayedMap:
         return MapMirror.of(self.voxel_map).snapshot()
 
     def class_at(self, point: ArrayLike, radius_m: float | None = None) -> str | None:
-        """Name of the class of the surface at a point; None where there is no surface, or nobody knows what it is.
-
-        Raises:
-            MapError: not a point, or a radius beyond what ``queries.nearest.at`` takes.
-        """
+        """Name of the class of the surface at a point, as of ``queries.nearest.at``; None where nobody knows it."""
         labels, found = self.snapshot.label_set, int(at(self.snapshot, np.asarray(point)[None], radius_m).label[0])
         return None if found == labels.ignore_id else labels.names[labels.ids.index(found)]
 
     def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
-        """The surface of a class that is nearest to a point: ``xyz``, ``distance_m``, ``confidence``; None = nowhere.
-
-        Raises:
-            LabelError, MapError: no such class; not a point.
-        """
+        """The surface of a class nearest to a point: ``xyz``, ``distance_m``, ``confidence``; None = nowhere."""
         return nearest(self.snapshot, class_name, point, min_confidence)
 
     def is_free(self, point: ArrayLike) -> bool:
@@ -93,40 +83,32 @@ class ReplayedMap:
         """Of the map's surface against the labels of the log, 0..1; ``LogError`` without labels that count."""
         return self._score("map_miou")
 
-    def compare(self, stored: Path | str, **tolerances: float) -> Comparison:
-        """Compare with an earlier run: a folder with ``map.npz`` and ``summary.json``, or a map alone.
-
-        Args:
-            stored: The run; a relative path begins at pytest's root folder.
-            tolerances: As of ``semantic_mapper.replay.compare.Tolerances``: score, surface_m, labels.
-
-        Raises:
-            ConfigError: no such field, or a folder without a run.
-            MapError: no such map, or a damaged one.
-        """
-        allowed = convert_config(tolerances, Tolerances, "tolerances")
-        earlier = read_run(self.root / stored)
-        return compare_runs(earlier, Run(str(self.folder), self.voxel_map, self.summary), allowed)
-
     def store(self, target: Path | str) -> None:
-        """Write what ``compare`` needs of this run to a folder, made if missing."""
+        """Write what ``assert_like`` needs of this run to a folder, made if missing."""
         folder = self.root / target
         folder.mkdir(parents=True, exist_ok=True)
         for name in (MAP_NAME, SUMMARY_FILE):
             shutil.copyfile(self.folder / name, folder / name)
 
     def assert_like(self, stored: Path | str, **tolerances: float) -> None:
-        """Fail where this run is not as an earlier one within tolerances; see ``compare``.
+        """Fail where this run is not as an earlier one, saying what differs; ``pytest --update-runs`` stores it there.
 
-        ``pytest --update-runs`` stores this run there instead. A failure names what differs.
+        Args:
+            stored: A folder with ``map.npz`` and ``summary.json``, or a map alone; relative to pytest's root folder.
+            tolerances: As of ``semantic_mapper.replay.compare.Tolerances``: score, surface_m, labels.
+
+        Raises:
+            ConfigError: no such tolerance, or a folder without a run.
+            MapError: a damaged map.
         """
         target = self.root / stored
         if self.update:
             self.store(target)
             return
         if not target.exists():
-            raise AssertionError(f"no run is stored at {target}; look at {self.folder}, then `pytest {UPDATE_OPTION}`")
-        comparison = self.compare(stored, **tolerances)
+            raise AssertionError(f"no run is stored at {target}; look at {self.folder}, then `pytest --update-runs`")
+        run = Run(str(self.folder), self.voxel_map, self.summary)
+        comparison = compare_runs(read_run(target), run, convert_config(tolerances, Tolerances, "tolerances"))
         if not comparison.equal:
             lines = [f"the map is not as {target}; see {self.folder}", *map(str, comparison.differences)]
             raise AssertionError("\n  ".join([*lines, *comparison.notes]))
@@ -134,9 +116,7 @@ class ReplayedMap:
     def _score(self, name: str) -> float:
         value = self.summary["metrics"][name]
         if value is None:
-            raise LogError(
-                f"{self.folder}: nothing to score: no frame has labels, or the weights have seen all of them"
-            )
+            raise LogError(f"{self.folder}: nothing to score: no frame has labels that the weights have not seen")
         return float(value)
 
 
@@ -188,6 +168,6 @@ class LogReplays:
         if key not in self._done:
             folder = self._make_folder(log.stem)
             result = replay_log(log, folder, weights, mapper, max_frames)
-            session, summary = result.session, result.summary
-            self._done[key] = ReplayedMap(folder, session.pipeline.voxel_map, summary, self._root, self._update)
+            voxel_map = result.session.pipeline.voxel_map
+            self._done[key] = ReplayedMap(folder, voxel_map, result.summary, self._root, self._update)
         return self._done[key]

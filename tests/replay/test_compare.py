@@ -72,7 +72,7 @@ def test_other_settings_and_logs_are_noted_and_no_difference(run: Run) -> None:
     assert run.summary is not None
     config = {**run.summary["config"], "quality": "another"}
     comparison = compare_runs(run, run._replace(summary={**run.summary, "config": config, "source": "s"}), Tolerances())
-    assert comparison.equal and [note.split(":")[0] for note in comparison.notes] == ["log", "config quality"]
+    assert comparison.equal and [note.split(":")[0] for note in comparison.notes] == ["source", "config.quality"]
 
 
 def test_maps_are_compared_by_their_surface_and_classes_from_both_sides() -> None:

@@ -142,7 +142,7 @@ def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights
     without = [replace(f, depth_m=None) for f in frames]
     for name, depth, frames_in, why in (
         ("rendered", "sensor", without, "have no sensor depth, and depth that the field renders"),
-        ("computed", "auto", without, "poses that are exact"),
+        ("computed", "auto", without, "needs exact poses"),
         ("measured", "auto", frames, "check depth_scale, the intrinsics and the poses"),
     ):
         summary = finish_session(run(weights, frames_in, depth=depth), tmp_path / name)
