@@ -38,9 +38,7 @@ def bench_fusion(log: Path, frames: int = 20, voxel_size_m: float = 0.02) -> dic
     """Time our fusion with 20 and 40 classes against Open3D's ``integrate`` without any, frame by frame in turns.
 
     Both find their own blocks. Open3D fuses TSDF and colour; ours class evidence, too, of a quarter-size rendered view.
-
-    Returns:
-        Plain data: milliseconds a frame (medians); ``ratio_20`` and ``ratio_40`` are ours over Open3D's.
+    Gives plain data: milliseconds a frame (medians); ``ratio_20`` and ``ratio_40`` are ours over Open3D's.
     """
     posed, _ = _frames(log, frames + WARM_UP)
     config = VoxelMapConfig(voxel_size_m=voxel_size_m)
@@ -78,10 +76,8 @@ def bench_pipeline(log: Path, weights: Path | None, config: MapperConfig, frames
     """Time whole steps: 640x480 frames of a log in, the semantic map out.
 
     The frames have a sensor's depth; none with ``depth.source`` "computed": a step computes it as a live mapper does.
-
-    Returns:
-        Plain data: ``hz`` (1 / mean of a step), ``p50_ms`` and ``p95_ms`` of ``step``, medians of its stages, and the
-        mIoU of the rendered labels (None for a log without labels).
+    Gives plain data: ``hz`` (1 / mean of a step), ``p50_ms`` and ``p95_ms`` of ``step``, medians of its stages, and the
+    mIoU of the rendered labels (None for a log without labels).
     """
     pipeline = Mapper.load(weights, config).pipeline
     posed, label_set = _frames(log, frames + WARM_UP)
@@ -150,15 +146,8 @@ class _Open3DFusion:
         self._config = config
         core = self._o3d.core
         dtypes, shapes, cpu = (core.float32,) * 3, ((1,), (1,), (3,)), core.Device("CPU:0")
-        self._grid = self._o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight", "color"),
-            dtypes,
-            shapes,
-            config.voxel_size_m,
-            8,
-            config.initial_blocks,
-            cpu,
-        )
+        names, size_m, blocks = ("tsdf", "weight", "color"), config.voxel_size_m, config.initial_blocks
+        self._grid = self._o3d.t.geometry.VoxelBlockGrid(names, dtypes, shapes, size_m, 8, blocks, cpu)
 
     @property
     def block_count(self) -> int:

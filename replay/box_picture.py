@@ -58,18 +58,13 @@ class _Place(NamedTuple):
 
 
 def draw_boxes(log: Log, boxes: Sequence[Primitive], title: str) -> tuple[UInt8, int]:
-    """Draw boxes over the frames that show the most of them, and from above.
-
-    Args:
-        log: Whose frames.
-        boxes: In its world.
-        title: Head of the picture.
+    """Draw boxes, which are in the world of a log, over the frames that show the most of them, and from above.
 
     Returns:
         The picture (H, W, 3) uint8 RGB, and how many boxes have their middle in view of any frame.
 
     Raises:
-        LogError: it has no frames.
+        LogError: the log has no frames.
     """
     places = [
         _Place(number, e.stamp_ns, log.info.cameras[e.source], np.array(e.T_world_camera, np.float64).reshape(4, 4))
@@ -138,19 +133,13 @@ def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
 def edges_in_view(box: Primitive, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> list[Float64]:
     """Ends (2, 2) in pixels of the edges of a box, as far as they are in front of a camera."""
     corners = transform(invert_pose(T_world_camera), box.corners())
-    ends = [_in_front(corners[a], corners[b]) for a, b in _EDGES]
-    return [project(e, intrinsics) for e in ends if e is not None]
-
-
-def _in_front(a: Float64, b: Float64) -> Float64 | None:
-    """The part (2, 3) of an edge in camera coordinates that is in front of the camera; None where nothing is."""
-    if a[2] < NEAR_M and b[2] < NEAR_M:
-        return None
-    ends = [a, b]
-    for i, (near, far) in enumerate(((a, b), (b, a))):
-        if near[2] < NEAR_M:
-            ends[i] = near + (far - near) * ((NEAR_M - near[2]) / (far[2] - near[2]))
-    return np.stack(ends)
+    found: list[Float64] = []
+    for edge in _EDGES:
+        near, far = sorted(corners[list(edge)], key=lambda corner: corner[2])
+        if far[2] >= NEAR_M:
+            start = max(0.0, (NEAR_M - near[2]) / max(far[2] - near[2], 1e-12))
+            found.append(project(np.stack((near + start * (far - near), far)), intrinsics))
+    return found
 
 
 def _put_plan(
@@ -168,7 +157,7 @@ def _put_plan(
     roof = ceiling_height(level)
     inside = np.ones(len(level), np.bool_) if roof is None else level[:, 2] < roof
     points, path = from_above(level[inside]), from_above(poses[:, :3, 3] @ R.T)
-    moments = [(box, pose) for box in boxes for pose in _poses(box)]
+    moments = [(b, pose) for b in boxes for _, pose in b.stamps or b.frames or ((0, b.T_world_box),)]
     prints = [from_above(replace(box, T_world_box=pose).corners() @ R.T) for box, pose in moments]
 
     every = np.concatenate([points, path, *prints])
@@ -201,11 +190,6 @@ def _surface(frames: Sequence[PosedFrame]) -> tuple[Float64, UInt8]:
             xyz.append(transform(frame.T_world_camera, unproject(depth, k)[depth > 0]))
             rgb.append(resize_rgb(frame, k)[depth > 0])
     return np.concatenate(xyz), np.concatenate(rgb)
-
-
-def _poses(box: Primitive) -> list[Float64]:
-    known = box.stamps or box.frames
-    return [box.T_world_box] if known is None else [pose for _, pose in known]
 
 
 def _put_id(axes: Axes, at: Float64, box_id: int) -> None:

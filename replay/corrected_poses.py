@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -58,10 +59,11 @@ def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
 def match_frames(
     keys: Iterable[tuple[str, int]], stamps_ns: NDArray[np.int64], poses: Float64, within_ns: int
 ) -> dict[tuple[str, int], Float64]:
-    """Poses by the frames of one camera that were taken nearest to their stamps; those without one are left out.
+    """Poses by the frames, (camera_id, stamp_ns), of one camera that were taken nearest to their stamps; those without
+    one are left out.
 
     Args:
-        keys: (camera_id, stamp_ns) of the frames.
+        keys: Of the frames.
         stamps_ns, poses: (N,) and (N, 4, 4) T_world_camera.
         within_ns: Largest difference.
     """
@@ -90,11 +92,11 @@ def correct_session(session: MapSession, trajectory: Trajectory) -> int:
     given = len(trajectory.stamps_ns)
     frozen = session.pipeline.corrector.status.frozen  # frames that have left the history, whose stamps are not known
     if not poses:
+        first, frames = trajectory.stamps_ns[0] / 1e9, keys[0][1] / 1e9 if keys else math.nan
         raise ImportSourceError(
-            f"{trajectory.path}: none of its {given} stamps is that of a mapped frame "
-            f"(within {MATCH_NS / 1e6:g} ms); the first is {trajectory.stamps_ns[0] / 1e9:.6f} s"
-            + (f", that of the frames {keys[0][1] / 1e9:.6f} s" if keys else "")
-            + (f"; {frozen} frames have left the history, raise history.max_frames or max_disk_mb" if frozen else "")
+            f"{trajectory.path}: none of its {given} stamps is that of a mapped frame (within {MATCH_NS / 1e6:g} ms); "
+            f"the first is {first:.6f} s, that of the frames {frames:.6f} s; {frozen} frames have left the history "
+            "(history.max_frames, max_disk_mb)"
         )
     if len(poses) < given:
         _log.warning("corrections_without_a_frame", left_out=given - len(poses), used=len(poses), frozen=frozen)

@@ -72,11 +72,7 @@ class LabelFolder:
         return replace(frame, label=label, label_is_pseudo=False)
 
     def read(self, number: int, size: tuple[int, int]) -> UInt8:
-        """Label image (H, W) of a frame of that size.
-
-        Raises:
-            LogError: it is missing or damaged, of another size, or names other classes.
-        """
+        """Label image (H, W) of a frame; ``LogError`` where it is missing or damaged, of another size or classes."""
         file = self._files().get(number)
         if file is None:
             raise LogError(f"{self.path}: has no label image of frame {number}, {number:06d}.png")
@@ -132,33 +128,34 @@ def open_label_folder(path: Path, log: Log) -> LabelFolder:
 
 
 def make_label_folder(path: Path, log: Log, label_set: LabelSet) -> LabelFolder:
-    """A folder to write to: a new one, or one with labels of the same log, to go on with.
+    """A folder to write label images of a log to: a new one, or one with labels of the same log, to go on with.
 
-    Args:
-        path: Of the folder.
-        log: Whose frames are labelled.
-        label_set: Its classes. A folder that is there may have fewer, with the same ids.
+    A folder that is there may have fewer classes than ``label_set``, with the same ids.
 
     Raises:
         LogError: it holds labels of another log, or cannot be made.
         LabelError: it holds labels of other classes.
         ImportSourceError: its labels.json is invalid.
     """
+    folder = LabelFolder(path, label_set)
     if (path / LABELS_FILE).exists():
         _check_log(path, log)
         there = read_label_set(path / LABELS_FILE)
-        if LabelFolder(path, there).numbers():
-            _check_classes(path, there, label_set)
-    elif LabelFolder(path, label_set).numbers():
+        kept = set(zip(there.ids, there.names, strict=True)) <= set(zip(label_set.ids, label_set.names, strict=True))
+        if folder.numbers() and (not kept or there.ignore_id != label_set.ignore_id):
+            raise LabelError(
+                f"{path}: holds labels of other classes ({', '.join(there.names)}; unknown is {there.ignore_id}); leave"
+                " out --classes to go on with them, give classes that hold these with their ids, or another folder"
+            )
+    elif folder.numbers():
         raise LogError(f"{path}: has images, but no labels.json that says what they are; choose another folder")
-    identity = msgspec.to_builtins(log_identity(log))
-    text = json.dumps(plain_labels(label_set) | {"log": identity}, indent=1, ensure_ascii=False)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogError(f"{path}: cannot be made: {error.strerror or error}; choose another folder") from error
-    write_bytes(path / LABELS_FILE, text.encode(), raises=LogError)
-    return LabelFolder(path, label_set)
+    data = plain_labels(label_set) | {"log": msgspec.to_builtins(log_identity(log))}
+    write_bytes(path / LABELS_FILE, json.dumps(data, indent=1, ensure_ascii=False).encode(), raises=LogError)
+    return folder
 
 
 def read_classes(file: Path) -> LabelSet:
@@ -193,20 +190,6 @@ def _check_log(path: Path, log: Log) -> None:
         named = read_json(path / LABELS_FILE, _NamedLog).log
     except ConfigError as error:
         raise LogError(str(error)) from error
-    if named is None:
-        return
     here = log_identity(log)
-    if (named.frames, named.digest) != (here.frames, here.digest):
-        raise LogError(
-            f"{path}: holds labels of another log, {named.name} ({named.frames} frames); give that log, "
-            "or another folder"
-        )
-
-
-def _check_classes(path: Path, there: LabelSet, wanted: LabelSet) -> None:
-    kept = set(zip(there.ids, there.names, strict=True)) <= set(zip(wanted.ids, wanted.names, strict=True))
-    if not kept or there.ignore_id != wanted.ignore_id:
-        raise LabelError(
-            f"{path}: holds labels of other classes ({', '.join(there.names)}; unknown is {there.ignore_id}); leave out"
-            " --classes to go on with them, give classes that hold these with their ids, or another folder"
-        )
+    if named is not None and (named.frames, named.digest) != (here.frames, here.digest):
+        raise LogError(f"{path}: holds labels of another log, {named.name} ({named.frames} frames); give that one")

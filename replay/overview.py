@@ -81,8 +81,7 @@ def draw_overview(
         points: The map; N may be 0.
         label_set: Names and colours of all labels.
         title, subtitle: Head of the picture.
-        up: (3,) rough up direction of the world frame (``upright.camera_up`` of the poses gives one); ``None``
-            estimates it from the points alone.
+        up: (3,) rough up of the world, as of ``upright.camera_up``; None estimates it from the points alone.
         unit: Of lengths.
         rooms: Name and outline (N, 3) in the world of each room, drawn into the map from above.
     """
@@ -95,7 +94,8 @@ def draw_overview(
         y += _strip_height(strip) + GAP
     _put_map(figure, top + CAPTION, points, label_set, up, unit, rooms)
     shown = [image for strip in strips for image in (strip.rendered, strip.truth) if image is not None]
-    legend = place(figure, (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT))
+    x, y = WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION
+    legend = place(figure, (x, y, LEGEND_WIDTH, MAP_HEIGHT))
     put_text(legend, (0, -11), "class, fraction of the map", color=DIM_TEXT)
     hints = ["paler in the map = less sure"]
     if points.measured is not None and not points.measured.all():
@@ -103,7 +103,7 @@ def draw_overview(
         hints.append(f"striped = computed: {share}" if points.measured.any() else "all of it computed, no sensor")
     for row, hint in enumerate(reversed(hints)):
         put_text(legend, (0, MAP_HEIGHT - 10 - 20 * row), hint, color=DIM_TEXT)
-    box = (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT - 10 - 20 * len(hints))
+    box = (x, y, LEGEND_WIDTH, MAP_HEIGHT - 10 - 20 * len(hints))
     put_legend(figure, box, class_rows(points.label, label_set, shown))
     return figure
 
@@ -117,8 +117,7 @@ def draw_strip(strip: ViewStrip, label_set: LabelSet, unit: str = "m") -> Figure
 
 
 def _tile_size(strip: ViewStrip) -> tuple[int, int]:
-    tiles = 2 + (strip.truth is not None) + (strip.depth_m is not None)
-    columns = max(tiles, 3)  # two tiles side by side would tower over the map
+    columns = 3 + (strip.truth is not None and strip.depth_m is not None)  # two alone would tower over the map
     width = (WIDTH - 2 * MARGIN - (columns - 1) * GAP) // columns
     return width, round(width * strip.rgb.shape[0] / strip.rgb.shape[1])
 
@@ -209,12 +208,10 @@ def _striped(colors: UInt8, upright: Float64, computed: NDArray[np.bool_]) -> UI
 
 
 def _without_ceiling(upright: Float64, label: UInt8, label_set: LabelSet) -> NDArray[np.bool_]:
-    inside = np.ones(len(upright), np.bool_)
     cut = ceiling_height(upright)
-    if cut is not None:
-        inside &= upright[:, 2] < cut
+    inside = upright[:, 2] < (np.inf if cut is None else cut)
     if "ceiling" in label_set.names:
-        inside &= label != label_set.ids[label_set.names.index("ceiling")]
+        inside &= label != label_set.id_of("ceiling")
     return inside if inside.any() else ~inside
 
 
@@ -230,11 +227,8 @@ def _put_room(axes: Axes, name: str, corners: Float64) -> None:
 
 def put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
     """A bar of 1 m (or of the power of ten that fits) in the lower left corner; ``scale`` is in pixels a metre."""
-    metres = 1.0
-    while metres * scale > axes.get_xlim()[1] / 3:
-        metres /= 10
-    while metres * scale < 24:
-        metres *= 10
+    longest, shortest = axes.get_xlim()[1] / 3 / scale, 24 / scale
+    metres = 10.0 ** max(min(0, np.floor(np.log10(longest))), np.ceil(np.log10(shortest)))
     y = axes.get_ylim()[0] - 18
     axes.plot((16, 16 + metres * scale), (y, y), color="white", linewidth=3, solid_capstyle="butt")
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 2}  # points may lie here
@@ -298,16 +292,10 @@ def from_angle(xyz_upright: Float64, azimuth: float, elevation: float) -> Float6
 
 
 def hides_the_room(xyz_upright: Float64, azimuth: float) -> NDArray[np.bool_]:
-    """Which points of tall things stand in front and would hide the rest from a viewer at ``azimuth``.
+    """(N,) bool: which points of tall things stand in front and would hide the rest from a viewer at ``azimuth``.
 
-    Leaving them out opens the map like a doll's house: walls, and what leans on them, on the viewer's side.
-
-    Args:
-        xyz_upright: (N, 3) metres, z up.
-        azimuth: Direction of the viewer in the x-y plane, radians.
-
-    Returns:
-        (N,) bool; never the floor.
+    Leaving them out opens the map like a doll's house: walls, and what leans on them, on the viewer's side; never the
+    floor. Points are upright, (N, 3) metres, z up; ``azimuth`` is a direction in the x-y plane, radians.
     """
     towards = np.array((np.cos(azimuth), np.sin(azimuth)))
     low, high = np.percentile(xyz_upright[:, 2], (2, 99)) if len(xyz_upright) else (0.0, 0.0)

@@ -22,22 +22,14 @@ _log = get_logger(__name__)
 
 
 def prepare_file(path: Path) -> None:
-    """Make sure that a file can be written, before minutes are spent on what is to be in it.
-
-    Raises:
-        ConfigError: it is a folder, or nothing can be written next to it.
-    """
+    """Make sure that a file can be written, before minutes are spent on what is to be in it; else ``ConfigError``."""
     if path.is_dir():
         raise ConfigError(f"{path}: is a folder; give the name of a file")
     prepare_folder(path.parent)
 
 
 def prepare_folder(out: Path) -> None:
-    """Make the folder for results, before minutes are spent on them.
-
-    Raises:
-        ConfigError: it cannot be made or written to.
-    """
+    """Make the folder for results, before minutes are spent on them; ``ConfigError`` where that is not possible."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
@@ -54,11 +46,7 @@ def free_name(path: Path) -> Path:
 
 @contextmanager
 def folder_for_results(out: Path) -> Iterator[None]:
-    """Make the folder, and remove it again where an error leaves it empty.
-
-    Raises:
-        ConfigError: it cannot be made or written to.
-    """
+    """As ``prepare_folder``; removes the folder again where an error leaves it empty."""
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         prepare_folder(out)
@@ -72,69 +60,53 @@ def folder_for_results(out: Path) -> Iterator[None]:
 
 @contextmanager
 def hold_folder(out: Path) -> Iterator[None]:
-    """Make the folder for results, and keep other runs out of it for as long as this one lasts.
-
-    Where an error leaves a new folder empty, it is removed again.
+    """As ``folder_for_results``, and keeps other runs out of the folder for as long as this one lasts.
 
     Raises:
         ConfigError: it cannot be made or written to, or another run writes its results there.
     """
-    with folder_for_results(out), _lock(out):
-        for left in remove_stale(out):
-            _log.info("unfinished_file_removed", path=str(left))
-        yield
-
-
-@contextmanager
-def _lock(out: Path) -> Iterator[None]:
-    folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    try:
+    with folder_for_results(out):
+        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            os.close(folder)
             raise ConfigError(
                 f"{out}: another run writes its results there; choose another folder (--out), or wait until it ends"
             ) from None
         except OSError as error:  # file systems without locks
             _log.warning("folder_not_held", folder=str(out), reason=error.strerror)
-        yield
-    finally:
-        os.close(folder)
+        try:
+            for left in remove_stale(out):
+                _log.info("unfinished_file_removed", path=str(left))
+            yield
+        finally:
+            os.close(folder)
 
 
 def map_path(path: Path) -> Path:
     """The file of a map that is named itself, or by the folder it is in.
 
     Raises:
-        ConfigError: no map is there, or it is a log.
+        ConfigError: no map is there, or it is a log; with what to do, from what is there.
     """
-    if path.is_dir() and not (path / MAP_NAME).is_file():
-        raise ConfigError(f"{path}: no {MAP_NAME} in this folder; {_instead_of_map(path)}")
     if not path.exists():
         raise ConfigError(f"{path}: no such map file or folder")
+    if path.is_dir() and (path / MAP_NAME).is_file():
+        return path / MAP_NAME
     if is_log(path):
         raise ConfigError(f"{path}: is a log; `semantic-mapper replay {path} --out FOLDER` makes a map of it")
-    return path / MAP_NAME if path.is_dir() else path
-
-
-def _instead_of_map(folder: Path) -> str:
-    """What to do about a folder without a map, from what is in it."""
-    if (folder / STORE_MARK).is_file():
-        return "a fleet's store: `fleet merge` fuses its maps; or name one of them in files/"
-    maps = [*sorted(folder.glob(f"*{MAP_SUFFIX}")), *sorted(folder.glob(f"*/{MAP_NAME}"))]
-    if maps:
-        return f"name the map itself, such as {maps[0]}"
-    if is_log(folder):
-        return f"its logs hold frames: `semantic-mapper replay {folder} --out FOLDER` makes a map of them"
-    return "give a saved map or a folder that `replay` has written"
+    if not path.is_dir():
+        return path
+    maps = [*sorted(path.glob(f"*{MAP_SUFFIX}")), *sorted(path.glob(f"*/{MAP_NAME}"))]
+    hint = f"name the map itself, such as {maps[0]}" if maps else "give a saved map or a folder of `replay`"
+    if (path / STORE_MARK).is_file():
+        hint = "a fleet's store: `fleet merge` fuses its maps; or name one of them in files/"
+    raise ConfigError(f"{path}: no {MAP_NAME} in this folder; {hint}")
 
 
 def refuse_overwriting(out: Path, *sources: Path) -> None:
-    """Refuse a result under the name of what it is made from.
-
-    Raises:
-        ConfigError: naming the file.
-    """
+    """Refuse a result under the name of what it is made from, by a ``ConfigError``."""
     if out.resolve() in {source.resolve() for source in sources}:
         raise ConfigError(f"{out}: the result is made from it; choose another name")
 

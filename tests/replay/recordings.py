@@ -11,15 +11,13 @@ import cv2
 import numpy as np
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from scipy.spatial.transform import Rotation
 
 from semantic_mapper.geometry import invert_pose, look_at
 from semantic_mapper.labels import NYU40
 from semantic_mapper.replay.importers import ImportOptions, ImportReport, import_recording
 from semantic_mapper.replay.log.reader import LogReader
-from semantic_mapper.replay.sfm.gps import (
-    GpsPosition,
-    east_north_up,
-)
+from semantic_mapper.replay.sfm.gps import GpsPosition, east_north_up
 from semantic_mapper.types import Float64, PosedFrame
 
 WIDTH, HEIGHT = 32, 24
@@ -125,10 +123,7 @@ def nyu40_color(name: str) -> tuple[int, int, int]:
 
 # Collections of posed pictures, and data sets.
 
-
 W, H, F = 64, 48, 50.0
-
-
 GL = np.diag((1.0, -1.0, -1.0, 1.0))
 
 
@@ -180,18 +175,8 @@ def add_depth(folder: Path) -> Path:
 
 def quaternion(R: Float64) -> tuple[float, float, float, float]:
     """w x y z of a rotation."""
-    values, vectors = np.linalg.eigh(
-        np.array(
-            [
-                [R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
-                [R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
-                [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1], R[1, 0] - R[0, 1]],
-                [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
-            ]
-        )
-    )
-    x, y, z, w = vectors[:, int(np.argmax(values))]
-    return float(w), float(x), float(y), float(z)
+    x, y, z, w = Rotation.from_matrix(R).as_quat().tolist()
+    return w, x, y, z
 
 
 POINTS = np.array([(2.0, -0.3, 1.4), (2.5, 0.4, 1.7), (1.8, 0.0, 1.2)])
@@ -301,26 +286,20 @@ def tag(file: Path, position: GpsPosition, **changes: Any) -> None:
 
     def angle(degrees: float) -> tuple[IFDRational, ...]:
         whole, minutes = int(abs(degrees)), abs(degrees) % 1 * 60
-        return (
-            IFDRational(whole),
-            IFDRational(int(minutes)),
-            IFDRational(round(minutes % 1 * 60 * 1_000_000), 1_000_000),
-        )
+        millionths = IFDRational(round(minutes % 1 * 60 * 1_000_000), 1_000_000)
+        return IFDRational(whole), IFDRational(int(minutes)), millionths
 
     image = Image.open(file)
     exif = image.getexif()
-    exif.get_ifd(0x8825).update(
-        {
-            1: "N" if position.latitude >= 0 else "S",
-            2: angle(position.latitude),
-            3: "E" if position.longitude >= 0 else "W",
-            4: angle(position.longitude),
-            5: b"\x01" if position.altitude_m < 0 else b"\x00",
-            6: IFDRational(round(abs(position.altitude_m) * 1000), 1000),
-        }
-    )
-    for key in changes.get("without", ()):
-        del exif.get_ifd(0x8825)[key]
+    found = {
+        1: "N" if position.latitude >= 0 else "S",
+        2: angle(position.latitude),
+        3: "E" if position.longitude >= 0 else "W",
+        4: angle(position.longitude),
+        5: b"\x01" if position.altitude_m < 0 else b"\x00",
+        6: IFDRational(round(abs(position.altitude_m) * 1000), 1000),
+    }
+    exif.get_ifd(0x8825).update({key: value for key, value in found.items() if key not in changes.get("without", ())})
     image.save(file, exif=exif, quality=95)
 
 

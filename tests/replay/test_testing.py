@@ -19,7 +19,6 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.nearest import at
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.replay.testing import LogReplays, ReplayedMap
-from semantic_mapper.types import PosedFrame
 from tests.nodes.support import CONFIG, run, write_config, write_log, write_weights
 from tests.small import tiny_frames
 
@@ -94,28 +93,21 @@ def test_a_replay_is_done_once_for_the_same_settings(root: Path, tmp_path: Path)
 
 
 def test_refused_frames_are_told_and_a_log_of_nothing_else_is_an_error(root: Path, tmp_path: Path) -> None:
-    def lost(frame: PosedFrame) -> PosedFrame:
-        return replace(frame, T_world_camera=2 * frame.T_world_camera)
-
-    frames = tiny_frames(3)
-    write_log(tmp_path / "some.mcap", [lost(frames[0]), *frames[1:]])
-    write_log(tmp_path / "none.mcap", [lost(f) for f in frames])
+    frames = [replace(f, label=None) for f in tiny_frames(3)]
+    lost = [replace(f, T_world_camera=2 * f.T_world_camera) for f in frames]
+    write_log(tmp_path / "some.mcap", [lost[0], *frames[1:]])
+    write_log(tmp_path / "none.mcap", lost)
     replay_log, settings = replays(root, tmp_path), {"weights": "tiny.safetensors", "config": "mapper.toml"}
     some = replay_log(tmp_path / "some.mcap", **settings)
     assert some.mapped == 2 and len(some.refused) == 1 and "seq=0" in some.refused[0]
+    with pytest.raises(LogError, match="nothing to score"):
+        _ = some.miou
     with pytest.raises(LogError, match="frames could be mapped"):
         replay_log(tmp_path / "none.mcap", **settings)
     with pytest.raises(LogError, match=r"gone\.mcap"):
         replay_log("gone.mcap", **settings)
     with pytest.raises(ConfigError, match="did you mean `voxel_map`"):
         replay_log("room.mcap", config={"voxel_maps": {}})
-
-
-def test_scores_of_a_log_without_labels_are_an_error_not_a_number(root: Path, tmp_path: Path) -> None:
-    write_log(tmp_path / "bare.mcap", [replace(f, label=None) for f in tiny_frames(2)])
-    bare = replays(root, tmp_path)(tmp_path / "bare.mcap", weights="tiny.safetensors", config="mapper.toml")
-    with pytest.raises(LogError, match="nothing to score"):
-        _ = bare.miou
 
 
 def test_a_stored_run_is_compared_with_tolerances(room: ReplayedMap, root: Path, tmp_path: Path) -> None:
