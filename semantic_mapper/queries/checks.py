@@ -1,4 +1,7 @@
-"""Arguments of queries come from people and programs: what is wrong with one is said before anything is computed."""
+"""Arguments of queries come from people and programs: what is wrong with one is said before anything is computed.
+
+Each check raises ``MapError``.
+"""
 
 from __future__ import annotations
 
@@ -12,34 +15,30 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64
 
 
+def as_numbers(values: ArrayLike, name: str) -> Float64:
+    """Whatever numpy makes an array of numbers of."""
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise MapError(f"{name}: expected numbers, got {values!r}") from error
+
+
 def check_points(points: ArrayLike, snapshot: MapSnapshot, name: str = "points") -> Float64:
-    """Points (N, 3) in metres -> units of voxels.
-
-    Raises:
-        MapError: lengths of the map are not metres; or see ``voxel_coordinates``.
-    """
+    """Points (N, 3) in metres, no farther than a map can reach -> units of voxels."""
     require_metres(snapshot.scale_known, name)
-    return voxel_coordinates(points, snapshot, name)
-
-
-def voxel_coordinates(points: ArrayLike, snapshot: MapSnapshot, name: str) -> Float64:
-    """Points (N, 3) in the map's own unit -> units of voxels.
-
-    Raises:
-        MapError: another shape, NaN or infinity, or farther than a map can reach.
-    """
     array = np.ascontiguousarray(as_numbers(points, name))
     if array.ndim != 2 or array.shape[1] != 3:
         raise MapError(f"{name}: expected shape (N, 3), got {array.shape}")
     reach_m = 4 * KEY_LIMIT * snapshot.voxel_size_m  # half of what keys can address
-    if array.size and not np.abs(array).max() < reach_m:
-        bad = int(np.flatnonzero(~(np.abs(array) < reach_m).all(axis=1))[0])
+    near = (np.abs(array) < reach_m).all(axis=1)
+    if not near.all():
+        bad = int(np.argmin(near))
         raise MapError(f"{name}: row {bad} is {array[bad].tolist()}; coordinates must be numbers below {reach_m:.0f} m")
     return array / snapshot.voxel_size_m
 
 
 def check_point(point: ArrayLike, snapshot: MapSnapshot, name: str = "point") -> Float64:
-    """One point (3,) in metres -> units of voxels; see ``check_points``."""
+    """One point (3,) in metres -> units of voxels."""
     array = as_numbers(point, name)
     if array.shape != (3,):
         raise MapError(f"{name}: expected shape (3,), got {array.shape}")
@@ -47,22 +46,18 @@ def check_point(point: ArrayLike, snapshot: MapSnapshot, name: str = "point") ->
 
 
 def check_direction(direction: ArrayLike, name: str) -> Float64:
-    """A direction (3,) or directions (N, 3) -> of unit length.
-
-    Raises:
-        MapError: another shape, NaN or infinity, or no length.
-    """
+    """A direction (3,) or directions (N, 3) of finite length above 0 -> of unit length."""
     array = as_numbers(direction, name)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
         raise MapError(f"{name}: expected shape (3,) or (N, 3), got {array.shape}")
     length = np.linalg.norm(array, axis=-1, keepdims=True)
-    if array.size and not (np.isfinite(length).all() and (length > 0).all()):
+    if not (np.isfinite(length) & (length > 0)).all():
         raise MapError(f"{name}: a direction must have a finite length above 0")
     return array / length
 
 
 def check_up(up: ArrayLike) -> Float64:
-    """One direction (3,) -> of unit length; see ``check_direction``."""
+    """One direction (3,) -> of unit length."""
     unit = check_direction(up, "up")
     if unit.shape != (3,):
         raise MapError(f"up: expected shape (3,), got {unit.shape}")
@@ -70,11 +65,7 @@ def check_up(up: ArrayLike) -> Float64:
 
 
 def check_box(lower: ArrayLike, upper: ArrayLike, snapshot: MapSnapshot) -> tuple[Float64, Float64]:
-    """Corners (3,) of a box in metres -> units of voxels.
-
-    Raises:
-        MapError: see ``check_points``, or a box without volume.
-    """
+    """Corners (3,) of a box with volume in metres -> units of voxels."""
     low, high = check_point(lower, snapshot, "lower"), check_point(upper, snapshot, "upper")
     if not (low < high).all():
         raise MapError(
@@ -84,14 +75,12 @@ def check_box(lower: ArrayLike, upper: ArrayLike, snapshot: MapSnapshot) -> tupl
     return low, high
 
 
-def check_positive(value: float, name: str) -> float:
-    """A finite number above 0.
-
-    Raises:
-        MapError: it is not.
-    """
+def check_positive(value: float, name: str, most: float = np.inf) -> float:
+    """A finite number above 0, and at most so large."""
     if not (np.isfinite(value) and value > 0):
         raise MapError(f"{name} must be a finite number above 0, got {value}")
+    if value > most:
+        raise MapError(f"{name} must be at most {most:g}, got {value}")
     return float(value)
 
 
@@ -99,15 +88,3 @@ def rows_in_box(snapshot: MapSnapshot, low: Float64, high: Float64) -> NDArray[n
     """Positions in ``packed`` of the blocks with voxels (half a voxel round their centres) in a box of voxel units."""
     first = snapshot.keys.astype(np.float64) * 8
     return np.flatnonzero(((first + 7.5 >= low) & (first - 0.5 <= high)).all(axis=1))
-
-
-def as_numbers(values: ArrayLike, name: str) -> Float64:
-    """Whatever numpy makes an array of.
-
-    Raises:
-        MapError: it makes none, or not of numbers.
-    """
-    try:
-        return np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise MapError(f"{name}: expected numbers, got {values!r}") from error

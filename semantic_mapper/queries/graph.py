@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import cv2
 import numpy as np
 import scipy  # loads `ndimage` when it is first used
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
@@ -106,26 +106,12 @@ class _Plan(NamedTuple):
     ids: Int64
 
 
-class _Level(NamedTuple):
-    """What was found on one floor."""
-
-    floor: Floor
-    rooms: list[Room]
-    doors: list[Door]
-    plan: _Plan
-
-
 class GraphTracker:
     """Finds the graph of one map again and again. Safe to call from several threads.
 
     A room is what an earlier one became where it holds the most of that one's floor, and at least a tenth; of several
     that became one, the oldest id stays. A floor is the earlier one that is within half a metre of its height.
-
-    Args:
-        up: (3,) direction in the world; by default it is found by the floor of the first map that has one, and kept.
-
-    Raises:
-        MapError: ``up`` without a direction.
+    ``up`` (3,), a direction in the world, is by default found by the floor of the first map that has one, and kept.
     """
 
     def __init__(self, up: ArrayLike | None = None) -> None:
@@ -153,11 +139,7 @@ class GraphTracker:
             return self._up
 
     def update(self, snapshot: MapSnapshot, things: Sequence[Instance] | None = None) -> SceneGraph:
-        """The graph of the map as it is now.
-
-        Args:
-            snapshot: The map.
-            things: Of it, found by another; by default this finds them.
+        """The graph of the map as it is now, with ``things`` of it that another has found; by default this finds them.
 
         Raises:
             MapError: lengths of the map are not metres, or which way is up is not known (``up_in``).
@@ -174,27 +156,34 @@ class GraphTracker:
             every = max(1, 2 * int(CELL_M / snapshot.voxel_size_m) - 1)
             xyz, label, level = _surface(snapshot, R_grid_world, every)
             heights = find_floors(xyz[level, 2], snapshot.voxel_size_m**2 * every)
-            floors = list[_Level]()
+            plans, floors = list[_Plan](), list[Floor]()
+            rooms, doors = list[Room](), list[Door]()
             for height, above in zip(heights, [*heights, np.inf][1:], strict=True):
                 within = (xyz[:, 2] >= height + LOW_M[0]) & (xyz[:, 2] < min(above + LOW_M[0], height + HIGH_M))
                 first, seen, wall = _plan(xyz[within], label[within], height, cell_m, snapshot.label_set)
                 found = part_rooms(seen, wall, cell_m)
-                plan, ids = self._identify(found, height, first, [level.plan for level in floors])
-                floors.append(_describe_level(found, plan, ids, _ToWorld(R_grid_world, first, cell_m, height)))
-            plans = self._plans = tuple(level.plan for level in floors)
+                plan, ids = self._identify(found, height, first, plans)
+                plans.append(plan)
+                floors.append(Floor(plan.floor, height, tuple(sorted(ids))))
+                rooms += [_describe(found, number, room, plan, R_grid_world, cell_m) for number, room in enumerate(ids)]
+                for passage in found.passages:
+                    one, other = sorted(ids[number] for number in passage.rooms)
+                    middle = _to_world(np.array(passage.cell[::-1]) + 0.5, plan, R_grid_world, cell_m)
+                    doors.append(Door((one, other), middle, passage.width_m))
+            self._plans = tuple(plans)
         return SceneGraph(
             up,
-            tuple(level.floor for level in floors),
-            tuple(sorted((room for level in floors for room in level.rooms), key=lambda room: room.id)),
-            tuple(sorted((door for level in floors for door in level.doors), key=lambda door: door.rooms)),
+            tuple(floors),
+            tuple(sorted(rooms, key=lambda room: room.id)),
+            tuple(sorted(doors, key=lambda door: door.rooms)),
             things,
             {thing.id: _room_of(thing, snapshot.voxel_size_m, R_grid_world, plans, cell_m) for thing in things},
         )
 
     def _identify(
         self, found: RoomPlan, height: float, first: Int64, taken: Sequence[_Plan]
-    ) -> tuple[_Plan, NDArray[np.int64]]:
-        """The plan with ids that last, and the id (R,) of each of its rooms; ``taken`` are plans of other floors."""
+    ) -> tuple[_Plan, list[int]]:
+        """The plan with ids that last, and the id of each of its rooms; ``taken`` are plans of other floors."""
         used = {plan.floor for plan in taken}
         before = [plan for plan in self._plans if plan.floor not in used and abs(plan.height_m - height) < 0.5]
         last = min(before, key=lambda plan: abs(plan.height_m - height), default=None)
@@ -206,7 +195,7 @@ class GraphTracker:
         self._next_room += len(new)
         floor = self._next_floor if last is None else last.floor
         self._next_floor += last is None
-        return _Plan(floor, height, first, np.append(ids, 0)[found.room]), ids
+        return _Plan(floor, height, first, np.append(ids, 0)[found.room]), ids.tolist()
 
 
 def find_graph(voxel_map: VoxelMap) -> SceneGraph | None:
@@ -220,12 +209,8 @@ def find_graph(voxel_map: VoxelMap) -> SceneGraph | None:
 
 
 def find_floors(height: Float64, area_m2: float) -> list[float]:
-    """Heights of floors, ascending: where level surface is largest, and as far apart as storeys are.
-
-    Args:
-        height: (N,) of the voxels of surface that one could stand on, metres.
-        area_m2: That each of them covers.
-    """
+    """Heights of floors, ascending: where level surface is largest, and as far apart as storeys are; by the heights
+    (N,) in metres of voxels of surface that one could stand on, each of which covers ``area_m2``."""
     if not len(height):
         return []
     layer = np.floor(height / LAYER_M).astype(np.int64)
@@ -288,46 +273,27 @@ def _plan(xyz: Float64, label: UInt8, floor_m: float, cell_m: float, labels: Lab
     return first, seen, find_walls((low >= WALL_LAYERS[0]) | ((high >= WALL_LAYERS[1]) & ~seen), cell_m)
 
 
-class _ToWorld(NamedTuple):
-    """Where a plan lies."""
-
-    R_grid_world: Float64
-    first: Int64
-    cell_m: float
-    height_m: float
-
-    def cells(self, xy: Float64) -> Float64:
-        """World points (..., 3) of (..., 2) column and row, as real numbers, on the floor."""
-        flat = (self.first + xy - 0.5) * self.cell_m
-        return np.concatenate((flat, np.full((*flat.shape[:-1], 1), self.height_m)), axis=-1) @ self.R_grid_world
+def _to_world(xy: Float64, plan: _Plan, R_grid_world: Float64, cell_m: float) -> Float64:
+    """World points (..., 3) of column and row (..., 2) of a plan, as real numbers, on the floor."""
+    flat = (plan.first + xy - 0.5) * cell_m
+    return np.concatenate((flat, np.full((*flat.shape[:-1], 1), plan.height_m)), axis=-1) @ R_grid_world
 
 
-def _describe_level(found: RoomPlan, plan: _Plan, ids: NDArray[np.int64], to_world: _ToWorld) -> _Level:
-    rooms = [_describe(found, number, room_id, plan.floor, to_world) for number, room_id in enumerate(ids.tolist())]
-    doors = list[Door]()
-    for passage in found.passages:
-        a, b = sorted(int(ids[number]) for number in passage.rooms)
-        row, column = passage.cell
-        doors.append(Door((a, b), to_world.cells(np.array((column + 0.5, row + 0.5))), passage.width_m))
-    return _Level(Floor(plan.floor, plan.height_m, tuple(sorted(ids.tolist()))), rooms, doors, plan)
-
-
-def _describe(found: RoomPlan, number: int, room_id: int, floor: int, to_world: _ToWorld) -> Room:
+def _describe(found: RoomPlan, number: int, room_id: int, plan: _Plan, R_grid_world: Float64, cell_m: float) -> Room:
     own = found.room == number
-    row, column = np.unravel_index(int(np.where(own, found.clearance_m, -1).argmax()), own.shape)
+    widest = np.unravel_index(int(np.where(own, found.clearance_m, -1).argmax()), own.shape)
     # Twice the size, so that the outline runs along the outer edges of the cells, and no cell is a line.
     twice = np.repeat(np.repeat(own.astype(np.uint8), 2, axis=0), 2, axis=1)
     contours, _ = cv2.findContours(twice, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     corners = cv2.approxPolyDP(max(contours, key=cv2.contourArea), 2.0, True).reshape(-1, 2).astype(np.float64)
-    x, y = corners.T
-    if (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() < 0:
+    if cv2.contourArea(corners.astype(np.float32), oriented=True) < 0:
         corners = corners[::-1]
-    center = to_world.cells(np.array((float(column), float(row))) + 0.5)
-    outline = to_world.cells(corners / 2 + 0.25)
-    return Room(room_id, floor, float(own.sum()) * to_world.cell_m**2, center, outline)
+    center = _to_world(np.array(widest[::-1]) + 0.5, plan, R_grid_world, cell_m)
+    outline = _to_world(corners / 2 + 0.25, plan, R_grid_world, cell_m)
+    return Room(room_id, plan.floor, float(own.sum()) * cell_m**2, center, outline)
 
 
-def _match(last: _Plan, found: RoomPlan, first: Int64, numbers: NDArray[np.int64]) -> None:
+def _match(last: _Plan, found: RoomPlan, first: Int64, numbers: Int64) -> None:
     """Write the ids (R,) of the earlier rooms that these still are, 0 where one is new."""
     shift = last.first - first  # of the earlier plan's cells in this one
     rows, columns = np.indices(last.ids.shape)
@@ -358,19 +324,13 @@ def _room_of(
     part = plan.ids[low[1] : high[1], low[0] : high[0]]
     if not part.any():
         return None
-    distance, nearest = _nearest(part > 0)
+    distance, at = scipy.ndimage.distance_transform_edt(part == 0, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
     column, row = (cell - low).T
     here = (column >= 0) & (row >= 0) & (column < part.shape[1]) & (row < part.shape[0])
     column, row = column[here], row[here]
     near = distance[row, column] <= reach
-    ids = part.ravel()[nearest[row[near], column[near]]]
+    ids = part[tuple(at[:, row[near], column[near]])]
     return int(np.bincount(ids).argmax()) if len(ids) else None
-
-
-def _nearest(mask: Bool) -> tuple[Float64, Int64]:
-    """Distance (H, W) in cells to the nearest cell of a mask, and the flat index of that cell."""
-    distance, (row, column) = scipy.ndimage.distance_transform_edt(~mask, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
-    return distance, row * mask.shape[1] + column
 
 
 @rendered
@@ -421,11 +381,7 @@ def _draw_floor(axes: Axes, graph: SceneGraph, floor: Floor, R_grid_world: Float
 
 
 class _Names:
-    """Where names stand on the plan of a floor, so that none covers another; sizes are estimates.
-
-    Args:
-        xy: (N, 2) of what the plan shows, metres.
-    """
+    """Where names stand on the plan of a floor, of points (N, 2), so that none covers another; sizes are estimates."""
 
     def __init__(self, xy: Float64) -> None:
         width, height = np.ptp(xy, axis=0)

@@ -104,13 +104,11 @@ class _Whole(NamedTuple):
 class InstanceTracker:
     """Finds the instances of one map again and again. Safe to call from several threads.
 
-    An instance is what an earlier one became where it holds the most of that one's voxels, and at least a tenth. Of
-    several that became one, the oldest id stays; of a split, the part with the most voxels keeps the id. Matching looks
-    at the last update alone: a thing that was not found in it comes back under a new id.
+    An instance is what an instance of the last update became where it holds the most of that one's voxels, and at least
+    a tenth. Of several that became one, the oldest id stays; of a split, the largest part keeps the id.
 
     A thing of which more than half was seen through since it was whole has gone (``gone``); what is left of it gets a
-    new id. One that is only no longer found (its class or the map's poses have changed, or it became part of another)
-    has not gone.
+    new id. One that is only no longer found (its class or the map's poses have changed) has not gone.
 
     Args:
         stuff: Names of classes that are no things; by default ``labels.STUFF_NAMES``.
@@ -163,17 +161,13 @@ class InstanceTracker:
             new = np.flatnonzero(ids == 0)
             ids[new] = self._next_id + np.arange(len(new))
             self._next_id += len(new)
-            parts = np.split(found.order, found.ends[:-1]) if len(ids) else []
-            things = [
-                self._describe(snapshot, int(number), voxels, part) for part, number in zip(parts, ids, strict=True)
-            ]
-            things.sort(key=lambda thing: thing.id)
+            parts = dict(zip(ids.tolist(), np.split(found.order, found.ends[:-1]), strict=False))
+            things = [self._describe(snapshot, number, voxels, part) for number, part in sorted(parts.items())]
             self._last = _Found(voxels, found, ids, sizes)
             self._keep_whole(snapshot, things)
         return tuple(things)
 
     def _describe(self, snapshot: MapSnapshot, number: int, voxels: ThingVoxels, part: Int64) -> Instance:
-        """The thing that some of the voxels, ``part`` (M,), are; ``number`` is its id."""
         row, voxel, labels = voxels.row[part], voxels.voxel[part].astype(np.int64), snapshot.label_set
         slot, class_id = snapshot.slots[row].astype(np.int64), int(voxels.label[part[0]])
         xyz = voxels.point[part] * snapshot.voxel_size_m
@@ -184,7 +178,8 @@ class InstanceTracker:
             float(snapshot.voxels.confidence[slot, voxel].mean(dtype=np.float64) / CONFIDENCE_STEPS),
             xyz.mean(axis=0),
             upright_box(xyz, self._up),
-            unpack_keys(voxels.packed[row]) * 8 + _within(voxels.voxel[part]),
+            unpack_keys(voxels.packed[row]) * 8
+            + np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1).astype(np.int32),
             float(snapshot.measured(slot, voxel).mean()),
         )
 
@@ -200,12 +195,11 @@ class InstanceTracker:
         ends = np.searchsorted(pairs, count * np.arange(len(last.ids) + 1))
         for old in np.argsort(last.ids):  # so that the oldest of several has its component first
             part = slice(ends[old], ends[old + 1])
-            if part.start == part.stop:
-                continue
-            best = int(np.argmax(overlaps[part]))
-            successor = pairs[part][best] % count
-            if overlaps[part][best] >= LEAST_OVERLAP * last.sizes[old] and ids[successor] == 0:
-                ids[successor] = last.ids[old]
+            if part.start < part.stop:
+                best = int(np.argmax(overlaps[part]))
+                successor = pairs[part][best] % count
+                if overlaps[part][best] >= LEAST_OVERLAP * last.sizes[old] and ids[successor] == 0:
+                    ids[successor] = last.ids[old]
 
     def _find_gone(self, snapshot: MapSnapshot, ids: Int64, sizes: Int64) -> None:
         """Note which things have gone, and take the ids of their remains away."""
@@ -216,13 +210,11 @@ class InstanceTracker:
         self._going = {}
         for number, whole in sorted(small.items()):
             left, stamps = _seen_through(snapshot, whole)
-            if not len(stamps):
-                continue
-            if 2 * left >= whole.most_voxels:
+            if len(stamps) and 2 * left >= whole.most_voxels:
                 self._going[number] = whole
-                continue
-            self._gone.append(replace(whole.thing, gone_ns=int(stamps[len(stamps) // 2])))
-            ids[ids == number] = 0
+            elif len(stamps):
+                self._gone.append(replace(whole.thing, gone_ns=int(stamps[len(stamps) // 2])))
+                ids[ids == number] = 0
 
     def _keep_whole(self, snapshot: MapSnapshot, things: Collection[Instance]) -> None:
         """Note the things as they are, save those that are about to go; what else has shrunk is whole again."""
@@ -235,31 +227,21 @@ class InstanceTracker:
             self._whole[thing.id] = self._going.get(thing.id) or _Whole(thing, snapshot.version, most)
 
 
-def _within(voxel: Int32) -> Int32:
-    """Coordinates (N, 3) in their blocks of voxels (N,)."""
-    return np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
-
-
-def _seen_through(snapshot: MapSnapshot, whole: _Whole) -> tuple[int, NDArray[np.int64]]:
-    """How many voxels of a thing have a surface still, and the stamp of each voxel cleared there, ascending.
-
-    None are cleared where these are too few to be what the thing has lost.
-    """
+def _seen_through(snapshot: MapSnapshot, whole: _Whole) -> tuple[int, Int64]:
+    """How many voxels of a thing have a surface still, of whichever class, and the stamp of each voxel cleared there,
+    ascending. None are cleared where these are too few to be what the thing has lost."""
     packed = pack_keys(whole.thing.voxels >> 3)
     rows = snapshot.cleared.between(whole.version, snapshot.version)
     of_thing = np.isin(rows.packed, packed)
     stamps = np.repeat(rows.stamp_ns[of_thing], rows.voxels[of_thing])
-    left = _count_left(snapshot, packed, whole.thing.voxels) if len(stamps) else len(packed)
-    return left, stamps if 2 * len(stamps) >= len(packed) - left else stamps[:0]
-
-
-def _count_left(snapshot: MapSnapshot, packed: NDArray[np.int64], voxels: NDArray[np.int32]) -> int:
-    """How many of the voxels (N, 3), which lie in blocks with keys (N,), have a surface still, of whichever class."""
+    if not len(stamps):
+        return len(packed), stamps
     surface = surface_voxels(snapshot, np.flatnonzero(np.isin(snapshot.packed, packed)))
     blocks, row = np.unique(packed, return_inverse=True)
-    x, y, z = (voxels & 7).T
+    x, y, z = (whole.thing.voxels & 7).T
     there = np.searchsorted(blocks, snapshot.packed[surface.row]) * BLOCK_VOXELS + surface.voxel
-    return int(np.isin(row * BLOCK_VOXELS + (z * 8 + y) * 8 + x, there).sum())
+    left = int(np.isin(row * BLOCK_VOXELS + (z * 8 + y) * 8 + x, there).sum())
+    return left, stamps if 2 * len(stamps) >= len(packed) - left else stamps[:0]
 
 
 class Components(NamedTuple):
@@ -291,24 +273,15 @@ def find_components(voxels: ThingVoxels, min_voxels: int) -> Components:
 def connect_voxels(
     packed: Int64, start: Int64, voxel: Int32, label: UInt8, used: Int64, node: Int32, first: Int64
 ) -> None:
-    """Write the first voxel of each voxel's component (N,): union-find over 26 neighbours.
+    """Write the ``first`` voxel of the component of each of the ``ThingVoxels`` (N,): union-find over 26 neighbours.
 
-    Args:
-        packed, start, voxel, label: Of ``ThingVoxels``.
-        used: (B,) number of each block among the U that have voxels.
-        node: (U, 512) scratch, -1.
-        first: (N,) written.
+    ``used`` (B,) is the number of each block among the U that have voxels, ``node`` (U, 512) scratch, -1.
     """
     ...
 
 
 def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
-    """The box round points that is level and has the least floor area; one of its sides lies on their hull.
-
-    Args:
-        xyz: (N, 3) points, N > 0.
-        up: (3,) unit vector.
-    """
+    """The level box of least floor area round points (N, 3), N > 0; one of its sides lies on their hull."""
     frame = turn_onto(np.array((0.0, 0.0, 1.0)), up)
     middle = xyz.mean(axis=0)
     plan = (xyz - middle) @ frame

@@ -30,17 +30,13 @@ class NearestSurface:
 def nearest(
     snapshot: MapSnapshot, class_name: str, point: ArrayLike, min_confidence: float = 0.0
 ) -> NearestSurface | None:
-    """The surface point of a class that is nearest to a point; ``None`` where the map has no surface of that class.
+    """The surface point of a class that is nearest to a point (3,), world metres; ``None`` where the map has none.
 
-    Args:
-        snapshot: The map.
-        class_name: As in the map's label set.
-        point: (3,) world metres.
-        min_confidence: Places that are less sure of the class do not count; 0..1.
+    Places that are less sure of the class than ``min_confidence``, 0..1, do not count.
 
     Raises:
         LabelError: no such class; lists those there are.
-        MapError: see ``checks.check_points``; or no such confidence.
+        MapError: a bad point or confidence.
     """
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
@@ -110,25 +106,16 @@ class PointAnswers:
 
 
 def at(snapshot: MapSnapshot, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
-    """Class and confidence of the surface at points, and whether these are free, occupied or unknown.
+    """Class and confidence of the surface at points (N, 3), world metres, and whether they are free or occupied.
 
-    The class is that of the surface voxel whose surface point is nearest, where that is at most ``radius_m`` away.
-
-    Args:
-        snapshot: The map.
-        points: (N, 3) world metres.
-        radius_m: How far to look; by default 2.5 voxels, at most 25.
+    The class is that of the surface voxel whose surface point is nearest, where that is at most ``radius_m`` away: by
+    default 2.5 voxels, at most 25.
 
     Raises:
-        MapError: see ``checks.check_points``; or a radius out of range.
+        MapError: bad points, or a radius out of range.
     """
-    p = check_points(points, snapshot)
-    radius = RADIUS_VOXELS
-    if radius_m is not None:
-        radius = check_positive(radius_m, "radius_m") / snapshot.voxel_size_m
-    if radius > MAX_RADIUS_VOXELS:
-        most = MAX_RADIUS_VOXELS * snapshot.voxel_size_m
-        raise MapError(f"at: radius_m must be at most {most:g} in this map, got {radius_m}; `nearest` searches farther")
+    p, most = check_points(points, snapshot), MAX_RADIUS_VOXELS * snapshot.voxel_size_m
+    radius = RADIUS_VOXELS if radius_m is None else check_positive(radius_m, "radius_m", most) / snapshot.voxel_size_m
     slot, voxel, distance = np.empty(len(p), np.int64), np.empty(len(p), np.int64), np.empty(len(p))
     find_nearest_voxels(p, radius, snapshot.index, snapshot.voxels, slot, voxel, distance)
     label, confidence, _ = snapshot.read(slot, voxel)
@@ -146,8 +133,6 @@ def find_nearest_voxels(
     chosen: Int64,
     distances: Float64,
 ) -> None:
-    """Write slot (-1 = none) and voxel (N,) of the surface point nearest to points (N, 3), and its distance (N,).
-
-    All in units of voxels; surface points beyond ``radius`` do not count.
-    """
+    """Write slot (-1 = none) and voxel (N,) of the surface point nearest to points (N, 3) within a radius, and its
+    distance (N,), all in units of voxels."""
     ...

@@ -14,7 +14,7 @@ from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.blocks import BlockIndex
 from semantic_mapper.queries.checks import check_box, check_points
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Float32, Float64, Int64, UInt8
 
 MAX_BOX_VOXELS = 1 << 24  # 134 m^3 at 2 cm; about 0.5 GB while the distances are computed
 
@@ -46,13 +46,8 @@ class DistanceField:
 
 
 def occupancy(snapshot: MapSnapshot, points: ArrayLike) -> UInt8:
-    """``State`` (N,) of the voxels in which points (N, 3), world metres, lie.
-
-    Raises:
-        MapError: see ``checks.check_points``.
-    """
-    p = check_points(points, snapshot)
-    return read_states(p, snapshot)
+    """``State`` (N,) of the voxels in which points (N, 3), world metres, lie; MapError for bad ones."""
+    return read_states(check_points(points, snapshot), snapshot)
 
 
 def distance_field(
@@ -63,12 +58,11 @@ def distance_field(
     Only voxels in the box count as obstacles: give the box a margin of the distance that matters.
 
     Args:
-        snapshot: The map.
         lower, upper: (3,) corners, world metres.
         unknown_is_occupied: Whether what was never seen is an obstacle, too.
 
     Raises:
-        MapError: see ``checks.check_box``; no voxel or more than ``MAX_BOX_VOXELS`` in it.
+        MapError: a bad box, or no voxel or more than ``MAX_BOX_VOXELS`` in it.
     """
     low, high = check_box(lower, upper, snapshot)
     first = np.ceil(low - 1e-6).astype(np.int64)  # 1e-6 voxels: corners that were meant to be voxel centres
@@ -82,35 +76,25 @@ def distance_field(
     state = np.empty(tuple(shape), np.uint8)
     fill_box_states(first, snapshot.index, snapshot.voxels, snapshot.voxels_per_step, state)
     moving = snapshot.moving - first
-    moving = moving[((moving >= 0) & (moving < shape)).all(axis=1)]
-    state[tuple(moving.T)] = State.MOVING
+    state[tuple(moving[((moving >= 0) & (moving < shape)).all(axis=1)].T)] = State.MOVING
     obstacle = (state >= State.OCCUPIED) | ((state == State.UNKNOWN) & unknown_is_occupied)
+    distance = np.full(state.shape, np.inf)
     if obstacle.any():
         distance = scipy.ndimage.distance_transform_edt(~obstacle, sampling=snapshot.voxel_size_m)
-    else:
-        distance = np.full(state.shape, np.inf)
-    origin = first.astype(np.float64) * snapshot.voxel_size_m
-    return DistanceField(origin, snapshot.voxel_size_m, np.asarray(distance, np.float32), state)
+    return DistanceField(first * snapshot.voxel_size_m, snapshot.voxel_size_m, np.asarray(distance, np.float32), state)
 
 
 def read_states(points: Float64, snapshot: MapSnapshot) -> UInt8:
     """``State`` (N,) of the voxels in which points (N, 3), units of voxels, lie."""
     places, states = np.floor(points + 0.5).astype(np.int64), np.empty(len(points), np.uint8)
     read_voxel_states(places, snapshot.index, snapshot.voxels, snapshot.voxels_per_step, states)
-    states[_is_in(places, snapshot.moving)] = State.MOVING
+    if len(snapshot.moving):
+        first, last = snapshot.moving.min(axis=0), snapshot.moving.max(axis=0)
+        near = np.flatnonzero(((places >= first) & (places <= last)).all(axis=1))
+        shape = tuple((last - first + 1).tolist())
+        here, there = (np.ravel_multi_index(tuple((v - first).T), shape) for v in (places[near], snapshot.moving))
+        states[near[np.isin(here, there)]] = State.MOVING
     return states
-
-
-def _is_in(places: Int64, voxels: Int64) -> Bool:
-    """Which of places (N, 3) are among voxels (M, 3)."""
-    found = np.zeros(len(places), np.bool_)
-    if len(voxels):
-        first = voxels.min(axis=0)
-        shape = tuple((voxels.max(axis=0) - first + 1).tolist())
-        near = np.flatnonzero(((places >= first) & (places < first + shape)).all(axis=1))
-        here, there = (np.ravel_multi_index(tuple((v - first).T), shape) for v in (places[near], voxels))
-        found[near] = np.isin(here, there)
-    return found
 
 
 @kernel

@@ -61,14 +61,10 @@ def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
 
 
 def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
-    """Surface points in a box, one a surface voxel, in a fixed order.
-
-    Args:
-        snapshot: The map.
-        lower, upper: (3,) corners, world metres.
+    """Surface points in a box with corners (3,), world metres, one a surface voxel, in a fixed order.
 
     Raises:
-        MapError: see ``checks.check_box``.
+        MapError: a bad box.
     """
     low, high = check_box(lower, upper, snapshot)
     surface = surface_voxels(snapshot, rows_in_box(snapshot, low, high))
@@ -102,38 +98,25 @@ class RayHits:
 
 
 def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
-    """The first surface that each ray meets from its front.
+    """The first surface that each ray meets from its front, at most ``max_m`` away (up to 100).
 
     Args:
-        snapshot: The map.
         origins: (N, 3) or (3,) world metres.
         directions: (N, 3) or (3,), of any length; one origin or direction stands for all.
-        max_m: How far rays go, at most 100.
 
     Raises:
-        MapError: see ``checks``; shapes that do not go together; a range out of bounds.
+        MapError: bad arguments, or shapes that do not go together.
     """
+    check_positive(max_m, "max_m", MAX_RANGE_M)
     origin = check_points(np.atleast_2d(as_numbers(origins, "origins")), snapshot, "origins")
     direction = np.atleast_2d(check_direction(directions, "directions"))
     if len(origin) != len(direction) and 1 not in (len(origin), len(direction)):
         raise MapError(f"cast_rays: {len(origin)} origins and {len(direction)} directions do not go together")
     count = max(len(origin), len(direction)) if len(origin) and len(direction) else 0
-    origin, direction = np.broadcast_to(origin, (count, 3)), np.broadcast_to(direction, (count, 3))
-    if check_positive(max_m, "max_m") > MAX_RANGE_M:
-        raise MapError(f"max_m must be at most {MAX_RANGE_M:g}, got {max_m}")
-    step = np.ascontiguousarray(direction / snapshot.voxel_size_m)
-    distance, slot, voxel = np.empty(count, np.float32), np.empty(count, np.int64), np.empty(count, np.int64)
-    march_rays(
-        np.ascontiguousarray(origin),
-        step,
-        snapshot.voxels_per_step,
-        max_m,
-        snapshot.index,
-        snapshot.voxels,
-        distance,
-        slot,
-        voxel,
-    )
+    start = np.ascontiguousarray(np.broadcast_to(origin, (count, 3)))
+    step = np.ascontiguousarray(np.broadcast_to(direction, (count, 3)) / snapshot.voxel_size_m)
+    found = distance, slot, voxel = np.empty(count, np.float32), np.empty(count, np.int64), np.empty(count, np.int64)
+    march_rays(start, step, snapshot.voxels_per_step, max_m, snapshot.index, snapshot.voxels, *found)
     label, confidence, rgb = snapshot.read(slot, voxel)
     return RayHits(distance, label, confidence, rgb, snapshot.measured(slot, voxel))
 
