@@ -8,9 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.nn import functional
 
 from semantic_mapper.errors import FrameError, LabelError
@@ -43,7 +41,7 @@ SURE = 0.9  # confidence of a pixel that a user would keep
 MAP = "points of the map"  # the method whose figures are those of the fused map
 
 Predictor = Callable[[PosedFrame], Opinion]
-ThingTeller = Callable[[PosedFrame, UInt8], NDArray[np.uint16]]  # ids (H, W) of a frame's things, given its classes
+ThingTeller = Callable[[PosedFrame, UInt8], PanopticImage]  # things of a frame, given its classes (H, W)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +171,7 @@ def evaluate_frames(
                 if voxel_map is not None:
                     surface.add(frame)
                 if panoptic is not None:
-                    found = {name: partial(_panoptic, tell, frame, predicted[name]) for name, tell in things.items()}
+                    found = {name: partial(tell, frame, predicted[name].label) for name, tell in things.items()}
                     panoptic.add(frame, truth, found)
                 labelled = frame.label != stream_labels.ignore_id
                 strange = labelled & (truth == label_set.ignore_id)
@@ -212,10 +210,6 @@ def evaluate_frames(
         for name, figures in panoptic.score_methods().items():
             methods[name] |= figures
     return Evaluation(methods, scored, excluded, refused, pseudo, segments=segments)
-
-
-def _panoptic(tell: ThingTeller, frame: PosedFrame, opinion: Opinion) -> PanopticImage:
-    return PanopticImage(opinion.label, tell(frame, opinion.label))
 
 
 def _of_confidence(scores: ConfidenceScores) -> dict[str, float | None]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import scipy  # loads `spatial` when it is first used
 import torch
 from numpy.typing import ArrayLike, NDArray
 
@@ -40,14 +42,7 @@ MAX_FRAMES = 100  # that are kept; beyond that every second one goes
 class InstanceFolder:
     """Images of object numbers of a log's frames: ``NNNNNN.png`` or ``CAMERA/NNNNNN.png``, uint8 or uint16, 0 = none.
 
-    NNNNNN is the number of the frame in the log, from 0.
-
-    Args:
-        path: Of the folder.
-        log: Whose frames they are of.
-
-    Raises:
-        LabelError: it holds none.
+    NNNNNN is the number of the frame in the log, from 0. LabelError for a folder that holds none.
     """
 
     def __init__(self, path: Path, log: Log) -> None:
@@ -60,11 +55,7 @@ class InstanceFolder:
             )
 
     def read(self, frame: PosedFrame) -> NDArray[np.integer[Any]] | None:
-        """Object numbers (H, W) of a frame; None where there is no image of it.
-
-        Raises:
-            LogError: it is damaged, or of another size.
-        """
+        """Object numbers (H, W) of a frame; None where there is no image of it, LogError for a damaged one."""
         name = f"{self._number[frame.camera_id, frame.stamp_ns]:06d}.png"
         file = next((f for f in (self.path / frame.camera_id / name, self.path / name) if f.exists()), None)
         if file is None:
@@ -76,19 +67,12 @@ class InstanceFolder:
 
 
 class ThingSurface:
-    """The N surface voxels of a map as it is now.
-
-    Args:
-        voxel_map: Whose.
-        up: As of ``InstanceTracker``.
+    """The N surface voxels of a map as it is now; MapError where its lengths are not metres.
 
     Attributes:
         xyz: (N, 3) float64 surface points, world metres.
         number: (N,) which of ``things`` each belongs to; -1 = none.
         things: As queries find them.
-
-    Raises:
-        MapError: lengths of the map are not metres.
     """
 
     def __init__(self, voxel_map: VoxelMap, *, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
@@ -103,37 +87,24 @@ class ThingSurface:
             self.number[np.searchsorted(keys, (block << 9) | (z * 64 + y * 8 + x))] = index
         self.xyz: Float64 = every.point * snapshot.voxel_size_m
         self._reach_m = AT_SURFACE * snapshot.voxel_size_m
-        self._label_set = voxel_map.label_set
-        self._tree: Any = None
 
     def panoptic(self, cast: MapView, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> PanopticImage:
-        """Classes and things that a view of the map shows.
-
-        Args:
-            cast: What ``ray_cast`` returns for the pose and the intrinsics.
-            T_world_camera: (4, 4) float64.
-            intrinsics: Of the view.
-
-        Returns:
-            Class ids (H, W), those of the view but where there is a thing; and numbers of things from 1, 0 = none.
-        """
+        """Classes and things, numbered from 1, that a view of the map shows: what ``ray_cast`` gives for a pose and
+        intrinsics, but where there is a thing."""
         label, instance = cast.label.copy(), np.zeros(cast.label.shape, np.int64)
         hit = cast.depth_m > 0
         if self.things and hit.any():
             at = transform(T_world_camera, unproject(cast.depth_m, intrinsics)[hit])
-            _, near = self._nearest().query(at, distance_upper_bound=self._reach_m)
+            _, near = self._tree.query(at, distance_upper_bound=self._reach_m)
             number = np.append(self.number, -1)[near]
             class_of = np.array([thing.class_id for thing in self.things], np.uint8)
             instance[hit] = number + 1
             label[hit] = np.where(number >= 0, class_of[number], label[hit])
         return PanopticImage(label, instance)
 
-    def _nearest(self) -> Any:
-        if self._tree is None:
-            from scipy.spatial import KDTree
-
-            self._tree = KDTree(self.xyz)
-        return self._tree
+    @cached_property
+    def _tree(self) -> Any:
+        return scipy.spatial.KDTree(self.xyz)
 
 
 class _View(NamedTuple):
@@ -144,12 +115,9 @@ class _View(NamedTuple):
 
 
 class PanopticTruth:
-    """True classes and objects of some frames.
+    """True classes, ids of the map's ``label_set``, and objects of some frames.
 
-    Args:
-        folder: Has the objects.
-        stream_labels: Of the frames. Segments that are found of other classes are as if nothing had been found.
-        label_set: Of the map, and of the true classes that are added.
+    Segments that are found of classes that the frames' ``stream_labels`` lack are as if nothing had been found.
     """
 
     def __init__(self, folder: InstanceFolder, stream_labels: LabelSet, label_set: LabelSet) -> None:
@@ -163,15 +131,9 @@ class PanopticTruth:
         self._seen = 0
 
     def add(self, frame: PosedFrame, truth: UInt8, found: Mapping[str, Callable[[], PanopticImage]] = {}) -> None:
-        """Remember a frame whose objects are known, at reduced size.
+        """Remember a frame whose objects are known, with its truth (H, W), at reduced size.
 
-        Args:
-            frame: Of the log.
-            truth: (H, W) ids of the map.
-            found: By method, what it says of the frame (H, W), ids of the map; called where objects are known.
-
-        Raises:
-            LogError: see ``InstanceFolder.read``.
+        ``found`` gives, by method, what it says of the frame (H, W); called where objects are known.
         """
         instance = self._folder.read(frame) if self._seen % self._stride == 0 else None
         self._seen += 1
@@ -185,11 +147,7 @@ class PanopticTruth:
             self._stride *= 2
 
     def score_methods(self) -> Mapping[str, Mapping[str, Any]]:
-        """The figures of ``PanopticMetrics`` by method of ``add``, of the frames that ``score`` looks at.
-
-        Raises:
-            LabelError: no frame was added.
-        """
+        """The figures of ``PanopticMetrics`` by method of ``add``, of the frames that ``score`` looks at."""
         views = self._known_views()
         counts = {name: PanopticCounts(self._label_set) for name in views[0].found}
         for view in views:
@@ -235,8 +193,8 @@ def _figures(counts: PanopticCounts) -> dict[str, Any]:
     return figures
 
 
-def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> NDArray[np.uint16]:
-    """Ids (H, W) of the boxes of things that a frame sees, where its ``label`` (H, W) has their class."""
+def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> PanopticImage:
+    """The boxes of things, by their ids, that a frame sees where its ``label`` (H, W) has their class."""
     channel = field.label_set.to_channels(label, f"frame seq={frame.seq}").ravel()
     names = field.label_set.names
     boxed = [names.index(b.class_name) for b in field.shape.boxes if b.thing]
@@ -251,4 +209,4 @@ def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> NDArray[np.
             at = {"near_m": near_m, "far_m": field.sampling.far_m, "stamp_ns": frame.stamp_ns}
             rays = pixel_rays(pixels[part], k, pose, **at, prior_depth_m=prior)
             found[part.numpy()] = field.instances(rays, torch.from_numpy(channel[part.numpy()])).numpy()
-    return found.reshape(label.shape)
+    return PanopticImage(label, found.reshape(label.shape))

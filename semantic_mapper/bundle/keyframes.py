@@ -74,12 +74,7 @@ class BundleResult(NamedTuple):
 
 
 class KeyframeMap:
-    """The last keyframes and their points.
-
-    Args:
-        intrinsics: Of the images that corners are followed in.
-        window: Keyframes that a bundle moves; as many before them hold it.
-    """
+    """The last keyframes and their points; a bundle moves ``window`` of them, and as many before these hold it."""
 
     def __init__(self, intrinsics: CameraIntrinsics, window: int) -> None:
         self.intrinsics = intrinsics
@@ -102,11 +97,8 @@ class KeyframeMap:
         return mask, np.array([self.points[i] for i in tracks.ids[mask].tolist()]).reshape(-1, 3)
 
     def locate(self, tracks: Tracks, guess: Float64, least: int) -> tuple[Float64, Int64] | None:
-        """Pose of a frame from the points that it sees.
-
-        Returns:
-            (4, 4) T_world_camera; ids of tracks that do not agree. None where fewer than ``least`` agree.
-        """
+        """T_world_camera (4, 4) of a frame from the points that it sees, and ids of tracks that do not agree with it;
+        None where fewer than ``least`` agree."""
         mask, points = self.known(tracks)
         if mask.sum() < least:
             return None
@@ -136,10 +128,10 @@ class KeyframeMap:
     def flow(self, tracks: Tracks) -> float:
         """Median motion of corners since the last keyframe, as a fraction of the image's width; NaN where few stay."""
         before = self.keyframes[-1].tracks
-        shared = before.ids[np.isin(before.ids, tracks.ids)]
-        if len(shared) < _LEAST_CORNERS:
+        _, now, then = np.intersect1d(tracks.ids, before.ids, assume_unique=True, return_indices=True)
+        if len(now) < _LEAST_CORNERS:
             return np.nan
-        moved = tracks.pixels[tracks.rows(shared)] - before.pixels[before.rows(shared)]
+        moved = tracks.pixels[now] - before.pixels[then]
         return float(np.median(np.linalg.norm(moved, axis=1))) / self.intrinsics.width
 
     def predict(self, tracks: Tracks, T_world_before: Float64, T_world_camera: Float64) -> Float64:
@@ -176,19 +168,10 @@ class KeyframeMap:
         rows, columns, pixels = zip(*sights, strict=True)
         held = np.arange(len(keyframes)) < len(old)
         held[0] |= not any(np.isfinite(k.prior_sigmas[0]) for k in keyframes)  # something must hold the others
-        return BundleProblem(
-            self.intrinsics,
-            np.array([k.T_world_camera for k in keyframes]),
-            held,
-            np.array([k.prior for k in keyframes]),
-            np.array([k.prior_sigmas for k in keyframes]),
-            np.array([self.points[i] for i in ids]),
-            np.array(rows),
-            np.array(columns),
-            np.array(pixels),
-            keyframes,
-            ids,
-        )
+        poses, priors = (np.array([getattr(k, name) for k in keyframes]) for name in ("T_world_camera", "prior"))
+        sigmas, points = np.array([k.prior_sigmas for k in keyframes]), np.array([self.points[i] for i in ids])
+        seen = np.array(rows), np.array(columns), np.array(pixels)
+        return BundleProblem(self.intrinsics, poses, held, priors, sigmas, points, *seen, keyframes, ids)
 
     def apply(self, problem: BundleProblem, found: BundleResult) -> None:
         """Take over what a bundle found. Keyframes added since move with the last one that took part.
@@ -251,9 +234,7 @@ def triangulate(
 def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     """Least squares of all sights and priors (Levenberg-Marquardt, Huber). Deterministic.
 
-    Args:
-        problem: At least one keyframe must be held or have a prior.
-        iterations: At most.
+    At least one keyframe must be held or have a prior.
     """
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     k = problem.intrinsics
@@ -289,11 +270,7 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
 
 
 def minimize(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int) -> gtsam.Values:
-    """Values of the least cost (Levenberg-Marquardt), after at most so many iterations.
-
-    Raises:
-        RuntimeError: by GTSAM, where the factors leave a direction open.
-    """
+    """Values of the least cost (Levenberg-Marquardt); GTSAM raises RuntimeError where a direction is left open."""
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams())
     cost = optimizer.error()
     for _ in range(iterations):  # ``optimize`` would keep Python's other threads waiting until its end

@@ -50,26 +50,18 @@ class RefinedPose:
 
 @dataclass(slots=True, eq=False)
 class _Frame:
-    """A frame whose pose may still change: where it is relative to its keyframe, and what was reported last.
-
-    ``tracks`` are of a frame that no points were known for yet: None of all others.
-    """
+    """A frame whose pose may still change."""
 
     key: tuple[str, int]
     keyframe: Keyframe
     T_keyframe_camera: Float64
-    reported: Float64
-    tracks: Tracks | None
+    reported: Float64  # T_world_camera
+    tracks: Tracks | None  # of a frame that no points were known for yet; None of all others
 
 
 class PoseRefiner:
-    """Refines the poses of one camera's frames, in the order of capture. Deterministic unless ``background``.
-
-    Args:
-        intrinsics: Of all frames.
-        config: How.
-        background: Whether the bundle runs in a thread of its own, so that no frame waits for it; the results arrive
-            with one of the next frames.
+    """Refines the poses of one camera's frames, in the order of capture. Deterministic unless ``background``: then the
+    bundle runs in a thread of its own, no frame waits for it, and results arrive with one of the next frames.
     """
 
     def __init__(self, intrinsics: CameraIntrinsics, config: PoseRefinerConfig, *, background: bool = False) -> None:

@@ -66,12 +66,7 @@ class ScaleEstimator:
 
 
 def floor_height(z: Float64, camera_z: float) -> float | None:
-    """z of the floor: the lowest strong layer of points below the camera; None if no floor is found.
-
-    Args:
-        z: (N,) of points.
-        camera_z: Of the cameras that see them, the median.
-    """
+    """z of the floor: the lowest strong layer of points with z (N,) below the camera; None if no floor is found."""
     below = z[z < camera_z]
     if len(below) < _LEAST_POINTS:
         return None

@@ -56,11 +56,7 @@ def prepare_image(rgb: UInt8, width: int, height: int) -> UInt8:
 
 
 def follow(before: UInt8, after: UInt8, pixels: Float64, guess: Float64) -> tuple[Float64, np.ndarray]:
-    """Where corners (N, 2) of one image are in another, from a guess (N, 2).
-
-    Returns:
-        (N, 2) pixels; (N,) bool, whether the corner was found, and found back from there.
-    """
+    """Where corners (N, 2) of one image are in another, from a guess (N, 2); whether they were found there and back."""
     if not len(pixels):
         return np.zeros((0, 2)), np.zeros(0, bool)
     start, found = pixels.astype(np.float32)[:, None], guess.astype(np.float32)[:, None].copy()
@@ -75,11 +71,7 @@ def follow(before: UInt8, after: UInt8, pixels: Float64, guess: Float64) -> tupl
 
 
 class Tracker:
-    """Follows up to ``count`` corners through a stream of images of one size.
-
-    Args:
-        count: Corners an image.
-    """
+    """Follows up to ``count`` corners through a stream of images of one size."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -89,12 +81,7 @@ class Tracker:
         self.tracks = NO_TRACKS
 
     def advance(self, image: UInt8, guess: Float64 | None = None) -> Tracks:
-        """Follow the corners into the next image.
-
-        Args:
-            image: The next one.
-            guess: (N, 2) where the ``tracks`` of the image before are expected; None = where they were.
-        """
+        """Follow the corners into the next image; ``guess`` (N, 2): where they are expected, None = where they were."""
         if self._last is not None and len(self.tracks.ids):
             guess = self.tracks.pixels if guess is None else guess
             pixels, good = follow(self._last, image, self.tracks.pixels, guess)

@@ -55,14 +55,10 @@ def estimate_depth(
     hint: DepthEstimate | None = None,
     neighbours: Sequence[PreparedView] = (),
 ) -> DepthEstimate:
-    """Depth and spread (h, w) of ``reference``, by plane sweep and semi-global matching.
+    """Depth and spread (h, w) of ``reference``, by plane sweep and semi-global matching with at least one source.
 
-    What is not sure is filled from what is, along the surfaces that the image shows.
-
-    Args:
-        sources: Views with some way between, at least one; see ``choose_sources``.
-        hint: Depth of the reference as a map has it, at the reference's size. Breaks ties of the pictures.
-        neighbours: Views whose ``estimate`` is compared: agreement makes a depth surer and more exact.
+    What is not sure is filled from what is, along the surfaces that the image shows. The hint, depth as a map has it at
+    the reference's size, breaks ties. Agreement with the ``estimate`` of neighbours makes a depth surer and more exact.
     """
     inverse_depth = inverse_depths(config.planes, config.near_m, config.far_m)
     swept = sweep_and_match(reference, sources, inverse_depth, hint)
@@ -70,7 +66,7 @@ def estimate_depth(
     depth = (1 / (first + swept.plane * step)).astype(np.float32)
     agreement = find_agreement(reference, depth, neighbours)
     plane = ((1 / agreement.mean_m - first) / step).astype(np.float32)
-    matched = spread_of_match(swept, agreement)
+    matched = _spread(match_terms(swept, agreement), MATCHED)
     surface = np.clip(smooth_planes(plane, matched, reference.rgb), 0, config.planes - 1)
     depth = (1 / (first + surface * step)).astype(np.float32)
     sigma = _spread(surface_terms(plane, surface, matched, agreement, depth), SMOOTHED)
@@ -92,10 +88,7 @@ def smooth_planes(plane: Float32, sigma: Float32, rgb: UInt8) -> Float32:
     """A membrane (h, w) through what matching is sure of, in planes of the sweep, that tears at edges of the image.
 
     A membrane of inverse depth is plane where the surface is: plain walls take the plane of what surrounds them.
-
-    Args:
-        plane: (h, w) best plane; sigma: (h, w) its spread, in planes.
-        rgb: (h, w, 3) uint8.
+    ``sigma`` (h, w) is the spread of ``plane``, in planes.
     """
     right, below = np.zeros_like(plane), np.zeros_like(plane)
     right[:, :-1], below[:-1] = _ties(rgb[:, 1:], rgb[:, :-1]), _ties(rgb[1:], rgb[:-1])
@@ -113,13 +106,8 @@ def _ties(one: UInt8, other: UInt8) -> Float32:
     return (TIE * np.maximum(np.exp(-step / COLOUR_SCALE), LEAST_TIE)).astype(np.float32)
 
 
-def spread_of_match(swept: SweepResult, agreement: Agreement) -> Float32:
-    """Spread (h, w) in planes of what was matched."""
-    return _spread(match_terms(swept, agreement), MATCHED)
-
-
 def match_terms(swept: SweepResult, agreement: Agreement) -> Float32:
-    """Terms (h, w, 6) that the logarithm of ``spread_of_match`` is a sum of."""
+    """Terms (h, w, 6) that the logarithm of the spread of what was matched is a sum of."""
     agree, visible = agreement.agree.astype(np.float32), agreement.visible.astype(np.float32)
     return _stack(
         np.ones_like(agree),
@@ -136,7 +124,7 @@ def surface_terms(plane: Float32, smooth: Float32, sigma: Float32, agreement: Ag
 
     Args:
         plane, smooth: (h, w) planes as matched, and of the surface that was laid through them.
-        sigma: (h, w) of ``spread_of_match``.
+        sigma: (h, w) of what was matched.
         depth_m: (h, w) of the surface.
     """
     around = cv2.blur(1 / sigma**2, (AROUND, AROUND)) ** -0.5
@@ -171,16 +159,7 @@ def count_agreement(
     mean: Float32,
     tolerance: float,
 ) -> None:
-    """Count neighbours whose depth agrees.
-
-    Args:
-        count: h, rows.
-        depth: (h, w) float32, 0 = none.
-        neighbour_depth: (n, H, W) float32, 0 = none; neighbour_size: (n, 2) int64 height and width.
-        rotation, translation: (n, 3, 3), (n, 3) of `relative_projections`.
-        agree, visible, mean: (h, w), written; see `Agreement`.
-        tolerance: Fraction of the depth.
-    """
+    """Write ``agree``, ``visible`` and ``mean`` (h, w) of `Agreement` with depths of neighbours (n, H, W)."""
     ...
 
 
@@ -188,12 +167,9 @@ def count_agreement(
 def relax_membrane(
     data: Float32, weight: Float32, right: Float32, below: Float32, out: Float32, iterations: int, relaxation: float
 ) -> None:
-    """Minimise sum weight (out - data)^2 + sum tie (difference of neighbours)^2.
+    """Minimise sum weight (out - data)^2 + sum tie (difference of neighbours)^2 by red-black over-relaxation.
 
-    Args:
-        data, weight: (h, w) float32.
-        right, below: (h, w) ties to the pixel to the right, and below; those of the last column and row are not used.
-        out: (h, w) first guess, then the solution.
-        iterations: Of red-black over-relaxation by ``relaxation``.
+    ``right`` and ``below`` (h, w) are ties to the pixel to the right, and below; those of the last column and row are
+    not used. ``out`` (h, w) is the first guess, then the solution.
     """
     ...

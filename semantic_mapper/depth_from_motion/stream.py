@@ -65,21 +65,22 @@ class DepthFromMotion:
         """Take a frame; returns the frames that are ready, oldest first, so that none is lost or overtaken.
 
         Each has ``depth_m`` and ``depth_sigma_m`` of its full size, all 0 where the camera has not moved enough. A
-        frame with depth from a sensor passes through unchanged.
-
-        Args:
-            hint: Gives the depth of a frame as a map has it, at the size of the intrinsics that it is called with;
-                called when the frame's depth is computed.
+        frame with depth from a sensor passes through unchanged. ``hint`` gives the depth of a frame as a map has it,
+        at the size of the intrinsics that it is called with; called when the frame's depth is computed.
         """
-        if frame.depth_m is not None:
-            self._waiting.append(_Waiting(frame, None, None))
-            return self._ready()
-        view = prepare_view(frame, self._config.width)
+        view = None if frame.depth_m is not None else prepare_view(frame, self._config.width)
         for other in self._waiting:
-            other.later += other.frame.camera_id == frame.camera_id
+            other.later += view is not None and other.frame.camera_id == frame.camera_id
         self._waiting.append(_Waiting(frame, view, hint))
-        self._remember(frame.camera_id, view)
-        return self._ready()
+        if view is not None:
+            self._remember(frame.camera_id, view)
+        delay, ready = self._config.delay_frames, list[PosedFrame]()
+        while self._waiting:
+            first = self._waiting[0]
+            if first.view is not None and first.later < delay and len(self._waiting) <= WAIT_FACTOR * delay:
+                break
+            ready.append(self._complete(self._waiting.popleft()))
+        return ready
 
     def correct_poses(self, poses: Mapping[tuple[str, int], Float64]) -> None:
         """Move earlier frames, by camera and stamp, to better poses T_world_camera (4, 4); unknown ones are left out.
@@ -100,44 +101,23 @@ class DepthFromMotion:
         self._waiting.clear()
         return done
 
-    def _ready(self) -> list[PosedFrame]:
-        done: list[PosedFrame] = []
-        delay = self._config.delay_frames
-        while self._waiting:
-            first = self._waiting[0]
-            if first.view is not None and first.later < delay and len(self._waiting) <= WAIT_FACTOR * delay:
-                break
-            done.append(self._complete(self._waiting.popleft()))
-        return done
-
     def _complete(self, waiting: _Waiting) -> PosedFrame:
         frame, view = waiting.frame, waiting.view
         if view is None:
             return frame
         frame = replace(frame, T_world_camera=view.T_world_camera)
         hint = waiting.hint(frame, view.intrinsics) if waiting.hint is not None else None
-        estimate = self._estimate(frame.camera_id, view, hint)
-        if estimate is None:
+        camera = self._cameras.get(frame.camera_id, _CameraViews())
+        others = [v for v in camera.views if v is not view]
+        sources = choose_sources(view, others, None if hint is None else hint.depth_m, camera.usual_m)
+        if not sources:  # the camera has not moved enough
             nothing = np.zeros(frame.rgb.shape[:2], np.float32)
             return replace(frame, depth_m=nothing, depth_sigma_m=nothing.copy())
+        estimate = estimate_depth(view, sources, self._config, hint, _nearest_estimates(view, others))
+        camera.usual_m = float(np.median(estimate.depth_m))
+        camera.views[:] = [replace(view, estimate=estimate) if other is view else other for other in camera.views]
         full = enlarge_estimate(estimate, view.rgb, frame.rgb)
         return replace(frame, depth_m=full.depth_m, depth_sigma_m=full.sigma_m)
-
-    def _estimate(self, camera_id: str, view: PreparedView, hint: DepthEstimate | None) -> DepthEstimate | None:
-        """None where the camera has not moved enough."""
-        camera = self._cameras.get(camera_id, _CameraViews())
-        others = [v for v in camera.views if v is not view]
-        known = hint.depth_m if hint is not None else None
-        sources = choose_sources(view, others, known, camera.usual_m)
-        if not sources:
-            return None
-        neighbours = _nearest_estimates(view, others)
-        estimate = estimate_depth(view, sources, self._config, hint, neighbours)
-        camera.usual_m = float(np.median(estimate.depth_m))
-        for k, other in enumerate(camera.views):
-            if other is view:
-                camera.views[k] = replace(view, estimate=estimate)
-        return estimate
 
     def _remember(self, camera_id: str, view: PreparedView) -> None:
         camera = self._cameras.setdefault(camera_id, _CameraViews())
@@ -175,14 +155,12 @@ def choose_sources(
 ) -> list[PreparedView]:
     """Candidates to match with, at most one for each baseline; none where the camera only turned or stood still.
 
-    Args:
-        candidates: Other frames of the same camera.
-        depth_m: (h, w) what is known of the reference's depth, 0 = none.
-        usual_m: Depth where nothing is known.
+    Candidates are other frames of the same camera; ``depth_m`` (h, w) is what is known of the reference's depth, 0 =
+    none, and ``usual_m`` the depth where nothing is known.
     """
-    points = _grid_points(reference, depth_m, usual_m)
     if not candidates:
         return []
+    points = _grid_points(reference, depth_m, usual_m)
     relations = [_relation(reference, candidate, points) for candidate in candidates]
     baseline, overlap, side = (np.array(part) for part in zip(*relations, strict=True))
     usable = (baseline >= LEAST_BASELINE) & (baseline <= MOST_BASELINE) & (overlap >= LEAST_OVERLAP)

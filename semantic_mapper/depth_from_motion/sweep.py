@@ -50,9 +50,8 @@ def sweep_and_match(
 ) -> SweepResult:
     """Find the plane of each pixel of ``reference`` by its ``sources`` (at least one).
 
-    Args:
-        inverse_depth: (D,) of ``inverse_depths``; D a multiple of 16, at most 256.
-        hint: At the reference's size; holds where nothing contradicts it.
+    D of ``inverse_depth`` (D,) is a multiple of 16, at most 256. The hint, at the reference's size, holds where nothing
+    contradicts it.
     """
     height, width = reference.gray.shape
     volume = (height, width, len(inverse_depth))
@@ -73,12 +72,8 @@ def sweep_and_match(
 def relative_projections(
     reference: PreparedView, targets: Sequence[tuple[CameraIntrinsics, Float64]]
 ) -> tuple[Float32, Float32]:
-    """How the reference's pixels fall into other views, given as intrinsics and pose.
-
-    Returns:
-        (n, 3, 3) and (n, 3) float32, so that ``rotation @ (x, y, 1) + translation / z`` is the other's pixel,
-        homogeneous, of a point at depth z.
-    """
+    """How the reference's pixels fall into other views, given as intrinsics and pose: (n, 3, 3) and (n, 3) float32, so
+    that ``rotation @ (x, y, 1) + translation / z`` is the other's homogeneous pixel of a point at depth z."""
     inverse = np.linalg.inv(camera_matrix(reference.intrinsics))
     rotation, translation = np.empty((len(targets), 3, 3), np.float32), np.empty((len(targets), 3), np.float32)
     for n, (intrinsics, T_world_camera) in enumerate(targets):
@@ -129,15 +124,9 @@ def sweep_planes(
 ) -> None:
     """Cost of each plane of each pixel: of its two best sources, twice that of a single one, plus what the hint costs.
 
-    Args:
-        count: h, rows.
-        census: (2h, 2w) of the reference, of which every second pixel is used.
-        source_census: (n, H, W) int32; source_size: (n, 2) int64 height and width.
-        rotation, translation: (n, 3, 3), (n, 3) of `relative_projections`, to pixels of the census images; truncated.
-        inverse_depth: (D,).
-        hint, hint_rate: (h, w) plane, < 0 = none, and 1 / planes by which it may be off.
-        cost, seen: (h, w, D) and (h, w) uint8, written.
-        unseen, hint_cost: Cost where no source sees a plane, and of a plane far from the hint.
+    Writes ``cost`` (h, w, D) and ``seen`` (h, w). Of ``census`` (2h, 2w) of the reference every second pixel is used;
+    ``source_census`` are (n, H, W), projections lead to their pixels and are truncated; ``hint`` and ``hint_rate``
+    (h, w) are a plane, < 0 = none, and 1 / planes by which it may be off.
     """
     ...
 
@@ -146,27 +135,15 @@ def sweep_planes(
 def sum_paths(
     count: int, cost: UInt8, gray: UInt8, large_step: Int16, path_sum: UInt16, buffer: UInt8, small_step: int
 ) -> None:
-    """Semi-global matching along 8 paths.
+    """Semi-global matching along 8 paths, in 3 groups: to the sides, down, up; writes ``path_sum`` (3, h, w, D).
 
-    Args:
-        count: 3 groups of paths: to the sides, down, up.
-        cost: (h, w, D) uint8.
-        gray: (h, w) uint8.
-        large_step: (256,) int16 P2 by difference of gray; small_step: P1.
-        path_sum: (3, h, w, D) uint16, written.
-        buffer: (3, bytes) uint8, for the states of the paths.
+    ``large_step`` (256,) is P2 by difference of gray, ``small_step`` P1, ``buffer`` (3, bytes) for states of the paths.
     """
     ...
 
 
 @parallel_kernel()
 def pick_planes(count: int, path_sum: UInt16, cost: UInt8, plane: Float32, confidence: Float32, match: Float32) -> None:
-    """Lowest plane of each pixel with a parabola through its neighbours.
-
-    Args:
-        count: h, rows.
-        path_sum: (3, h, w, D) uint16, of which the first becomes the sum of all three.
-        cost: (h, w, D) uint8.
-        plane, confidence, match: (h, w) float32, written; see `SweepResult`.
-    """
+    """Lowest plane of each pixel with a parabola through its neighbours: writes ``plane``, ``confidence`` and ``match``
+    of `SweepResult`; the first of ``path_sum`` (3, h, w, D) becomes the sum of all three."""
     ...

@@ -79,10 +79,6 @@ def enlarge_estimate(estimate: DepthEstimate, coarse_rgb: UInt8, rgb: UInt8) -> 
 
     Within a surface inverse depth is interpolated, which keeps planes plane. Where the coarse pixels round a pixel
     belong to several surfaces, it takes the one that looks most like it.
-
-    Args:
-        estimate: Of the size of ``coarse_rgb``.
-        coarse_rgb: (h, w, 3) uint8; rgb: (H, W, 3) uint8.
     """
     full = DepthEstimate(np.zeros(rgb.shape[:2], np.float32), np.zeros(rgb.shape[:2], np.float32))
     depth_m, sigma_m = np.ascontiguousarray(estimate.depth_m), np.ascontiguousarray(estimate.sigma_m)
@@ -93,13 +89,7 @@ def enlarge_estimate(estimate: DepthEstimate, coarse_rgb: UInt8, rgb: UInt8) -> 
 
 @parallel_kernel()
 def compare_with_middle(count: int, padded: UInt8, census: Int32, spacing: int) -> None:
-    """The transform of `census_transform`.
-
-    Args:
-        count: H, rows.
-        padded: (H + 4 * spacing, W + 4 * spacing) image with a margin of 2 * spacing on each side.
-        census: (H, W) int32, written.
-    """
+    """`census_transform` of an image that has a margin of 2 * spacing on each side; writes ``census`` (H, W)."""
     ...
 
 
@@ -115,12 +105,8 @@ def enlarge_depth(
     same: float,
     colour_rate: float,
 ) -> None:
-    """The upsampling of `enlarge_estimate`, row by row of ``rgb``.
+    """The upsampling of `enlarge_estimate`: writes ``out_depth`` and ``out_sigma`` (H, W), zeros before.
 
-    Args:
-        count: H, rows.
-        out_depth, out_sigma: (H, W) float32 zeros, written.
-        same: Fraction of the depth by which pixels of one surface differ at most.
-        colour_rate: A coarse pixel counts by exp(-rate * squared distance of the colours).
+    A coarse pixel counts by exp(-colour_rate * squared distance of the colours).
     """
     ...

@@ -13,6 +13,7 @@ One implementation for everything the project reports. Rules, the same everywher
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,6 +38,9 @@ class SegmentationMetrics:
     pixels: int = 0  # how many pixels were counted
 
 
+_FIGURES = ("miou", "total_accuracy", "average_accuracy", "coverage")
+
+
 class ConfusionMatrix:
     """Counts of (true class, predicted class) pixels of a label set; adds up over images, frames and processes.
 
@@ -50,12 +54,9 @@ class ConfusionMatrix:
         self.counts: NDArray[np.int64] = np.zeros((len(label_set), len(label_set) + 1), np.int64)
 
     def update(self, truth: UInt8, predicted: UInt8, where: str = "label image") -> None:
-        """Count one image, map or batch.
+        """Count one image, map or batch of uint8 class ids (...) of the label set; ``where`` names it in errors.
 
-        Args:
-            truth: (...) uint8 class ids of the label set; the ignore id is not counted.
-            predicted: (...) uint8 class ids, the same shape; the ignore id means "unknown" and counts as wrong.
-            where: Names the image in errors.
+        Where the truth has the ignore id nothing is counted; predicted, that means "unknown" and counts as wrong.
 
         Raises:
             ShapeError: the shapes differ.
@@ -83,35 +84,22 @@ class ConfusionMatrix:
         total.counts = self.counts + other.counts
         return total
 
-    def iou(self) -> Float64:
-        """(L,) intersection over union; NaN for a class that does not occur in the truth."""
-        hits, occurring = self._hits(), self.counts.sum(axis=1)
-        union = occurring + self.counts[:, :-1].sum(axis=0) - hits
-        return np.divide(hits, union, out=np.full(len(hits), np.nan), where=occurring > 0)
-
-    def class_accuracy(self) -> Float64:
-        """(L,) fraction of each class's pixels that is right; NaN for a class that does not occur in the truth."""
-        hits, occurring = self._hits(), self.counts.sum(axis=1)
-        return np.divide(hits, occurring, out=np.full(len(hits), np.nan), where=occurring > 0)
-
     def metrics(self) -> SegmentationMetrics:
         """All figures; ``None`` where nothing was counted."""
         pixels = int(self.counts.sum())
         if pixels == 0:
             return SegmentationMetrics(None, None, None, None)
-        iou = self.iou()
-        named = zip(self.label_set.names, iou, strict=True)
+        hits, occurring, union = class_sums(self.counts)
+        true = np.flatnonzero(occurring)
+        iou = hits[true] / union[true]
         return SegmentationMetrics(
-            miou=float(np.nanmean(iou)),
-            total_accuracy=float(self._hits().sum() / pixels),
-            average_accuracy=float(np.nanmean(self.class_accuracy())),
+            miou=float(iou.mean()),
+            total_accuracy=float(hits.sum() / pixels),
+            average_accuracy=float((hits[true] / occurring[true]).mean()),
             coverage=1.0 - float(self.counts[:, -1].sum() / pixels),
-            per_class={name: float(value) for name, value in named if np.isfinite(value)},
+            per_class={self.label_set.names[k]: float(value) for k, value in zip(true, iou, strict=True)},
             pixels=pixels,
         )
-
-    def _hits(self) -> Float64:
-        return np.diagonal(self.counts).astype(np.float64)
 
 
 def confusion_of(truth: UInt8, predicted: UInt8, label_set: LabelSet, where: str = "label image") -> ConfusionMatrix:
@@ -125,28 +113,24 @@ class ImageMeans:
     """Means over images of each image's own figures; of a class, over the images that show it."""
 
     def __init__(self) -> None:
-        self._sums = np.zeros(4)  # of the figures of an image
-        self._class_sums: dict[str, float] = {}
-        self._class_images: dict[str, int] = {}
+        self._sums: Counter[str] = Counter()
+        self._class_sums: Counter[str] = Counter()
+        self._class_images: Counter[str] = Counter()
         self._images = self._pixels = 0
 
     def add(self, image: ConfusionMatrix) -> None:
         """Count one more image."""
         m = image.metrics()
-        if not m.pixels:
-            return
-        self._images += 1
-        self._pixels += m.pixels
-        self._sums += np.array([m.miou, m.total_accuracy, m.average_accuracy, m.coverage], np.float64)
-        for name, value in m.per_class.items():
-            self._class_sums[name] = self._class_sums.get(name, 0.0) + value
-            self._class_images[name] = self._class_images.get(name, 0) + 1
+        if m.pixels:
+            self._images += 1
+            self._pixels += m.pixels
+            self._sums.update({name: getattr(m, name) for name in _FIGURES})
+            self._class_sums.update(m.per_class)
+            self._class_images.update(m.per_class.keys())
 
     def metrics(self) -> SegmentationMetrics:
         """Of the images so far."""
-        if not self._images:
-            return SegmentationMetrics(None, None, None, None)
-        means = (float(value) / self._images for value in self._sums)
+        means = [float(self._sums[name]) / self._images if self._images else None for name in _FIGURES]
         per_class = {name: value / self._class_images[name] for name, value in self._class_sums.items()}
         return SegmentationMetrics(*means, per_class=per_class, pixels=self._pixels)
 
@@ -163,13 +147,9 @@ class ConfidenceScores:
         self._sum, self._right = np.zeros(size), np.zeros(size)
 
     def update(self, confidence: Float32, correct: NDArray[np.bool_], strange: NDArray[np.bool_]) -> None:
-        """Add an image.
+        """Add confidences (...) in [0, 1] of the predicted class, of pixels that have a truth, and whether it is right.
 
-        Args:
-            confidence: (...) in [0, 1], of the predicted class, of pixels that have a truth.
-            correct: (...) bool.
-            strange: (...) bool, where the truth is a class that cannot be predicted: these count for ``open_set_auroc``
-                alone.
+        ``strange`` pixels, whose truth is a class that cannot be predicted, count for ``open_set_auroc`` alone.
         """
         p = np.clip(confidence.astype(np.float64).ravel(), 0, 1)
         size = len(self._count)
@@ -207,10 +187,7 @@ class ConfidenceScores:
 def calibration_error(count: NDArray[np.int64], confidence_sum: Float64, right: Float64) -> float | None:
     """Expected calibration error: mean over the samples of |accuracy - confidence| of their bin; None without samples.
 
-    Args:
-        count: (B,) samples of each bin of confidence.
-        confidence_sum: (B,) sum of their confidences.
-        right: (B,) how many of them are right.
+    Of bins (B,) of confidence: how many samples, the sum of their confidences, and how many are right.
     """
     total = int(count.sum())
     return float(np.abs(right - confidence_sum).sum() / total) if total else None
@@ -265,16 +242,12 @@ class Segments:
             return
         first = 0 if last is None else last.first + last.frames
         self._segments.append(Segment(first, 1, ConfusionMatrix(self.label_set) + image))
-        if len(self._segments) > MAX_SEGMENTS:
-            self._join_neighbours()
-
-    def _join_neighbours(self) -> None:
-        """Half as many stretches, each twice as long; the last one stays short where it has no neighbour."""
-        self._frames_each *= 2
-        for one, other in zip(self._segments[::2], self._segments[1::2], strict=False):
-            one.frames += other.frames
-            one.confusion += other.confusion
-        self._segments = self._segments[::2]
+        if len(self._segments) > MAX_SEGMENTS:  # half as many, each twice as long; the last one may stay short
+            self._frames_each *= 2
+            for one, other in zip(self._segments[::2], self._segments[1::2], strict=False):
+                one.frames += other.frames
+                one.confusion += other.confusion
+            self._segments = self._segments[::2]
 
     def all(self) -> list[Segment]:
         """All stretches so far, in order."""

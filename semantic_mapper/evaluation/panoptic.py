@@ -26,7 +26,6 @@ from semantic_mapper.types import Float64, UInt8
 SMALL = 100 / (1408 * 376)  # of an image, as the evaluation of KITTI-360 has it: 100 of its pixels, 6 of 352x94
 MATCH_IOU = 0.5
 MOSTLY_VOID = 0.5  # of a found segment: more, and it counts as nothing
-_SUMS = ("iou", "right", "wrong", "missed", "stuff_iou")
 
 
 class PanopticImage(NamedTuple):
@@ -65,21 +64,16 @@ class PanopticMetrics:
 
 
 class PanopticCounts:
-    """Sums by class; they add up over images, scenes and processes.
+    """Sums by class of a label set, of which ``stuff`` names those that are no things; they add up over images.
 
-    Args:
-        label_set: Whose classes are counted.
-        stuff: Names of the classes that are no things.
-
-    Attributes:
-        sums: (5, L) float64: IoU of the right segments; how many are right, wrong, and missed; and the IoU of all true
-            segments of stuff with what was found there.
+    ``sums`` (5, L): IoU of the right segments; how many are right, wrong, and missed; and the IoU of all true segments
+    of stuff with what was found there.
     """
 
     def __init__(self, label_set: LabelSet, stuff: Collection[str] = STUFF_NAMES) -> None:
         self.label_set = label_set
         self.stuff = frozenset(stuff)
-        self.sums: Float64 = np.zeros((len(_SUMS), len(label_set)))
+        self.sums: Float64 = np.zeros((5, len(label_set)))
         self._thing = np.array([name not in self.stuff for name in label_set.names])
 
     def update(self, truth: PanopticImage, found: PanopticImage, where: str = "image") -> None:
@@ -89,10 +83,9 @@ class PanopticCounts:
             ShapeError: the four images differ in shape.
             LabelError: an id that is not in the label set.
         """
-        shapes = {name: np.shape(a) for name, a in zip("truth found".split(), (truth.label, found.label), strict=True)}
-        shapes |= {"its objects": np.shape(truth.instance), "objects found": np.shape(found.instance)}
-        if len(set(shapes.values())) > 1:
-            raise ShapeError(f"{where}: shapes differ: {', '.join(f'{n} {s}' for n, s in shapes.items())}; resize them")
+        shapes = [np.shape(image) for image in (*truth, *found)]
+        if len(set(shapes)) > 1:
+            raise ShapeError(f"{where}: truth, its objects, found and its objects have shapes {shapes}; resize them")
         least = SMALL * truth.label.size
         true, true_of, true_class = self._segments(truth, least, f"{where}: truth")
         seen, seen_of, seen_class = self._segments(found, least, f"{where}: prediction")
@@ -118,10 +111,7 @@ class PanopticCounts:
 
     def __add__(self, other: PanopticCounts) -> PanopticCounts:
         if (other.label_set.names, other.stuff) != (self.label_set.names, self.stuff):
-            raise ShapeError(
-                f"panoptic counts of different classes ('{self.label_set.name}' and '{other.label_set.name}') cannot "
-                "be added"
-            )
+            raise ShapeError(f"panoptic counts of '{self.label_set.name}' and '{other.label_set.name}' cannot be added")
         total = PanopticCounts(self.label_set, self.stuff)
         total.sums = self.sums + other.sums
         return total

@@ -60,28 +60,15 @@ def align_similar(a: Float64, b: Float64) -> tuple[Float64, float]:
 
 
 def absolute_trajectory_error(estimated: Float64, truth: Float64) -> TrajectoryError:
-    """Distances between positions after the estimated path has been aligned to the true one, without scale.
-
-    Args:
-        estimated, truth: (N, 4, 4) T_world_camera of the same moments; their world frames may differ.
-
-    Raises:
-        ShapeError: paths of different lengths, or fewer than 3 poses.
-    """
+    """Distances between positions of T_world_camera (N, 4, 4) of the same moments, after the estimated path has been
+    aligned to the true one, without scale; ShapeError for paths of different lengths, or fewer than 3 poses."""
     aligned = align_rigid(estimated[:, :3, 3], truth[:, :3, 3]) @ estimated
     return _error(np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1), np.zeros(len(truth)))
 
 
 def relative_pose_error(estimated: Float64, truth: Float64, gap: int = 1) -> TrajectoryError:
-    """How much the motion over ``gap`` poses differs from the true one; independent of their world frames.
-
-    Args:
-        estimated, truth: (N, 4, 4) T_world_camera of the same moments, N > gap >= 1.
-        gap: 1 = from each pose to the next.
-
-    Raises:
-        ShapeError: paths of different lengths, or shorter than ``gap``.
-    """
+    """How much the motion over ``gap`` poses T_world_camera (N, 4, 4) of the same moments differs from the true one;
+    ShapeError for paths of different lengths, or shorter than ``gap``."""
     sizes = expect_shape(estimated, "N 4 4", "estimated path")
     if expect_shape(truth, "N 4 4", "true path") != sizes or not 1 <= gap < sizes["N"]:
         raise ShapeError(f"relative_pose_error: need two paths of one length above gap {gap}, got {sizes['N']} poses")

@@ -23,10 +23,7 @@ def camera_up(T_world_camera: Float64) -> Float64:
     """First guess of up (3,) in the world from the poses (N, 4, 4) of a camera that is held without much roll.
 
     The x axes of such a camera lie level, so up is what is square to them; where it never turned enough for that to
-    be clear, the mean of its image-up directions.
-
-    Raises:
-        ShapeError: not (N, 4, 4), or no pose.
+    be clear, the mean of its image-up directions. ShapeError without a pose.
     """
     if T_world_camera.ndim != 3 or T_world_camera.shape[1:] != (4, 4) or not len(T_world_camera):
         raise ShapeError(f"T_world_camera: expected shape (N, 4, 4) with N > 0, got {T_world_camera.shape}")
@@ -42,15 +39,12 @@ def upright_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float
     """Rotation ``R_upright_world`` after which z is up and most walls run along x or y, the longer side along x.
 
     Floors, tables and ceilings make the histogram of heights sharp, walls those of x and y: the rotation is the one
-    that makes them sharpest. Deterministic.
+    that makes them sharpest. Deterministic; the identity where there are no points and no ``up``.
 
     Args:
         xyz: (N, 3) world points in metres, N may be 0.
         up: (3,) rough direction in the world frame; ten degrees off is corrected, and so is any error up to 45 degrees
             where the truth is an axis of the world. ``None`` tries the six axes.
-
-    Returns:
-        (3, 3) rotation; identity where there are no points and no ``up``.
 
     Raises:
         ShapeError: ``xyz`` is not (N, 3), or ``up`` has no direction.
@@ -75,24 +69,16 @@ def find_upright(xyz: Float32 | Float64, up: Float64 | None = None) -> Float64:
 
 
 def plan_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float64:
-    """Rotation (3, 3) from the world to the frame of an exported floor plan (``mapping.occupancy``).
-
-    z is up, and x and y are those of the world where its z is up, too. So pictures from above lie as the plan does.
-    Arguments and errors are those of ``upright_rotation``.
-    """
+    """Rotation (3, 3) from the world to the frame of an exported floor plan (``mapping.occupancy``): z is up, and x and
+    y are those of the world where its z is up, too. Arguments and errors are those of ``upright_rotation``."""
     return turn_onto(find_upright(xyz, up), np.array((0.0, 0.0, 1.0)))
 
 
 def ceiling_height(xyz_upright: Float32 | Float64) -> float | None:
-    """Height under which to cut a map open so that one can look in: just below its ceiling.
+    """Height in metres under which to cut a map (N, 3), z up, open so that one can look in: just below its ceiling.
 
-    A ceiling is what lies high up with nothing close under it; a wall goes on below.
-
-    Args:
-        xyz_upright: (N, 3) points with z up.
-
-    Returns:
-        z in metres; ``None`` where nothing in the upper third roofs over a 25th of the floor plan.
+    A ceiling is what lies high up with nothing close under it; a wall goes on below. ``None`` where nothing in the
+    upper third roofs over a 25th of the floor plan.
     """
     points = _sample(xyz_upright)
     if len(points) < 10:
@@ -190,4 +176,4 @@ def _turn(angle: float) -> Float64:
 
 def _tilt(a: float, b: float) -> Float64:
     ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-    return np.array(((1, 0, 0), (0, ca, -sa), (0, sa, ca))) @ np.array(((cb, 0, sb), (0, 1, 0), (-sb, 0, cb)))
+    return np.array(((cb, 0, sb), (sa * sb, ca, -sa * cb), (-ca * sb, sa, ca * cb)))

@@ -12,7 +12,7 @@ a ``CodecError``.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, Self, TypeVar, get_args
 
@@ -43,7 +43,7 @@ from semantic_mapper.transport.messages import (
     Wire,
     Word,
 )
-from semantic_mapper.types import Float64, Int32, Int64, UInt8
+from semantic_mapper.types import Float64, Int64, UInt8
 
 MAX_REQUEST_ROWS = 1 << 16  # points, rays or poses of one question
 MAX_WAIT_S = 3600.0  # for an answer, of a client that does not say
@@ -173,19 +173,22 @@ class InstanceArrays:
     @classmethod
     def of(cls, things: Sequence[Instance], labels: LabelSet) -> Self:
         """Things of a map with these classes."""
-        count = len(things)
+
+        def column(values: Iterable[Any], *shape: int, dtype: type = np.float64) -> NDArray[Any]:
+            return np.array([*values], dtype).reshape(len(things), *shape)
+
         return cls(
             labels,
-            np.array([t.id for t in things], np.int64),
-            np.array([t.class_id for t in things], np.int64),
-            np.array([t.confidence for t in things], np.float64),
-            np.array([t.centroid for t in things], np.float64).reshape(count, 3),
-            np.array([t.box.center for t in things], np.float64).reshape(count, 3),
-            np.array([t.box.size for t in things], np.float64).reshape(count, 3),
-            np.array([t.box.R_world_box for t in things], np.float64).reshape(count, 3, 3),
-            np.array([t.measured for t in things], np.float64),
-            np.array([-1 if t.gone_ns is None else t.gone_ns for t in things], np.int64),
-            np.array([len(t.voxels) for t in things], np.int64),
+            column((t.id for t in things), dtype=np.int64),
+            column((t.class_id for t in things), dtype=np.int64),
+            column(t.confidence for t in things),
+            column((t.centroid for t in things), 3),
+            column((t.box.center for t in things), 3),
+            column((t.box.size for t in things), 3),
+            column((t.box.R_world_box for t in things), 3, 3),
+            column(t.measured for t in things),
+            column((-1 if t.gone_ns is None else t.gone_ns for t in things), dtype=np.int64),
+            column((len(t.voxels) for t in things), dtype=np.int64),
             np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
         )
 
@@ -203,21 +206,14 @@ class InstanceArrays:
         names = dict(zip(self.label_set.ids, self.label_set.names, strict=True))
         if not np.isin(self.class_id, self.label_set.ids).all():
             raise CodecError(f"instances: of a class that label set '{self.label_set.name}' does not have")
-        parts: Sequence[Int32] = np.split(self.voxels, np.cumsum(self.voxel_count)[:-1]) if len(self.id) else ()
-        rows = zip(*(column.tolist() for column in columns[:5]), *arrays, parts, strict=True)
+        parts = np.split(self.voxels, np.cumsum(self.voxel_count)[:-1]) if len(self.id) else ()
         return tuple(
             Instance(
-                number,
-                class_id,
-                names[class_id],
-                confidence,
-                centroid,
-                OrientedBox(center, size, R_world_box),
-                voxels,
-                measured,
-                None if gone_ns < 0 else gone_ns,
+                id_, kind, names[kind], sure, centroid, OrientedBox(*box), voxels, measured, gone if gone >= 0 else None
             )
-            for number, class_id, confidence, measured, gone_ns, centroid, center, size, R_world_box, voxels in rows
+            for id_, kind, sure, measured, gone, centroid, *box, voxels in zip(
+                *(column.tolist() for column in columns[:5]), *arrays, parts, strict=True
+            )
         )
 
 
@@ -350,11 +346,7 @@ NAMES = {question.request: name for name, question in QUESTIONS.items()}
 
 
 def decode_question(parts: Parts) -> Request[Any]:
-    """A question of any kind; its arrays are fresh and writable.
-
-    Raises:
-        CodecError: anything that ``encode_request`` would not have made.
-    """
+    """A question of any kind; CodecError for anything that ``encode_request`` would not have made."""
     name = read_name(parts)
     if name not in QUESTIONS:
         raise CodecError(f"unknown question {name!r}; there are {', '.join(QUESTIONS)}")
@@ -362,33 +354,21 @@ def decode_question(parts: Parts) -> Request[Any]:
 
 
 def encode_request(name: str, request: Request[Any]) -> list[bytes]:
-    """Question -> parts; arrays are converted to the dtypes of their fields.
-
-    Raises:
-        CodecError: too many rows, or a value that cannot be sent.
-    """
+    """Question -> parts; CodecError for too many rows, or a value that cannot be sent."""
     parts = _encode(name, {}, request, name)
     decode_question(parts)  # as its reader will
     return parts
 
 
 def read_name(parts: Parts) -> str:
-    """The name of a question or answer.
-
-    Raises:
-        CodecError: it is neither.
-    """
+    """The name of a question or answer; CodecError if it is neither."""
     if not 2 <= len(parts) <= 3:
         raise CodecError(f"a question or answer has 2 or 3 parts, got {len(parts)}")
     return bytes(parts[0][:32]).decode("ascii", errors="replace")
 
 
 def encode_answer(name: str, state: MapState, answer: object) -> list[bytes]:
-    """Answer -> parts.
-
-    Raises:
-        CodecError: larger than a message may be, or a value that cannot be sent.
-    """
+    """Answer -> parts; CodecError for one that is too large, or a value that cannot be sent."""
     return _encode(name, {"map": msgspec.to_builtins(state)}, answer, f"answer to '{name}'")
 
 
@@ -399,12 +379,7 @@ def encode_error(error: SemanticMapperError) -> list[bytes]:
 
 
 def decode_answer(name: str, kind: type[AnswerT], parts: Parts) -> tuple[MapState, AnswerT]:
-    """Parts -> what the answer is about, and the answer; its arrays are fresh and writable.
-
-    Args:
-        name: Of the question.
-        kind: Type of the answer.
-        parts: What came.
+    """Parts -> what the answer to question ``name`` is about, and the answer; its arrays are fresh and writable.
 
     Raises:
         MapError, LabelError, CodecError, ShapeError, PoseError: the other side answered with this error.

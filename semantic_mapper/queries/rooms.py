@@ -7,14 +7,14 @@ smaller of the two (a corridor that is no wider than a door is one room, too). S
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import scipy  # loads `ndimage` when it is first used
 from numpy.typing import NDArray
 
-from semantic_mapper.types import Bool, Float64, Int64
+from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
 DOOR_M = 1.05  # wider passages part no rooms
 LEAST_DOOR_M = 0.5  # narrower passages are holes in what was seen of a wall
@@ -46,24 +46,24 @@ class RoomPlan(NamedTuple):
 def find_walls(shown: Bool, cell_m: float) -> Bool:
     """Cells (H, W) of walls, of those where one was seen: holes and their inside are closed, short pieces left out."""
     reach = round(WALL_CLOSING_M / cell_m)
-    closed = cv2.morphologyEx(
-        np.pad(shown, 2 * reach).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * reach + 1,) * 2, np.uint8)
-    )
+    closed = _closed(shown, reach, np.ones((2 * reach + 1,) * 2, np.uint8))
     _, parts, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     long = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * cell_m >= LEAST_WALL_M
     long[0] = False
-    return long[parts.astype(np.int64)][2 * reach : 2 * reach + shown.shape[0], 2 * reach : 2 * reach + shown.shape[1]]
+    return long[parts.astype(np.int64)]
+
+
+def _closed(mask: Bool, reach: int, kernel: NDArray[Any]) -> UInt8:
+    """A mask (H, W) without holes of up to twice the reach."""
+    padded = np.pad(mask, 2 * reach).astype(np.uint8)
+    inside = tuple(slice(2 * reach, 2 * reach + side) for side in mask.shape)
+    return np.ascontiguousarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[inside])
 
 
 def part_rooms(seen: Bool, wall: Bool, cell_m: float) -> RoomPlan:
-    """Part a plan into rooms; see the head of this file.
-
-    Args:
-        seen: (H, W) where floor or furniture was seen; the outermost cells count as outside.
-        wall: (H, W) where there is a wall, see ``find_walls``.
-        cell_m: Side of a cell.
-    """
-    inside = _bridged(seen, round(MOST_UNSEEN_M / 2 / cell_m)) & ~wall
+    """Part a plan into rooms, by where floor or furniture was seen, and where there is a wall (H, W)."""
+    reach = round(MOST_UNSEEN_M / 2 / cell_m)
+    inside = (_closed(seen, reach, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)) > 0) & ~wall
     inside[[0, -1]] = inside[:, [0, -1]] = False
     inside |= _small_parts(~inside & ~wall, MOST_HIDDEN_M2 / cell_m**2)
     clearance = np.asarray(scipy.ndimage.distance_transform_edt(inside, sampling=cell_m), np.float64)
@@ -82,14 +82,6 @@ def part_rooms(seen: Bool, wall: Bool, cell_m: float) -> RoomPlan:
     number[:-1] = number[group]
     room = number[basin]
     return RoomPlan(room, len(kept), clearance, _passages(room, clearance))
-
-
-def _bridged(seen: Bool, reach: int) -> Bool:
-    """With the cells (H, W) between what was seen that are at most ``2 * reach`` cells wide."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
-    padded = np.pad(seen, 2 * reach).astype(np.uint8)
-    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc) > 0
-    return closed[2 * reach : 2 * reach + seen.shape[0], 2 * reach : 2 * reach + seen.shape[1]]
 
 
 def _small_parts(mask: Bool, most_cells: float) -> Bool:

@@ -11,7 +11,7 @@ import itertools
 import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,29 +123,17 @@ class MapSnapshot:
         chosen, version = oldest_first(self.versions[later], limit, self.version)
         rows = later[chosen]
         slots, voxels = self.slots[rows], self.voxels
-        return BlockChanges(
-            since,
-            version,
-            self.version,
-            self.epoch,
+        computed = (voxels.weight[slots] == COMPUTED).astype(np.uint8)
+        blocks = [
             self.keys[rows],
-            voxels.tsdf[slots],
-            voxels.label[slots],
-            voxels.confidence[slots],
-            voxels.rgb[slots],
-            self.scale_known,
-            (voxels.weight[slots] == COMPUTED).astype(np.uint8),
-            self.cleared.between(since, version),
-        )
+            *(part[slots] for part in (voxels.tsdf, voxels.label, voxels.confidence, voxels.rgb)),
+        ]
+        of_map = since, version, self.version, self.epoch
+        return BlockChanges(*of_map, *blocks, self.scale_known, computed, self.cleared.between(since, version))
 
 
 class MapMirror:
-    """Follows a map by its changes and hands out snapshots of it. Safe to use from several threads.
-
-    Args:
-        voxel_size_m, truncation_voxels: Of the map (``VoxelMapConfig``).
-        label_set: Of the map.
-    """
+    """Follows a map by its changes and hands out snapshots of it. Safe to use from several threads."""
 
     def __init__(self, voxel_size_m: float, truncation_voxels: float, label_set: LabelSet) -> None:
         none = np.empty(0, np.int64)
@@ -198,10 +186,8 @@ class MapMirror:
         After a new epoch, that is the last one of the old epoch until changes have come up to the map's newest version.
 
         Raises:
-            MapError: changes are missing between the mirror's version and these, these are older than the mirror, or
-                their arrays are not of the form that ``BlockChanges`` has.
-            LabelError: a class id that is not in the label set.
-            In every case the mirror is as it was.
+            MapError: changes that do not continue the mirror's version, or damaged ones. The mirror is as it was.
+            LabelError: a class id that is not in the label set. The mirror is as it was.
         """
         packed = _check(changes, self._snapshot.label_set)
         with self._lock:
@@ -267,43 +253,35 @@ def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int)
     pool.label[part] = changes.label
     pool.confidence[part] = changes.confidence
     pool.rgb[part] = changes.rgb
-    pool.classes[part] = _collect_classes(pool.tsdf[part], pool.weight[part], pool.label[part], ignore_id)
-
-
-def _collect_classes(tsdf: NDArray[np.int8], weight: UInt8, label: UInt8, ignore_id: int) -> NDArray[np.uint64]:
-    """Classes (B, 4) of the voxels that lie near enough to a surface to be one of its own (``surface_voxels``)."""
-    near = (label != ignore_id) & (weight != 0) & (tsdf <= NEAREST_STEPS) & (tsdf >= -NEAREST_STEPS)
-    at = np.flatnonzero(near)
+    # Classes of the voxels that lie near enough to a surface to be one of its own (``surface_voxels``).
+    label, tsdf = changes.label, changes.tsdf
+    at = np.flatnonzero((label != ignore_id) & changes.observed & (tsdf <= NEAREST_STEPS) & (tsdf >= -NEAREST_STEPS))
     has_class = np.zeros((len(tsdf), 256), np.bool_)
     has_class[at // BLOCK_VOXELS, label.ravel()[at]] = True
-    return np.packbits(has_class, axis=1, bitorder="little").view("<u8").astype(np.uint64)
+    pool.classes[part] = np.packbits(has_class, axis=1, bitorder="little").view("<u8")
 
 
 def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:
     """Packed keys of changes that may come from a network."""
-    blocks = len(changes.keys)
-    forms = {"keys": (np.int32, (3,)), "tsdf": (np.int8, (BLOCK_VOXELS,)), "label": (np.uint8, (BLOCK_VOXELS,))}
-    forms |= {"confidence": (np.uint8, (BLOCK_VOXELS,)), "rgb": (np.uint8, (BLOCK_VOXELS, 3))}
-    forms |= {} if changes.computed is None else {"computed": (np.uint8, (BLOCK_VOXELS,))}
+    blocks, where = len(changes.keys), f"changes up to version {changes.version}"
+    forms: dict[str, tuple[Any, tuple[int, ...]]] = {"keys": (np.int32, (3,)), "tsdf": (np.int8, (BLOCK_VOXELS,))}
+    forms |= dict.fromkeys(("label", "confidence", "computed"), (np.uint8, (BLOCK_VOXELS,)))
+    forms |= {"rgb": (np.uint8, (BLOCK_VOXELS, 3))}
     for name, (dtype, tail) in forms.items():
-        array: NDArray[np.generic] = getattr(changes, name)
-        if array.dtype != dtype or array.shape != (blocks, *tail):
-            raise MapError(
-                f"changes up to version {changes.version}: {name} must be {np.dtype(dtype).name} {(blocks, *tail)}, "
-                f"got {array.dtype.name} {array.shape}"
-            )
+        array: NDArray[np.generic] | None = getattr(changes, name)
+        shape = (blocks, *tail)
+        if array is not None and (array.dtype != dtype or array.shape != shape):
+            got = f"{array.dtype.name} {array.shape}"
+            raise MapError(f"{where}: {name} must be {np.dtype(dtype).name} {shape}, got {got}")
     if blocks and not -KEY_LIMIT <= changes.keys.min() <= changes.keys.max() < KEY_LIMIT:
-        raise MapError(f"changes up to version {changes.version}: block coordinates beyond {KEY_LIMIT}")
+        raise MapError(f"{where}: block coordinates beyond {KEY_LIMIT}")
     packed = pack_keys(changes.keys)
     if len(np.unique(packed)) != blocks:
-        raise MapError(f"changes up to version {changes.version}: a block comes twice")
-    known = np.zeros(256, np.bool_)
-    known[[*label_set.ids, label_set.ignore_id]] = True
-    if not known[changes.label].all():
+        raise MapError(f"{where}: a block comes twice")
+    if not np.isin(changes.label, [*label_set.ids, label_set.ignore_id]).all():
         foreign = sorted({int(i) for i in np.unique(changes.label)} - {*label_set.ids, label_set.ignore_id})
         raise LabelError(
-            f"changes up to version {changes.version}: class ids {foreign} are not in label set '{label_set.name}'; "
-            "the mirror was made for another map"
+            f"{where}: class ids {foreign} are not in label set '{label_set.name}'; the mirror was made for another map"
         )
     return packed
 
@@ -317,12 +295,8 @@ class BlockAges:
         self._changed_s = np.empty(0, np.float64)
 
     def follow(self, snapshot: MapSnapshot, now_s: float) -> Float64:
-        """Seconds (B,) since each block of a snapshot last changed, as seen here.
-
-        Args:
-            snapshot: A later one than before, of whichever mirror.
-            now_s: When the map was like this, on any one clock.
-        """
+        """Seconds (B,) since each block of a snapshot, which is later than the last one, has changed, as seen here;
+        ``now_s`` is when the map was like this, on any one clock."""
         changed_s = np.full(snapshot.block_count, now_s)
         if len(self._packed):
             row = np.minimum(np.searchsorted(self._packed, snapshot.packed), len(self._packed) - 1)

@@ -7,12 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.bundle.keyframes import BundleProblem, adjust_bundle, triangulate
+from semantic_mapper.bundle.keyframes import BundleProblem, adjust_bundle
 from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose, align_poses
-from semantic_mapper.bundle.tracks import Tracker, follow, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
-from semantic_mapper.geometry import invert_pose, project, rotation_vector, transform, unproject
+from semantic_mapper.geometry import invert_pose, project, rotation_vector
 from semantic_mapper.types import Float64, PosedFrame
 
 from .rooms import INTRINSICS, truth, walk
@@ -122,24 +121,6 @@ def test_pictures_without_corners_leave_given_poses_as_they_are() -> None:
     assert refiner.corrections() == {}
 
 
-def test_corners_are_followed_to_where_the_scene_moved_them() -> None:
-    a, b = walk()[0], walk()[1]
-    images = [prepare_image(f.rgb, 320, 240) for f in (a, b)]
-    tracker = Tracker(150)
-    tracker.advance(images[0])
-    corners = tracker.replenish()
-    assert len(corners.ids) > 80 and (np.diff(corners.ids) > 0).all()
-    there, found = follow(images[0], images[1], corners.pixels, corners.pixels)
-    assert a.depth_m is not None
-    nearest = np.rint(corners.pixels).astype(int)
-    points = unproject(a.depth_m, INTRINSICS)[nearest[:, 1], nearest[:, 0]]
-    expected = project(transform(invert_pose(b.T_world_camera) @ a.T_world_camera, points), INTRINSICS)
-    assert found.mean() > 0.6
-    assert np.median(np.linalg.norm(there - expected, axis=1)[found]) < 0.5
-    after = tracker.advance(images[1])
-    assert set(after.ids.tolist()) <= set(corners.ids.tolist()) and len(after.ids) > 50
-
-
 def test_a_bundle_finds_poses_and_points_from_their_pixels(rng: np.random.Generator) -> None:
     points = rng.uniform((-2, -1.5, 2), (2, 1.5, 5), (60, 3))
     poses = np.tile(np.eye(4), (5, 1, 1))
@@ -158,15 +139,3 @@ def test_a_bundle_finds_poses_and_points_from_their_pixels(rng: np.random.Genera
     assert np.abs(found.poses[:, :3, 3] - poses[:, :3, 3]).max() < 1e-3
     assert np.abs(np.delete(found.points, point[7], axis=0) - np.delete(points, point[7], axis=0)).max() < 0.02
     assert found.errors_px[7] > 20 and np.median(found.errors_px) < 0.01
-
-
-def test_points_are_found_where_rays_meet_at_an_angle(rng: np.random.Generator) -> None:
-    points = rng.uniform((-1, -1, 2), (1, 1, 4), (30, 3))
-    far = np.eye(4)
-    far[0, 3] = 0.3
-    a, b = project(points, INTRINSICS), project(points - far[:3, 3], INTRINSICS)
-    found, good = triangulate(a, b, np.eye(4), far, INTRINSICS)
-    assert good.all() and np.allclose(found, points, atol=1e-6)
-    b[3, 1] += 20
-    assert not triangulate(a, b, np.eye(4), far, INTRINSICS)[1][3]
-    assert not triangulate(a, a, np.eye(4), np.eye(4), INTRINSICS)[1].any()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from semantic_mapper.depth_from_motion.estimate import TOLERANCE, find_agreement, relax_membrane, smooth_planes
+from semantic_mapper.depth_from_motion.estimate import TOLERANCE, find_agreement, relax_membrane
 from semantic_mapper.depth_from_motion.sweep import (
     EDGE_GRAY,
     HINT_COST,
@@ -176,16 +176,6 @@ def test_a_membrane_is_the_least_squares_surface() -> None:
             left[[a, b], [b, a]] -= t
     expected = np.linalg.solve(left, (weight * data).ravel())
     np.testing.assert_allclose(out.ravel(), expected, atol=1e-5)
-
-
-def test_what_is_not_sure_takes_the_plane_around_it_and_edges_of_the_image_part_surfaces() -> None:
-    x = np.arange(32, dtype=np.float32)[None].repeat(24, 0)
-    truth = np.where(x < 16, 10 + 0.2 * x, 40.0).astype(np.float32)
-    rgb = np.where(x < 16, 60, 200).astype(np.uint8)[..., None].repeat(3, 2)
-    plane, sigma = truth.copy(), np.full_like(truth, 0.2)
-    plane[6:18, 4:12], sigma[6:18, 4:12] = 55, 30
-    smooth = smooth_planes(plane, sigma, rgb)
-    assert np.abs(smooth - truth).max() < 0.3
 
 
 def test_an_enlarged_plane_is_a_plane() -> None:

@@ -92,7 +92,7 @@ def test_images_add_up_and_a_class_is_averaged_over_all_of_them() -> None:
 
 
 def test_images_of_other_sizes_and_unknown_ids_are_refused() -> None:
-    with pytest.raises(ShapeError, match="objects found"):
+    with pytest.raises(ShapeError, match="have shapes"):
         metrics(image((CAR, 1, 4)), image((CAR, 1, 4))._replace(instance=np.zeros((1, 3), np.uint16)))
     with pytest.raises(LabelError):
         metrics(image((CAR, 1, 4)), image((99, 1, 4)))

@@ -34,16 +34,13 @@ def test_points(query: Callable[..., Any], points: Any, match: str) -> None:
     assert len(nearest.at(whole(), np.empty((0, 3))).label) == 0
 
 
-def test_radius() -> None:
+def test_radius_and_point() -> None:
     for radius, match in ((0.0, "above 0"), (NAN, "above 0"), (0.6, "at most 0.5")):
         with pytest.raises(MapError, match=match):
             nearest.at(whole(), [[0, 0, 0]], radius)
-
-
-@pytest.mark.parametrize("point", [(0, 0), [(0, 0, 0)], (0, 0, NAN)])
-def test_point(point: Any) -> None:
-    with pytest.raises(MapError, match="point"):
-        nearest.nearest(whole(), "cup", point)
+    for point in ((0, 0), [(0, 0, 0)], (0, 0, NAN)):
+        with pytest.raises(MapError, match="point"):
+            nearest.nearest(whole(), "cup", point)
 
 
 @pytest.mark.parametrize("query", [surface.points_in_box, occupancy.distance_field])

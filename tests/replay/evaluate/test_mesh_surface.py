@@ -36,23 +36,17 @@ def write_wall(path, z: float, half: float = 0.5, label: int = ROOMS.ids[0]) -> 
     np.savez(path, vertices=vertices, faces=faces.astype(np.int32), label=np.full(len(grid), label, np.uint8))
 
 
-def test_a_wall_where_it_was_measured_is_on_the_mesh_and_complete(wall_folder):
-    write_wall(wall_folder / "wide.npz", WALL_M, half=1.5)
-    write_wall(wall_folder / "seen.npz", WALL_M, half=0.5)
-    assert compare_with_mesh(wall_folder, wall_folder / "wide.npz")["median_m"] < 0.002
-    found = compare_with_mesh(wall_folder, wall_folder / "seen.npz")
-    assert found["complete"] == 1.0 and found["mesh_miou"] == 1.0
-
-
-def test_a_wall_3_cm_off_is_measured_as_such(wall_folder):
-    write_wall(wall_folder / "mesh.npz", WALL_M + 0.03, half=1.5)
-    assert abs(compare_with_mesh(wall_folder, wall_folder / "mesh.npz")["median_m"] - 0.03) < 0.003
-
-
-def test_a_wall_7_cm_off_is_complete_within_10_cm_alone(wall_folder):
-    write_wall(wall_folder / "mesh.npz", WALL_M + 0.07)
-    found = compare_with_mesh(wall_folder, wall_folder / "mesh.npz")
-    assert (found["complete"], found["complete_10cm"]) == (0.0, 1.0)
+def test_walls_are_as_far_off_and_as_complete_as_they_are(wall_folder):
+    for off_m, half, wanted in (
+        (0.0, 0.5, {"complete": 1.0, "mesh_miou": 1.0}),
+        (0.07, 0.5, {"complete": 0.0, "complete_10cm": 1.0}),
+        (0.0, 1.5, {}),
+        (0.03, 1.5, {}),
+    ):
+        write_wall(wall_folder / "mesh.npz", WALL_M + off_m, half)
+        found = compare_with_mesh(wall_folder, wall_folder / "mesh.npz")
+        assert {name: found[name] for name in wanted} == wanted
+        assert wanted or abs(found["median_m"] - off_m) < 0.003
 
 
 def test_what_was_never_seen_is_not_complete_and_wrong_labels_score_zero(wall_folder):

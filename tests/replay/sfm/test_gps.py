@@ -71,28 +71,17 @@ def test_a_model_is_placed_where_its_pictures_were_taken_despite_a_wrong_one(rng
     assert np.degrees(np.arccos((np.trace(turned, axis1=1, axis2=2) - 1) / 2)).max() < 3
 
 
-@pytest.mark.parametrize(
-    ("way", "told", "says"),
-    [
-        (flight(), [0, 1, 2], "3 of 12 pictures have a GPS position"),
-        (
-            np.stack([look_at(np.array((n, 0.0, 30.0)), np.array((n, 9.0, 0.0)), np.eye(3)[2]) for n in range(8)]),
-            None,
-            "line",
-        ),
-    ],
-)
-def test_positions_that_do_not_suffice_are_refused(way: Float64, told: list[int] | None, says: str) -> None:
-    known = positions_of(way[:, :3, 3])
-    chosen = range(len(way)) if told is None else told
-    with pytest.raises(ImportSourceError, match=says):
-        place_by_gps(in_a_unit_of_its_own(way), [known[n] if n in chosen else None for n in range(len(way))])
-
-
-def test_positions_that_contradict_the_pictures_are_refused(rng: np.random.Generator) -> None:
-    way = flight()
-    with pytest.raises(ImportSourceError, match="off"):
-        place_by_gps(in_a_unit_of_its_own(way), [*positions_of(rng.normal(0, 20, (len(way), 3)))])
+def test_positions_that_are_few_on_a_line_or_contradict_the_pictures_are_refused(rng: np.random.Generator) -> None:
+    way, up = flight(), np.eye(3)[2]
+    line = np.stack([look_at(np.array((n, 0.0, 30.0)), np.array((n, 9.0, 0.0)), up) for n in range(8)])
+    few = [*positions_of(way[:3, :3, 3]), *[None] * (len(way) - 3)]
+    for poses, known, says in (
+        (way, few, "3 of 12 pictures have a GPS position"),
+        (line, positions_of(line[:, :3, 3]), "line"),
+        (way, positions_of(rng.normal(0, 20, (len(way), 3))), "off"),
+    ):
+        with pytest.raises(ImportSourceError, match=says):
+            place_by_gps(in_a_unit_of_its_own(poses), [*known])
     assert place_by_gps(way, [None] * len(way)) is None
 
 

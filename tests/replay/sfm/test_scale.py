@@ -16,9 +16,7 @@ from semantic_mapper.replay.sfm.scale import (
     fit_to_scene,
     marked_place,
     parse_distance,
-    ray_of,
     scene_depth,
-    triangulate,
     upright,
     vertical,
 )
@@ -34,23 +32,6 @@ def test_marked_distances_are_read() -> None:
     for text in ("", "3:1,2 0.9", "3:1,2 4:1,2 0", "3:1,2 4:1,2 -1", "a:1,2 4:1,2 1"):
         with pytest.raises(ConfigError, match="marks no distance"):
             parse_distance(text)
-
-
-def test_a_place_is_found_where_rays_meet_and_only_from_two_sides() -> None:
-    place = np.array((0.3, 3.0, 1.0))
-    eyes = [np.array((0.2 * n, 0.0, 1.5)) for n in range(5)]
-    rays = [(eye, (place - eye) / np.linalg.norm(place - eye)) for eye in eyes]
-    found = triangulate([*rays, (eyes[0], np.array((0.0, 0.6, 0.8)))])  # one is wrong
-    assert found is not None and np.allclose(found, place, atol=1e-6)
-    assert triangulate(rays[:1]) is None and triangulate([rays[0], rays[0]]) is None
-
-
-def test_rays_take_the_lens_into_account() -> None:
-    T = look_at(np.array((1.0, 2.0, 1.5)), np.array((1.0, 5.0, 1.2)), UP)
-    origin, direction = ray_of(T, np.array((250.0, 60.0)), CAMERA)
-    x, y = (transform(invert_pose(T), (origin + direction)[None])[0][:2]) / (invert_pose(T)[:3, :3] @ direction)[2]
-    bent = 1 + 0.05 * (x * x + y * y)
-    assert (300 * x * bent + 159.5, 300 * y * bent + 119.5) == pytest.approx((250, 60), abs=1e-3)
 
 
 def test_a_world_is_turned_upright_about_the_first_camera() -> None:
