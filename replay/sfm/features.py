@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy  # loads `cluster` when it is first used
 from numpy.typing import NDArray
 
 from semantic_mapper.types import Float32, Float64, UInt8
@@ -52,22 +53,17 @@ def match_features(a: UInt8, b: UInt8) -> NDArray[np.uint32]:
 
 
 def loop_pairs(descriptors: list[UInt8], window: int, seed: int) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of frames further than ``window`` apart that look alike.
+    """Pairs (i, j), i < j, of frames further than ``window`` apart that look alike, by their descriptors (N, 128).
 
     Frames are compared by the sums of their descriptors' residuals to a few words (VLAD), learned from all of them.
-
-    Args:
-        descriptors: Of each frame (N, 128) uint8; N may be 0.
-        window: Frames nearer than this in the sequence are matched anyway.
-        seed: Of the words.
     """
     filled = [rows for rows in descriptors if len(rows)]
     if len(filled) <= window or sum(map(len, filled)) < 10 * WORDS:
         return []
     rng = np.random.default_rng(seed)
     each = max(1, TRAIN_ROWS // len(filled))
-    sample = [rows[rng.permutation(len(rows))[:each]] for rows in filled]
-    words = _learn_words(np.concatenate(sample).astype(np.float64), rng)
+    sample = np.concatenate([rows[rng.permutation(len(rows))[:each]] for rows in filled]).astype(np.float64)
+    words, _ = scipy.cluster.vq.kmeans2(sample, WORDS, ROUNDS, minit="points", rng=rng)
     signatures = np.stack([_signature(rows.astype(np.float64), words) for rows in descriptors])
     signatures -= signatures.mean(axis=0)
     signatures /= np.maximum(np.linalg.norm(signatures, axis=1, keepdims=True), 1e-9)
@@ -81,25 +77,10 @@ def loop_pairs(descriptors: list[UInt8], window: int, seed: int) -> list[tuple[i
     return sorted(pairs)
 
 
-def _learn_words(rows: Float64, rng: np.random.Generator) -> Float64:
-    words = rows[rng.permutation(len(rows))[:WORDS]]
-    for _ in range(ROUNDS):
-        nearest = _nearest(rows, words)
-        counts = np.bincount(nearest, minlength=WORDS)
-        sums = np.zeros_like(words)
-        np.add.at(sums, nearest, rows)
-        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
-    return words
-
-
 def _signature(rows: Float64, words: Float64) -> Float64:
     sums = np.zeros_like(words)
     if len(rows):
-        nearest = _nearest(rows, words)
+        nearest, _ = scipy.cluster.vq.vq(rows, words)
         np.add.at(sums, nearest, rows - words[nearest])
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
     return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-9)
-
-
-def _nearest(rows: Float64, words: Float64) -> np.ndarray:
-    return np.argmin((words**2).sum(axis=1) - 2 * rows @ words.T, axis=1)

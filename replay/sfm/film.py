@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -41,11 +42,9 @@ class FilmFrame:
 
 
 class Film:
-    """A film or a folder of pictures; may be read several times, always with the same result.
+    """A film, or a folder of pictures by the numbers in their names; may be read several times, with the same result.
 
-    Args:
-        path: Film file, or folder of pictures, which are read by the numbers in their names.
-        quarters: Turn every frame clockwise by this many quarters, on top of what the film's own rotation mark says.
+    Frames are turned clockwise by ``quarters``, on top of what the film's own rotation mark says.
 
     Attributes:
         width, height: Of the frames as they are given, in pixels.
@@ -62,20 +61,22 @@ class Film:
     def __init__(self, path: Path, quarters: int = 0) -> None:
         self.path = path
         self.odd_pictures: dict[Path, str] = {}
-        self.unread = 0
-        self.focal_px: float | None = None
+        self.unread, self.count, self.hz = 0, 0, PICTURE_HZ
         self._turn = _TURNS[quarters % 4]
         self._pictures = pictures_of(path) if path.is_dir() else []
         if path.is_dir() and not self._pictures:
             raise ImportSourceError(f"{path}: no pictures in it ({', '.join(PICTURE_SUFFIXES)})")
         if not path.exists():
             raise ImportSourceError(f"{path}: no such film or folder of pictures")
-        first, self.count, self.hz = self._look_at_pictures() if self._pictures else self._look_at_film()
-        self.full_height, self.full_width = first.shape[:2]
-        ratio = min(1.0, MAX_SIDE_PX / max(first.shape[:2]))
+        first = next(self._decoded(), None)
+        if first is None:
+            raise ImportSourceError(f"{path}: holds no frame that can be decoded; copy or convert it again")
+        index, _, bgr = first
+        self.full_height, self.full_width = bgr.shape[:2]
+        ratio = min(1.0, MAX_SIDE_PX / max(bgr.shape[:2]))
         self.width, self.height = (max(1, round(side * ratio)) for side in (self.full_width, self.full_height))
-        if self.focal_px is not None:
-            self.focal_px *= ratio
+        focal_px = focal_of_exif(self._pictures[index], bgr.shape[:2]) if self._pictures else None
+        self.focal_px = None if focal_px is None else ratio * focal_px
 
     def position(self, index: int) -> GpsPosition | None:
         """Where a picture of a folder was taken by its EXIF data; None of a film, or where that tells nothing."""
@@ -83,11 +84,35 @@ class Film:
 
     def __iter__(self) -> Iterator[FilmFrame]:
         """All frames from the first one; pictures that cannot be used are left out (``odd_pictures``)."""
-        return self._iterate_pictures() if self._pictures else self._iterate_film()
+        for index, stamp_ns, bgr in self._decoded():
+            if self._pictures and bgr.shape[:2] != (self.full_height, self.full_width):
+                size = f"is {bgr.shape[1]}x{bgr.shape[0]}, the first picture {self.full_width}x{self.full_height}"
+                self.odd_pictures[self._pictures[index]] = size
+                continue
+            if bgr.shape[:2] != (self.height, self.width):
+                bgr = cv2.resize(bgr, (self.width, self.height), interpolation=cv2.INTER_AREA)
+            yield FilmFrame(index, stamp_ns, np.asarray(bgr, np.uint8))
 
-    def _iterate_film(self) -> Iterator[FilmFrame]:
+    def _decoded(self) -> Iterator[tuple[int, int, UInt8]]:
+        """Number, time in ns, and picture of each frame that can be decoded, in full size, upright."""
+        for index, stamp_ns, bgr in self._decoded_pictures() if self._pictures else self._decoded_film():
+            yield index, stamp_ns, np.asarray(bgr if self._turn is None else cv2.rotate(bgr, self._turn), np.uint8)
+
+    def _decoded_pictures(self) -> Iterator[tuple[int, int, np.ndarray]]:
+        self.count = len(self._pictures)
+        for index, file in enumerate(self._pictures):
+            bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)  # turns it as its EXIF data says
+            if bgr is None:
+                self.odd_pictures[file] = "is damaged, or no picture that OpenCV can read"
+            else:
+                yield index, round(index * 1e9 / PICTURE_HZ), bgr
+
+    def _decoded_film(self) -> Iterator[tuple[int, int, np.ndarray]]:
         last_ns, read, failed = -1, 0, 0
         with self._opened() as capture:
+            hz = capture.get(cv2.CAP_PROP_FPS)
+            self.hz = hz if 0.01 < hz < 1000 else DEFAULT_HZ
+            self.count = max(1, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
             for index in itertools.count():
                 good, bgr = capture.read()
                 if not good or bgr is None:
@@ -101,29 +126,7 @@ class Film:
                 if stamp_ns <= last_ns:  # containers without times
                     stamp_ns = last_ns + round(1e9 / self.hz)
                 last_ns = stamp_ns
-                yield FilmFrame(index, stamp_ns, self._smaller(self._turned(bgr)))
-
-    def _iterate_pictures(self) -> Iterator[FilmFrame]:
-        for index, file in enumerate(self._pictures):
-            bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)  # turns it as its EXIF data says
-            if bgr is None:
-                self.odd_pictures[file] = "is damaged, or no picture that OpenCV can read"
-                continue
-            turned = self._turned(bgr)
-            if turned.shape[:2] != (self.full_height, self.full_width):
-                self.odd_pictures[file] = (
-                    f"is {turned.shape[1]}x{turned.shape[0]}, the first picture {self.full_width}x{self.full_height}"
-                )
-                continue
-            yield FilmFrame(index, round(index * 1e9 / PICTURE_HZ), self._smaller(turned))
-
-    def _turned(self, bgr: np.ndarray) -> UInt8:
-        return np.asarray(bgr if self._turn is None else cv2.rotate(bgr, self._turn), np.uint8)
-
-    def _smaller(self, bgr: UInt8) -> UInt8:
-        if bgr.shape[:2] == (self.height, self.width):
-            return bgr
-        return np.asarray(cv2.resize(bgr, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8)
+                yield index, stamp_ns, bgr
 
     @contextmanager
     def _opened(self) -> Iterator[cv2.VideoCapture]:
@@ -136,25 +139,6 @@ class Film:
             yield capture
         finally:
             capture.release()
-
-    def _look_at_film(self) -> tuple[UInt8, int, float]:
-        """The first frame, how many there are, and the rate."""
-        with self._opened() as capture:
-            hz = capture.get(cv2.CAP_PROP_FPS)
-            count = max(1, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
-            for _ in range(min(count, MAX_FAILED)):
-                good, bgr = capture.read()
-                if good and bgr is not None:
-                    return self._turned(bgr), count, hz if 0.01 < hz < 1000 else DEFAULT_HZ
-        raise ImportSourceError(f"{self.path}: holds no frame that can be decoded; copy or convert it again")
-
-    def _look_at_pictures(self) -> tuple[UInt8, int, float]:
-        for file in self._pictures:
-            bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)
-            if bgr is not None:
-                self.focal_px = focal_of_exif(file, bgr.shape[:2])
-                return self._turned(bgr), len(self._pictures), PICTURE_HZ
-        raise ImportSourceError(f"{self.path}: none of its {len(self._pictures)} pictures can be read")
 
 
 def pictures_of(folder: Path) -> list[Path]:
@@ -228,15 +212,9 @@ def look_through(film: Film, on_frame: Callable[[int], None]) -> FilmLook:
         rows.append((frame.index, frame.stamp_ns, motion, fast, _sharpness(gray), dark))
         last = small
         on_frame(len(rows))
-    index, stamps, motion, fast, sharpness, dark = zip(*rows, strict=True) if rows else ((),) * 6
-    return FilmLook(
-        np.array(index, np.int64),
-        np.array(stamps, np.int64),
-        np.array(motion, np.float64),
-        np.array(fast, np.float64),
-        np.array(sharpness, np.float64),
-        np.array(dark, np.bool_),
-    )
+    columns = zip(*rows, strict=True) if rows else ((),) * 6
+    kinds: tuple[Any, ...] = (np.int64, np.int64, np.float64, np.float64, np.float64, np.bool_)
+    return FilmLook(*(np.array(column, kind) for column, kind in zip(columns, kinds, strict=True)))
 
 
 def pick_frames(look: FilmLook, step: float = STEP, most: int = MAX_PICKS) -> Int64:

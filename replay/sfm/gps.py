@@ -100,14 +100,8 @@ def _earth_centred(positions: Sequence[GpsPosition]) -> Float64:
 
 
 def place_by_gps(T_model_camera: Float64, positions: Sequence[GpsPosition | None]) -> GpsFit | None:
-    """The similarity that takes a model to where its pictures say they are; single wrong positions do not count.
-
-    Args:
-        T_model_camera: (N, 4, 4) poses.
-        positions: Of the N pictures; None = unknown.
-
-    Returns:
-        None: no picture has a position.
+    """The similarity that takes a model of poses (N, 4, 4) to where its pictures say they are; single wrong positions
+    do not count. None where no picture has one.
 
     Raises:
         ImportSourceError: too few have one, they lie on a line, or they contradict the pictures.

@@ -288,7 +288,7 @@ def _describe(found: RoomPlan, number: int, room_id: int, plan: _Plan, R_grid_wo
     corners = cv2.approxPolyDP(max(contours, key=cv2.contourArea), 2.0, True).reshape(-1, 2).astype(np.float64)
     if cv2.contourArea(corners.astype(np.float32), oriented=True) < 0:
         corners = corners[::-1]
-    center = _to_world(np.array(widest[::-1]) + 0.5, plan, R_grid_world, cell_m)
+    center = _to_world(np.array(widest[::-1], np.float64) + 0.5, plan, R_grid_world, cell_m)
     outline = _to_world(corners / 2 + 0.25, plan, R_grid_world, cell_m)
     return Room(room_id, plan.floor, float(own.sum()) * cell_m**2, center, outline)
 

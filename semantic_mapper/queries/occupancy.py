@@ -81,7 +81,9 @@ def distance_field(
     distance = np.full(state.shape, np.inf)
     if obstacle.any():
         distance = scipy.ndimage.distance_transform_edt(~obstacle, sampling=snapshot.voxel_size_m)
-    return DistanceField(first * snapshot.voxel_size_m, snapshot.voxel_size_m, np.asarray(distance, np.float32), state)
+    return DistanceField(
+        first.astype(np.float64) * snapshot.voxel_size_m, snapshot.voxel_size_m, np.asarray(distance, np.float32), state
+    )
 
 
 def read_states(points: Float64, snapshot: MapSnapshot) -> UInt8:

@@ -57,7 +57,7 @@ def _closed(mask: Bool, reach: int, kernel: NDArray[Any]) -> UInt8:
     """A mask (H, W) without holes of up to twice the reach."""
     padded = np.pad(mask, 2 * reach).astype(np.uint8)
     inside = tuple(slice(2 * reach, 2 * reach + side) for side in mask.shape)
-    return np.ascontiguousarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[inside])
+    return np.ascontiguousarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[inside], np.uint8)
 
 
 def part_rooms(seen: Bool, wall: Bool, cell_m: float) -> RoomPlan:

@@ -124,10 +124,7 @@ class MapSnapshot:
         rows = later[chosen]
         slots, voxels = self.slots[rows], self.voxels
         computed = (voxels.weight[slots] == COMPUTED).astype(np.uint8)
-        blocks = [
-            self.keys[rows],
-            *(part[slots] for part in (voxels.tsdf, voxels.label, voxels.confidence, voxels.rgb)),
-        ]
+        blocks = self.keys[rows], voxels.tsdf[slots], voxels.label[slots], voxels.confidence[slots], voxels.rgb[slots]
         of_map = since, version, self.version, self.epoch
         return BlockChanges(*of_map, *blocks, self.scale_known, computed, self.cleared.between(since, version))
 
