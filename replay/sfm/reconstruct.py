@@ -134,18 +134,11 @@ class FilmReport:
 def import_film(
     src: Path, dst: Path, options: FilmOptions, on_progress: Progress, *, overwrite: bool = False
 ) -> FilmReport:
-    """Write the log ``dst`` of a film, or of a folder of pictures, without poses; it is there once it is complete.
+    """Write the log ``dst`` of a film file, or of a folder of pictures, without poses; it is there once it is complete.
 
     The world of the log has z up, by how the camera was held, and begins at the first camera, on the floor where one is
     found. Pictures with GPS positions place it instead, unless a scale is given: x is east, y north, z up, in
     metres from the first one's position. Deterministic: the same film, options and machine give the same poses.
-
-    Args:
-        src: Film file, or folder of pictures.
-        dst: Log to write.
-        options: How to read.
-        on_progress: Called with what is done, how much of it, and of how much.
-        overwrite: Whether a log that is there may be replaced.
 
     Raises:
         ImportSourceError: no film, no poses can be found, or nothing of what was to tell the scale is found in it.
@@ -427,8 +420,9 @@ class _Import:
                 seconds = frame.stamp_ns / 1e9
                 if pose is not None:
                     rgb = rectify(frame.bgr)
+                    at = frame.stamp_ns, frame.index, CAMERA_ID
                     try:
-                        writer.write_frame(_log_frame(frame, rgb, rectify.intrinsics, pose))
+                        writer.write_frame(PosedFrame(*at, rgb, None, None, rectify.intrinsics, pose, "sfm"))
                     except FrameError as error:
                         reason = str(error)
                     else:
@@ -494,20 +488,6 @@ class _Import:
 
     def _seconds(self, index: int) -> float:
         return float(self._look.stamp_ns[np.searchsorted(self._look.index, index)]) / 1e9
-
-
-def _log_frame(frame: FilmFrame, rgb: UInt8, intrinsics: CameraIntrinsics, pose: Float64) -> PosedFrame:
-    return PosedFrame(
-        stamp_ns=frame.stamp_ns,
-        seq=frame.index,
-        camera_id=CAMERA_ID,
-        rgb=rgb,
-        depth_m=None,
-        label=None,
-        intrinsics=intrinsics,
-        T_world_camera=pose,
-        pose_source="sfm",
-    )
 
 
 def _poses(frames: dict[int, RegisteredFrame]) -> dict[int, Float64]:

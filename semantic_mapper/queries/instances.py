@@ -284,10 +284,14 @@ def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
     """The level box of least floor area round points (N, 3), N > 0; one of its sides lies on their hull."""
     frame = turn_onto(np.array((0.0, 0.0, 1.0)), up)
     middle = xyz.mean(axis=0)
-    plan = (xyz - middle) @ frame
-    hull = cv2.convexHull(plan[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
-    yaw = _best_yaw(hull)
-    if np.diff(np.ptp(plan[:, :2] @ _turn(yaw), axis=0))[0] > 0:
+    plan = ((xyz - middle) @ frame)[:, :2]
+    hull = cv2.convexHull(plan.astype(np.float32)).reshape(-1, 2).astype(np.float64)
+    sides = np.roll(hull, -1, axis=0) - hull
+    yaws = [math.atan2(y, x) % (math.pi / 2) for x, y in sides if x or y] or [0.0]
+    c, s = np.array([[math.cos(yaw)] for yaw in yaws]), np.array([[math.sin(yaw)] for yaw in yaws])
+    along, across = hull[:, 0] * c + hull[:, 1] * s, hull[:, 1] * c - hull[:, 0] * s  # (sides, N)
+    yaw = min(zip(np.ptp(along, axis=1) * np.ptp(across, axis=1), yaws, strict=True))[1]
+    if np.diff(np.ptp(plan @ _turn(yaw), axis=0))[0] > 0:
         yaw += np.pi / 2
     R = frame.copy()
     R[:, :2] = frame[:, :2] @ _turn(yaw)
@@ -299,14 +303,3 @@ def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
 def _turn(yaw: float) -> Float64:
     """(2, 2) whose columns are the axes turned by ``yaw``."""
     return np.array(((np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))))
-
-
-def _best_yaw(hull: Float64) -> float:
-    """Of the directions of a hull's (N, 2) sides, below 90 degrees, the one with the least area; the smaller of two."""
-    sides = np.roll(hull, -1, axis=0) - hull
-    yaws = [math.atan2(y, x) % (math.pi / 2) for x, y in sides if x or y]
-    if not yaws:  # one point
-        return 0.0
-    c, s = np.array([[math.cos(yaw)] for yaw in yaws]), np.array([[math.sin(yaw)] for yaw in yaws])
-    along, across = hull[:, 0] * c + hull[:, 1] * s, hull[:, 1] * c - hull[:, 0] * s  # (sides, N)
-    return min(zip(np.ptp(along, axis=1) * np.ptp(across, axis=1), yaws, strict=True))[1]

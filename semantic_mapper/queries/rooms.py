@@ -156,22 +156,15 @@ def _passages(room: Int64, clearance: Float64) -> tuple[Passage, ...]:
     """Every place where two rooms meet; two rooms may have several doors between them."""
     found: list[Passage] = []
     first, second, saddle = _contacts(room, clearance)
-    for a, b, height in zip(first.tolist(), second.tolist(), saddle.tolist(), strict=True):
-        if 2 * height < LEAST_DOOR_M:
-            break
-        count, parts = cv2.connectedComponents(_touching(room, a, b).astype(np.uint8), connectivity=8)
+    for a, b in zip(first[2 * saddle >= LEAST_DOOR_M].tolist(), second.tolist(), strict=False):
+        touching = np.zeros(room.shape, np.bool_)  # cells of room a that have one of room b next to them
+        for here, there in _NEIGHBOURS:
+            touching[here] |= (room[here] == a) & (room[there] == b)
+            touching[there] |= (room[there] == a) & (room[here] == b)
+        count, parts = cv2.connectedComponents(touching.astype(np.uint8), connectivity=8)
         for part in range(1, count):
             row, column = np.unravel_index(int(np.where(parts == part, clearance, -1).argmax()), room.shape)
             width = 2 * float(clearance[row, column])
             if width >= LEAST_DOOR_M:
                 found.append(Passage((a, b), (int(row), int(column)), width))
     return tuple(found)
-
-
-def _touching(room: Int64, a: int, b: int) -> NDArray[np.bool_]:
-    """Cells (H, W) of room ``a`` that have one of room ``b`` next to them."""
-    adjacent = np.zeros(room.shape, np.bool_)
-    for here, there in _NEIGHBOURS:
-        adjacent[here] |= room[there] == b
-        adjacent[there] |= room[here] == b
-    return adjacent & (room == a)
