@@ -22,14 +22,8 @@ def write_eval_report(
 ) -> None:
     """Write the report of ``eval``.
 
-    Args:
-        path: Of the page.
-        summaries: Of replays, by name; ``folders`` are theirs, in this order.
-        logs: The table of each log that was scored.
-        found: All figures, as in the JSON file.
-
-    Raises:
-        ConfigError: it cannot be written.
+    ``folders`` are those of the ``summaries`` of replays, in order; ``logs`` has the table of each log that was scored,
+    ``found`` all figures, as in the JSON file. ConfigError where it cannot be written.
     """
     sections: list[Section] = []
     if summaries:

@@ -28,11 +28,7 @@ class RegisteredFrame:
 def follow_pose(before: UInt8, frame: RegisteredFrame, gray: UInt8, intrinsics: CameraIntrinsics) -> Float64 | None:
     """T_world_camera (4, 4) of a frame soon after a registered one; None where too few of its points are found again.
 
-    Args:
-        before: (H, W) picture of the registered frame.
-        frame: The registered frame.
-        gray: (H, W) picture of the other one.
-        intrinsics: Of both, with their distortion.
+    ``before`` and ``gray`` (H, W) are their pictures, ``intrinsics`` those of both, with distortion.
     """
     if len(frame.xy) < MIN_INLIERS:
         return None

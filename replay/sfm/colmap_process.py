@@ -360,9 +360,7 @@ def _verified(path: Path, camera: Camera) -> list[Pair]:
 def _turned(a: Float64, b: Float64, on: Bool, focals: Float64, limit_px: float) -> float:
     """Fraction of matches that a turn on the spot explains, with the best of some focal lengths.
 
-    Args:
-        a, b: (N, 2) pixels from the picture's centre, of both frames.
-        on: (N,) those to fit the turn to.
+    ``a`` and ``b`` (N, 2) are pixels from the picture's centre in both frames; the turn is fitted to those ``on`` (N,).
     """
     best = 0.0
     if on.sum() < 3:

@@ -30,13 +30,10 @@ def find_features(bgr: UInt8) -> tuple[Float32, UInt8]:
 
 
 def match_features(a: UInt8, b: UInt8) -> NDArray[np.uint32]:
-    """Rows (M, 2) of features that are each other's nearest, by angle, and clearly nearer than the second one.
+    """Rows (M, 2) of features (N, 128) that are each other's nearest, by angle, and clearly nearer than the second one.
 
     Every feature is compared with every other one: COLMAP's search through an index differs now and then between runs.
     Products of bytes are whole numbers below 2^24, so that the outcome is the same on any number of threads.
-
-    Args:
-        a, b: (N, 128) descriptors of two frames.
     """
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), np.uint32)

@@ -66,11 +66,8 @@ def refuse_features(film: object, features: Sequence[int]) -> None:
 def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spans: Sequence[Sequence[int]]) -> None:
     """Raises ImportSourceError for what structure from motion could not put together.
 
-    Args:
-        film: Its name.
-        outcome: Of the mapping.
-        times_s: Of the picked frames.
-        spans: Places in the sequence of the frames of each model of the best attempt, the largest first.
+    ``times_s`` are those of the picked frames, ``spans`` the places in the sequence of the frames of each model of the
+    best attempt, the largest first.
     """
     picks = len(times_s)
     complete = bool(spans) and len(spans[0]) >= LEAST_MODEL * picks
@@ -102,15 +99,7 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
 
 def focal_note(film: object, calibration: object, focal_px: float, check: FocalCheck) -> list[str]:
     """What is wrong with the focal length of a calibration; empty where nothing is, or the film does not tell.
-
-    Args:
-        film: Its name.
-        calibration: Its file.
-        focal_px: Given, in pixels of the film.
-        check: What the pictures say.
-
-    Raises:
-        ImportSourceError: it is far off.
+    ImportSourceError where it is far off. ``focal_px`` is given, in pixels of the film.
     """
     off = abs(check.factor - 1)
     if off < UNCERTAIN_FOCAL or check.sigmas < LEAST_SIGMAS:
@@ -128,10 +117,8 @@ def focal_note(film: object, calibration: object, focal_px: float, check: FocalC
 def baseline_notes(ahead: bool, angle_deg: float, focal_sigma: float | None) -> list[str]:
     """Notes on what a film tells badly, because its camera hardly moves sideways; none where it tells all.
 
-    Args:
-        ahead: The model begins with two frames that lie straight ahead of each other.
-        angle_deg: Between the rays to a point, the median.
-        focal_sigma: Standard deviation of the focal length that was found, as a fraction.
+    Of whether the model begins with two frames straight ahead of each other, the median angle between the rays to a
+    point, and the standard deviation of the focal length that was found, as a fraction.
     """
     notes: list[str] = []
     if ahead or angle_deg < SMALL_ANGLE_DEG:

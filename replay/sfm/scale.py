@@ -203,11 +203,9 @@ def marked_place(
     """Where in the world (3,) what a mark shows is: it is followed into the frames around, and triangulated.
 
     Args:
-        mark: The pixel.
         marked: Index of the frame that it is a pixel of; one without a pose will do.
         pictures: (H, W) gray pictures of this frame and of registered frames around it, by their index.
         poses: T_world_camera (4, 4) of registered frames, by their index.
-        intrinsics: Of all.
 
     Raises:
         ImportSourceError: it cannot be followed.
@@ -256,12 +254,7 @@ def vertical(
 
     An edge and its camera span a plane, in which the edge's direction lies. The direction is sought that lies in the
     planes of most edges, by their length.
-
-    Args:
-        edges: Of some frames, as ``find_edges`` gives them.
-        poses: T_world_camera of frames; edges of others do not count.
-        intrinsics: Of all frames, with distortion.
-        guess: (3,) rough up.
+    ``edges`` are those of some frames, ``poses`` T_world_camera of frames, and ``guess`` (3,) is a rough up.
     """
     K, lens = camera_matrix(intrinsics), np.array(intrinsics.distortion or (0.0,) * 4)
     normals: list[Float64] = []

@@ -122,10 +122,8 @@ def match_terms(swept: SweepResult, agreement: Agreement) -> Float32:
 def surface_terms(plane: Float32, smooth: Float32, sigma: Float32, agreement: Agreement, depth_m: Float32) -> Float32:
     """Terms (h, w, 6) that the logarithm of the spread of a surface is a sum of.
 
-    Args:
-        plane, smooth: (h, w) planes as matched, and of the surface that was laid through them.
-        sigma: (h, w) of what was matched.
-        depth_m: (h, w) of the surface.
+    ``plane`` and ``smooth`` are as matched, and of the surface that was laid through them; ``sigma`` is what matching
+    is unsure by, ``depth_m`` that of the surface.
     """
     around = cv2.blur(1 / sigma**2, (AROUND, AROUND)) ** -0.5
     return _stack(

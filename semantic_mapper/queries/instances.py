@@ -110,21 +110,12 @@ class InstanceTracker:
     A thing of which more than half was seen through since it was whole has gone (``gone``); what is left of it gets a
     new id. One that is only no longer found (its class or the map's poses have changed) has not gone.
 
-    Args:
-        stuff: Names of classes that are no things; by default ``labels.STUFF_NAMES``.
-        min_voxels: Smaller pieces are left out.
-        up: (3,) direction in the world along which boxes stand.
-
-    Raises:
-        MapError: ``min_voxels`` below 1, or ``up`` without a direction.
+    Pieces below ``min_voxels`` are left out; ``up`` (3,) is the direction in the world along which boxes stand.
     """
 
-    def __init__(
-        self, stuff: Collection[str] = STUFF_NAMES, min_voxels: int = MIN_VOXELS, up: ArrayLike = (0.0, 0.0, 1.0)
-    ) -> None:
+    def __init__(self, min_voxels: int = MIN_VOXELS, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
         if min_voxels < 1:
             raise MapError(f"min_voxels must be at least 1, got {min_voxels}")
-        self._stuff = frozenset(stuff)
         self._min_voxels = min_voxels
         self._up = check_up(up)
         self._next_id = 1
@@ -149,7 +140,7 @@ class InstanceTracker:
         """
         require_metres(snapshot.scale_known, "instances")
         wanted = np.zeros(256, np.bool_)
-        wanted[list(snapshot.label_set.thing_ids(self._stuff))] = True
+        wanted[list(snapshot.label_set.thing_ids(STUFF_NAMES))] = True
         with self._lock:
             voxels = thing_voxels(snapshot, wanted)
             found = find_components(voxels, self._min_voxels)

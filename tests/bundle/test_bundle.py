@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from semantic_mapper.bundle.keyframes import BundleProblem, adjust_bundle
-from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose, align_poses
+from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
-from semantic_mapper.geometry import invert_pose, project, rotation_vector
+from semantic_mapper.geometry import project
 from semantic_mapper.types import Float64, PosedFrame
 
 from .rooms import INTRINSICS, truth, walk
@@ -56,25 +56,6 @@ def test_disturbed_poses_come_nearer_to_the_truth_and_fit_the_pictures() -> None
     late = found[8:]
     assert np.mean([r.refined for r in late]) > 0.9
     assert np.median([r.error_px for r in late]) < 0.7 < np.median([r.given_error_px for r in late])
-
-
-def test_poses_are_aligned_by_the_mean_of_what_each_says(rng: np.random.Generator) -> None:
-    turn = np.eye(4)
-    turn[:3, :3], turn[:3, 3] = cv2.Rodrigues(np.array([0.3, -1.2, 0.4]))[0], (0.5, -2.0, 1.0)
-    T, scale = align_poses(truth(), turn @ truth())
-    assert np.allclose(T, turn, atol=1e-9) and scale == pytest.approx(1)
-    T, scale = align_poses(truth(), turn @ np.array([f.T_world_camera for f in disturbed()]))
-    assert scale == pytest.approx(1, abs=0.02)
-    off = T @ invert_pose(turn)
-    assert np.degrees(np.linalg.norm(rotation_vector(off))) < 0.25  # one pose: 0.9 in the mean
-    middle = (turn @ truth())[:, :3, 3].mean(axis=0)
-    assert np.linalg.norm(scale * T[:3, :3] @ truth()[:, :3, 3].mean(axis=0) + T[:3, 3] - middle) < 0.01
-    assert np.allclose(align_poses(truth()[:1], turn @ truth()[:1])[0], turn, atol=1e-9)
-    longer = truth()
-    longer[:, :3, 3] *= 1.06
-    assert align_poses(truth(), longer)[1] == pytest.approx(1.06, abs=1e-6)
-    longer[:, :3, 3] += rng.standard_normal((len(longer), 3))  # metres, where the path has one and a half
-    assert abs(align_poses(truth(), longer)[1] - 1) < 0.03
 
 
 def test_the_scale_becomes_sure_as_the_camera_moves_and_given_poses_are_exact() -> None:

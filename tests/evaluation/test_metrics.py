@@ -110,24 +110,17 @@ def test_calibration_error_is_the_distance_of_confidence_from_accuracy(rng: np.r
     assert scores.calibration_error == pytest.approx(expected, abs=0.01)
 
 
-def test_of_pixels_above_a_confidence_it_is_known_how_many_there_are_and_how_many_are_right():
-    confidence = np.array([0.95, 0.92, 0.99, 0.9, 0.2, 0.99], np.float32)
-    right = np.array([True, False, True, True, True, False])
+def test_confidence_tells_how_many_pixels_are_sure_and_right_and_apart_from_strange_ones():
     scores = ConfidenceScores()
-    scores.update(confidence, right, np.arange(6) == 5)
+    confidence = np.array([0.95, 0.92, 0.99, 0.9, 0.2, 0.99], np.float32)
+    scores.update(confidence, np.array([True, False, True, True, True, False]), np.arange(6) == 5)
     assert scores.above(0.9) == (3 / 5, 2 / 3)
     assert scores.above(0.995) == (0.0, None) and ConfidenceScores().above(0.9) == (None, None)
-
-
-def test_open_set_auroc_is_how_often_a_known_pixel_is_surer_than_a_strange_one():
-    confidence = np.array([0.9, 0.8, 0.4, 0.6, 0.3], np.float32)
-    strange = np.array([False, False, False, True, True])
-    scores = ConfidenceScores()
-    scores.update(confidence, np.ones(5, bool), strange)
-    assert scores.open_set_auroc == pytest.approx(5 / 6)  # 0.4 is below 0.6, all other pairs are in order
-    alike = ConfidenceScores()
-    alike.update(np.full(4, 0.5, np.float32), np.ones(4, bool), np.array([True, False, True, False]))
-    assert alike.open_set_auroc == 0.5
-    nothing = ConfidenceScores()
-    nothing.update(np.full(2, 0.5, np.float32), np.ones(2, bool), np.zeros(2, bool))
-    assert nothing.open_set_auroc is None and nothing.calibration_error is not None
+    for confidence, strange, auroc in (
+        ([0.9, 0.8, 0.4, 0.6, 0.3], [False, False, False, True, True], 5 / 6),  # 0.4 is below 0.6, others are in order
+        ([0.5] * 4, [True, False, True, False], 0.5),
+        ([0.5] * 2, [False] * 2, None),
+    ):
+        scores = ConfidenceScores()
+        scores.update(np.array(confidence, np.float32), np.ones(len(strange), bool), np.array(strange))
+        assert scores.open_set_auroc == (None if auroc is None else pytest.approx(auroc))

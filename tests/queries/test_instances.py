@@ -66,9 +66,7 @@ def test_table_and_cup_are_found_where_they_stand() -> None:
     assert np.abs(cup.voxels * 0.02 - BALL).max() < 0.26
 
 
-def test_stuff_and_small_pieces_are_left_out() -> None:
-    names = [thing.class_name for thing in InstanceTracker(stuff=("table",), min_voxels=200).update(whole())]
-    assert sorted(names) == ["cup", "floor"]
+def test_small_pieces_are_left_out() -> None:
     assert InstanceTracker(min_voxels=10**6).update(whole()) == ()
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +18,6 @@ from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def content(snapshot: MapSnapshot) -> dict[str, np.ndarray]:
@@ -145,18 +141,3 @@ def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path) -> No
     assert [getattr(a, name) for name in names] == [getattr(b, name) for name in names]
     np.testing.assert_array_equal(a.versions, b.versions)
     assert loaded.is_whole
-
-
-def test_a_mirror_needs_no_open3d() -> None:
-    program = (
-        "import sys, numpy as np\n"
-        "from tests.queries.scene import LABELS, TABLE, painted\n"
-        "from semantic_mapper.queries.surface import points_in_box\n"
-        "from semantic_mapper.queries.instances import InstanceTracker\n"
-        "from semantic_mapper.queries.snapshot import MapMirror\n"
-        "snapshot = MapMirror(0.02, 4.0, LABELS).apply(painted(np.full((8, 8), TABLE, np.uint8), 0, 1))\n"
-        "print(len(points_in_box(snapshot, (-1, -1, -1), (1, 1, 1)).xyz), len(InstanceTracker().update(snapshot)))\n"
-        "print('open3d' in sys.modules)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.stdout.split() == ["64", "1", "False"], done.stderr

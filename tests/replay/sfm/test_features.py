@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.replay.sfm.features import find_features, loop_pairs, match_features
+from semantic_mapper.replay.sfm.features import find_features, loop_pairs
 from semantic_mapper.types import UInt8
 
 
@@ -27,20 +27,3 @@ def test_frames_of_one_place_are_paired_across_the_film(rng: np.random.Generator
     assert {(3, 10), (4, 11)} <= set(pairs) and all(j - i > 2 for i, j in pairs)
     assert pairs == loop_pairs(frames, window=2, seed=1)
     assert loop_pairs([np.zeros((0, 128), np.uint8)] * 5, window=2, seed=1) == []
-
-
-def test_features_that_are_clearly_each_others_nearest_are_matched() -> None:
-    rng = np.random.default_rng(3)
-
-    def bytes_of(rows: np.ndarray) -> np.ndarray:
-        rows = np.abs(rows)
-        return np.round(512 * rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.uint8)
-
-    things = rng.normal(size=(40, 128))
-    order = rng.permutation(40)
-    a, b = bytes_of(things), bytes_of(things[order] + 0.05 * rng.normal(size=(40, 128)))
-    b = np.concatenate((b, b[:1]))  # of this one there are two: neither is clearly the nearest
-    found = match_features(a, b)
-    assert found.dtype == np.uint32 and len(found) == 39
-    assert all(order[j] == i for i, j in found) and order[0] not in found[:, 0]
-    assert len(match_features(a, b[:1])) == len(match_features(a[:0], b)) == 0

@@ -11,7 +11,6 @@ from semantic_mapper.replay.sfm.film import FilmLook
 from semantic_mapper.replay.sfm.refusals import (
     baseline_notes,
     focal_note,
-    refuse_features,
     refuse_look,
     refuse_outcome,
 )
@@ -35,12 +34,6 @@ def look_of(motion: float, count: int = 60, dark: float = 0.0) -> FilmLook:
 def test_the_first_look_refuses(look: FilmLook, picks: int, says: str) -> None:
     with pytest.raises(ImportSourceError, match=says):
         refuse_look("film.mp4", look, picks)
-
-
-def test_frames_without_features_are_refused() -> None:
-    refuse_features("film.mp4", [500] * 9)
-    with pytest.raises(ImportSourceError, match="blurred"):
-        refuse_features("film.mp4", [10] * 9)
 
 
 TIMES = [0.5 * n for n in range(20)]

@@ -17,7 +17,6 @@ from semantic_mapper.replay.sfm.scale import (
     marked_place,
     parse_distance,
     scene_depth,
-    upright,
     vertical,
 )
 from semantic_mapper.transport.messages import StreamInfo
@@ -32,15 +31,6 @@ def test_marked_distances_are_read() -> None:
     for text in ("", "3:1,2 0.9", "3:1,2 4:1,2 0", "3:1,2 4:1,2 -1", "a:1,2 4:1,2 1"):
         with pytest.raises(ConfigError, match="marks no distance"):
             parse_distance(text)
-
-
-def test_a_world_is_turned_upright_about_the_first_camera() -> None:
-    T = look_at(np.array((3.0, 2.0, 1.5)), np.array((4.0, 5.0, 1.0)), UP)
-    askew = look_at(np.array((1.0, -2.0, 0.5)), np.array((0.0, 0.0, 0.0)), UP)
-    moved = upright(askew @ T, askew[:3, :3] @ UP) @ askew @ T
-    ahead = T[:3, 2]
-    assert np.allclose(moved[:3, 3], 0, atol=1e-9) and moved[2, 2] == pytest.approx(ahead[2])
-    assert moved[1, 2] == pytest.approx(0, abs=1e-9) and moved[0, 2] > 0
 
 
 def test_the_floor_is_the_lowest_strong_layer(rng: np.random.Generator) -> None:
