@@ -246,11 +246,15 @@ def _adjustment(**options: bool) -> Any:
     return found
 
 
+def _bundle(model: Any, **options: bool) -> None:
+    pycolmap.bundle_adjustment(model, _adjustment(**options))
+    model.update_point_3d_errors()
+
+
 def _freed(folder: Path, held: Model, prior: float) -> Model:
     """A model, adjusted with a free focal length; as it was where that runs away from the known one."""
     model = pycolmap.Reconstruction(folder / held.folder)
-    pycolmap.bundle_adjustment(model, _adjustment())
-    model.update_point_3d_errors()
+    _bundle(model)
     freed = _figures(held.folder, model)
     if abs(freed.focal_px / prior - 1) > MAX_FOCAL_CHANGE:
         return held
@@ -266,8 +270,7 @@ def _check_focal(folder: Path) -> FocalCheck:
     model = pycolmap.Reconstruction(folder)
     errors, focal = list[float](), list[float]()
     for free in (False, True):
-        pycolmap.bundle_adjustment(model, _adjustment(refine_extra_params=False, refine_focal_length=free))
-        model.update_point_3d_errors()
+        _bundle(model, refine_extra_params=False, refine_focal_length=free)
         errors.append(_squared_px(model))
         focal.append(_focal_px(model))
     if errors[1] <= 0:

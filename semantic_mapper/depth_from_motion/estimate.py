@@ -66,10 +66,10 @@ def estimate_depth(
     depth = (1 / (first + swept.plane * step)).astype(np.float32)
     agreement = find_agreement(reference, depth, neighbours)
     plane = ((1 / agreement.mean_m - first) / step).astype(np.float32)
-    matched = _spread(match_terms(swept, agreement), MATCHED)
+    matched = _spread_of_match(swept, agreement)
     surface = np.clip(smooth_planes(plane, matched, reference.rgb), 0, config.planes - 1)
     depth = (1 / (first + surface * step)).astype(np.float32)
-    sigma = _spread(surface_terms(plane, surface, matched, agreement, depth), SMOOTHED)
+    sigma = _spread_of_surface(plane, surface, matched, agreement, depth)
     return DepthEstimate(depth, (depth**2 * step * sigma).astype(np.float32))
 
 
@@ -106,42 +106,27 @@ def _ties(one: UInt8, other: UInt8) -> Float32:
     return (TIE * np.maximum(np.exp(-step / COLOUR_SCALE), LEAST_TIE)).astype(np.float32)
 
 
-def match_terms(swept: SweepResult, agreement: Agreement) -> Float32:
-    """Terms (h, w, 6) that the logarithm of the spread of what was matched is a sum of."""
+def _spread_of_match(swept: SweepResult, agreement: Agreement) -> Float32:
+    """Spread (h, w) of what was matched, in planes."""
     agree, visible = agreement.agree.astype(np.float32), agreement.visible.astype(np.float32)
-    return _stack(
-        np.ones_like(agree),
-        np.log(swept.confidence + 0.02),
-        np.log1p(agree),
-        (visible - agree) / 6,
-        (swept.seen < 2).astype(np.float32),
-        np.log(agreement.mean_m),
-    )
+    unsure, alone = (visible - agree) / 6, (swept.seen < 2).astype(np.float32)
+    terms = np.log(swept.confidence + 0.02), np.log1p(agree), unsure, alone, np.log(agreement.mean_m)
+    return _spread(MATCHED, *terms)
 
 
-def surface_terms(plane: Float32, smooth: Float32, sigma: Float32, agreement: Agreement, depth_m: Float32) -> Float32:
-    """Terms (h, w, 6) that the logarithm of the spread of a surface is a sum of.
-
-    ``plane`` and ``smooth`` are as matched, and of the surface that was laid through them; ``sigma`` is what matching
-    is unsure by, ``depth_m`` that of the surface.
-    """
+def _spread_of_surface(
+    plane: Float32, surface: Float32, sigma: Float32, agreement: Agreement, depth_m: Float32
+) -> Float32:
+    """Spread (h, w) in planes of a surface of this depth, laid through planes that were matched with their spread."""
     around = cv2.blur(1 / sigma**2, (AROUND, AROUND)) ** -0.5
-    return _stack(
-        np.ones_like(sigma),
-        np.log(sigma),
-        np.log(around),
-        np.log(np.abs(plane - smooth) + 0.1),
-        np.log1p(agreement.agree.astype(np.float32)),
-        np.log(depth_m),
-    )
+    agree, off = np.log1p(agreement.agree.astype(np.float32)), np.log(np.abs(plane - surface) + 0.1)
+    return _spread(SMOOTHED, np.log(sigma), np.log(around), off, agree, np.log(depth_m))
 
 
-def _stack(*terms: NDArray[np.floating]) -> Float32:
-    return np.stack(terms, axis=-1).astype(np.float32, copy=False)
-
-
-def _spread(terms: Float32, factors: tuple[float, ...]) -> Float32:
-    return np.clip(np.exp(terms @ np.array(factors, np.float32)), LEAST, MOST).astype(np.float32)
+def _spread(factors: tuple[float, ...], *terms: NDArray[np.floating]) -> Float32:
+    """The exponential (h, w) of the sum of terms, of which the first is 1, times their factors."""
+    stacked = np.stack((np.ones_like(terms[0]), *terms), axis=-1).astype(np.float32, copy=False)
+    return np.clip(np.exp(stacked @ np.array(factors, np.float32)), LEAST, MOST).astype(np.float32)
 
 
 @parallel_kernel()
