@@ -218,15 +218,9 @@ def guess_intrinsics(width: int, height: int) -> CameraIntrinsics:
 
 
 class Rectifier:
-    """Makes the RGB image of an ideal pinhole camera of what a lens gives.
+    """Makes the RGB image of an ideal pinhole camera of what a lens gives; ``ConfigError`` where there is none.
 
     The image keeps its size; its edges are cut so far that no pixel is made up.
-
-    Args:
-        measured: Of the camera with its lens.
-
-    Raises:
-        ConfigError: the distortion leaves no image that a pinhole camera could have made.
     """
 
     def __init__(self, measured: CameraIntrinsics) -> None:

@@ -73,11 +73,7 @@ def _plain(model: str) -> str:
 
 
 def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
-    """The pinhole camera of the same size whose image a fisheye's fills: square pixels, no wider than the lens sees.
-
-    Raises:
-        ConfigError: the coefficients leave no such image.
-    """
+    """The pinhole camera of the same size whose image a fisheye's fills: square pixels, no wider than the lens sees."""
     distance = _THETAS * (1 + np.polynomial.polynomial.polyval(_THETAS**2, (0.0, *lens.distortion)))
     rising = int(np.argmax(np.diff(distance, append=-1.0) <= 0)) + 1  # beyond its fold a polynomial means nothing
 
@@ -107,11 +103,8 @@ def _usable(lens: CameraIntrinsics, fx: float, fy: float, cx: float, cy: float) 
 
 
 def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float32, Float32]:
-    """The ideal pinhole camera of a lens, and where each of its pixels lies in the image of the lens: (H, W) x and y.
-
-    Raises:
-        ConfigError: the lens leaves no image that a pinhole camera could have made.
-    """
+    """The ideal pinhole camera of a lens (``ConfigError``: there is none), and where each of its pixels lies in the image
+    of the lens: (H, W) x and y."""
     K, lens = camera_matrix(measured), np.array(measured.distortion, np.float64)
     size = (measured.width, measured.height)
     if isinstance(measured, FisheyeIntrinsics):

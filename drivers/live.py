@@ -197,12 +197,9 @@ class CaptureDevice(Device):
     Args:
         camera_id: What its images are called.
         source: For people: model and address.
-        capture: Open, of the size that it will have.
+        capture: Open; ``CameraError``: it gives no images, or of another size than was calibrated.
         measured: Its calibration; None: guessed, said in ``warnings``.
         metadata: For ``info``.
-
-    Raises:
-        CameraError: it gives no images, or of another size than was calibrated.
     """
 
     def __init__(
@@ -222,11 +219,12 @@ class CaptureDevice(Device):
             capture.release()
             raise CameraError(f"{source}: holds no video that OpenCV can read; is it complete, and its codec common?")
         measured = measured or guess_intrinsics(*size)
-        if size != (measured.width, measured.height):
+        width, height = measured.width, measured.height
+        if size != (width, height):
             capture.release()
             raise CameraError(
-                f"{source}: gives images of {size[0]}x{size[1]}, but was calibrated at "
-                f"{measured.width}x{measured.height}; calibrate for a size that it offers"
+                f"{source}: gives images of {size[0]}x{size[1]}, but was calibrated at {width}x{height}; calibrate for a "
+                "size that it offers"
             )
         self._rectify = Rectifier(measured)
         hz = nominal_hz(self.get(cv2.CAP_PROP_FPS))

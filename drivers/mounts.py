@@ -25,9 +25,7 @@ def mount_for(
         kind: Of the camera; ``config``: its driver's settings, which may name a calibration file.
         camera: For messages.
 
-    Raises:
-        ConfigError: it is needed and not known, requested and without effect, no rigid transform, or the file cannot be
-            read.
+    ``ConfigError``: it is needed and not known, requested and without effect, or no rigid transform.
     """
     if not poses_of_rig(poses):
         if rows is None:

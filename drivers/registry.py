@@ -66,9 +66,7 @@ def open_camera(kind: str, config: Mapping[str, Any], camera_id: str, where: str
         where: The config comes from, for messages.
 
     Raises:
-        ConfigError: no such kind, an unknown key (with the nearest valid one), a value of the wrong type.
-        CameraError: the driver cannot work with this config.
-        DependencyError: the kind needs something that is not installed.
+        ConfigError, CameraError, DependencyError: a bad setting, one that cannot work, or something is not installed.
     """
     driver = load_driver(kind)
     return driver.open_camera(convert_config(dict(config), driver.Config, where), camera_id)

@@ -53,16 +53,13 @@ class Calibration:
 def solve(
     gathered: Mapping[str, ViewGatherer], known: Collection[str], config: CalibrationConfig, *, rig: bool
 ) -> Calibration:
-    """Calibrate.
+    """Calibrate cameras, the first one of which is where the rig is; ``rig``: also find where they sit on it.
 
     Args:
-        gathered: By camera; the first one is where the rig is.
+        gathered: By camera.
         known: Cameras whose intrinsics are right as their source gives them.
-        config: What a result has to be like.
-        rig: Also find where the cameras sit relative to each other.
-
-    Raises:
-        CameraError: one of them cannot be calibrated; says why and what to do.
+        config: What a result has to be like; ``CameraError`` says why one is not, and what to do.
+        rig: See above.
     """
     cameras: dict[str, CameraCalibration] = {}
     for name, views in gathered.items():
@@ -101,13 +98,8 @@ def calibrate_rig(
 ) -> RigCalibration:
     """At least two cameras and all boards fitted at once (bundle adjustment with the intrinsics as they are).
 
-    Args:
-        cameras: By name.
-        instants: See ``views.simultaneous``.
-        config: What a result has to be like.
-
-    Raises:
-        CameraError: cameras that hardly see the board at once, or views that do not fit each other.
+    ``instants`` as of ``views.simultaneous``. ``CameraError``: cameras that hardly see the board at once, or views
+    that do not fit each other.
     """
     names, lenses = list(cameras), list(cameras.values())
     sights = _sights(names, lenses, instants)

@@ -43,15 +43,11 @@ class BoardView:
 class ViewGatherer:
     """Takes the images of one camera and keeps what calibration needs of them.
 
-    Args:
-        board: To look for.
-        config: What makes a view worth keeping.
-        stream: Images follow each other closely: those that moved since the one before are left out.
+    With ``stream`` images follow each other closely: those that moved since the one before are left out.
 
     Attributes:
         images: How many were looked at; ``seen``: in how many the board was.
-        kept: Views for the intrinsics, each unlike the others.
-        steady: All views in which the board stood still.
+        kept: Views for the intrinsics, each unlike the others; ``steady``: all in which the board stood still.
         size: (width, height) of the images; intrinsics: what the source says of them. None before the first.
     """
 
@@ -100,13 +96,10 @@ class ViewGatherer:
         if len(self.kept) >= MAX_VIEWS:
             return False
         found = _signature(view, size)
-        if found is None:
+        if found is None or any(np.linalg.norm(found[0] - other) < NEW for other in self._signatures):
             return False
-        signature, tilt = found
-        if any(np.linalg.norm(signature - other) < NEW for other in self._signatures):
-            return False
-        self._signatures.append(signature)
-        self._tilts.append(tilt)
+        self._signatures.append(found[0])
+        self._tilts.append(found[1])
         self.kept.append(view)
         return True
 
@@ -154,11 +147,7 @@ def shortfalls(
 ) -> tuple[str, ...]:
     """What ``views`` views lack for a calibration that can be believed, as sentences that say what to do.
 
-    Args:
-        config: What is requested.
-        views: How many there are.
-        counts: See ``area_counts``.
-        tilts: (N, 2) degrees; None where they are not known yet.
+    ``counts`` are those of ``area_counts``; ``tilts`` (N, 2) degrees, None where they are not known yet.
     """
     lacks: list[str] = []
     if views < config.min_views:

@@ -31,13 +31,7 @@ ALIGNED_PX = 1.0  # within which intrinsics of depth and colour are the same
 
 
 def open_camera(config: Config, camera_id: str, connect: Callable[[Config], Sources] = connect_device) -> LiveCamera:
-    """The camera of a config, opened when it is entered; see ``drivers/registry.py``. One process a camera.
-
-    Args:
-        config: What to open, and how.
-        camera_id: Name in the images.
-        connect: Gives the sources of each connection; the device's, but for tests.
-    """
+    """The camera of a config, opened when it is entered. ``connect`` gives the sources of each connection."""
     known = config
 
     def open_device(stopping: threading.Event) -> OakDevice:
@@ -156,8 +150,7 @@ class OakDevice(Device):
 def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> CameraIntrinsics:
     """Intrinsics of an undistorted image, from a ``dai.CalibrationHandler``; what does not fit the ratio is cropped.
 
-    Raises:
-        CameraError: the calibration knows no such camera, or does not fit the image.
+    ``CameraError``: the calibration knows no such camera, or does not fit the image.
     """
     dai = load_depthai()
     try:

@@ -70,11 +70,7 @@ class Sources:
 
 
 def connect_device(config: Config) -> Sources:
-    """Open the device and build its part of the pipeline.
-
-    Raises:
-        CameraError: no such device, or it cannot do what the config asks for.
-    """
+    """Open the device and build its part of the pipeline; ``CameraError``: there is none, or it cannot do that."""
     dai = load_depthai()
     info = find_device(config.device, SEARCH_S)
     name = f"the OAK {info.getDeviceId()} ({info.name})"
@@ -95,11 +91,7 @@ def connect_device(config: Config) -> Sources:
 
 
 def load_calibration(device: Any, path: str) -> Any:
-    """The ``dai.CalibrationHandler`` of a file, or of the device where ``path`` is empty.
-
-    Raises:
-        CameraError: no such file, or none of DepthAI's.
-    """
+    """The ``dai.CalibrationHandler`` of a file (``CameraError``: it is none), or of the device where there is none."""
     if not path:
         return device.readCalibration()
     try:
@@ -109,11 +101,7 @@ def load_calibration(device: Any, path: str) -> Any:
 
 
 def rgb_to_left(calibration: Any, config: Config) -> Float64:
-    """``T_left_rgb`` (4, 4) in metres, of a ``dai.CalibrationHandler``.
-
-    Raises:
-        CameraError: the calibration does not link the two cameras.
-    """
+    """``T_left_rgb`` (4, 4) in metres, of a ``dai.CalibrationHandler``; ``CameraError`` where it links them not."""
     dai = load_depthai()
     rgb, left = (getattr(dai.CameraBoardSocket, socket) for socket in (config.rgb, config.left))
     if rgb == left:
@@ -222,14 +210,8 @@ def _odometry(pipeline: Any, left: Any, right: Any, T_left_rgb: Float64) -> Odom
 
 
 def synced_queue(pipeline: Any, outputs: Mapping[str, Any], within_s: float, size: int) -> Any:
-    """Queue of groups (``dai.MessageGroup``) of messages of one moment, by the names of their outputs.
-
-    Args:
-        pipeline: ``dai.Pipeline``.
-        outputs: ``dai.Node.Output`` by name.
-        within_s: How far the stamps of a group may lie apart; what has no partner is left out.
-        size: Groups that wait; the oldest gives way.
-    """
+    """Queue of up to ``size`` groups (``dai.MessageGroup``) of messages by the names of their ``dai.Node.Output``, with
+    stamps so far apart at most; what has no partner is left out, and the oldest group gives way."""
     sync = pipeline.create(load_depthai().node.Sync)
     sync.setRunOnHost(True)
     sync.setSyncThreshold(timedelta(seconds=within_s))

@@ -54,10 +54,7 @@ def find_device(address: str, search_s: float) -> Any:
 
     Args:
         address: Id, IP address or USB path; empty for the only one that is connected.
-        search_s: How long to look.
-
-    Raises:
-        CameraError: there is no device, several where one should be, or another process has it; and how to fix it.
+        search_s: How long to look; then ``CameraError`` says how to fix it.
     """
     deadline = time.monotonic() + search_s
     while True:
@@ -74,12 +71,7 @@ def find_device(address: str, search_s: float) -> Any:
 
 
 def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> str:
-    """Why no OAK can be found, as far as this machine knows, and how to fix it.
-
-    Args:
-        address: What was looked for; empty = any.
-        sysfs, nodes: Where the kernel lists USB devices, and their device files.
-    """
+    """Why no OAK (of this address; empty = any) can be found, as far as this machine knows, and how to fix it."""
     if _IP.match(address):
         return (
             f"no OAK answers at {address}: check that it has power (its switch port or injector must give PoE), that "

@@ -11,14 +11,13 @@ import time
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.base import PoseEstimate
 from semantic_mapper.drivers.live import SLICE_S
 from semantic_mapper.drivers.oak.device import OdometryPorts, capture_ns, clock_offset_ns, synced_queue, take
 from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, PoseError
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.geometry import check_pose, pose_matrix
 from semantic_mapper.types import Float64
 
 ANSWER_S = 2.0  # a pair without a pose for so long will have none
@@ -30,21 +29,13 @@ T_BODY_LEFT: Float64 = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0,
 
 
 def basalt_pose(position: tuple[float, float, float], quaternion: tuple[float, float, float, float]) -> Float64:
-    """Pose (4, 4) of the left camera, from what Basalt says of its body.
+    """Pose (4, 4) of the left camera, from what Basalt says of its body: metres, and a quaternion x, y, z, w.
 
-    Args:
-        position: Metres.
-        quaternion: x, y, z, w.
-
-    Raises:
-        PoseError: no rotation, or no finite numbers: it has lost track.
+    ``PoseError``: no rotation, or no finite numbers: it has lost track.
     """
     if not np.isfinite((*position, *quaternion)).all() or not np.linalg.norm(quaternion) > 0.5:
         raise PoseError(f"odometry gave no pose: position {position}, quaternion {quaternion}")
-    T_world_body = np.eye(4)
-    T_world_body[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    T_world_body[:3, 3] = position
-    return T_world_body @ T_BODY_LEFT
+    return pose_matrix(np.array(position), np.array(quaternion)) @ T_BODY_LEFT
 
 
 class Odometry:
@@ -55,11 +46,7 @@ class Odometry:
         ports: Of the odometry node.
         fps: Rate of the pairs.
 
-    Attributes:
-        trouble: What does not work now; empty when all is well.
-
-    Raises:
-        PoseError: the extrinsics are no rigid transform.
+    ``trouble`` says what does not work now. ``PoseError``: the extrinsics are no rigid transform.
     """
 
     def __init__(self, pipeline: Any, ports: OdometryPorts, fps: float) -> None:

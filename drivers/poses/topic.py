@@ -41,13 +41,7 @@ class TopicPoseSource(PoseSource):
     """Listens to a publisher of ``pose_message`` and interpolates to the stamps of images.
 
     A thread takes messages as they come. ``pose`` waits up to ``wait_s`` for one at or after the image's stamp.
-
-    Args:
-        config: Where to listen, what to expect, where the cameras sit.
-        wait_s: See above.
-
-    Raises:
-        CameraError: not an endpoint; one of another machine, and there is no `server`; or there are no keys.
+    ``CameraError``: not an endpoint; one of another machine, and there is no `server`; or there are no keys.
 
     Attributes:
         counters: Messages ("messages"), those that were no pose ("rejected"), of a moment that has not come

@@ -207,11 +207,7 @@ class _Place:
 
 class VisualOdometry:
     """Follows one camera. The world begins at the first of the two views that begin it, and its unit is the median
-    depth of what they see, until ``rescale`` sets another.
-
-    Args:
-        intrinsics: Of the images, rectified.
-        counters: Where images are counted: see ``VisualPoseSource``.
+    depth of what they see, until ``rescale`` sets another. ``counters`` are those of ``VisualPoseSource``.
 
     Attributes:
         keyframe_added: Whether the last image became a keyframe.

@@ -28,13 +28,7 @@ _SLOW_USB = ("1.", "2.")
 
 
 def open_camera(config: Config, camera_id: str, find: Callable[[str, float], Any] = find_device) -> LiveCamera:
-    """The camera of a config, opened when it is entered; see ``drivers/registry.py``.
-
-    Args:
-        config: What to open, and how.
-        camera_id: Name in the images.
-        find: Gives the SDK's device by serial number within a time; but for tests, one that is connected.
-    """
+    """The camera of a config, opened when it is entered. ``find`` gives the SDK's device by serial number."""
     serial = config.device
 
     def open_device(stopping: threading.Event) -> RealSenseDevice:
@@ -173,15 +167,8 @@ class RealSenseDevice(Device):
 
 
 def read_intrinsics(reported: Any) -> CameraIntrinsics:
-    """Intrinsics that the device reports, with OpenCV's coefficients for whatever lens model it has.
-
-    Args:
-        reported: The SDK's ``intrinsics``. Its models are fitted by their own rays, since one of them is the inverse of
-            OpenCV's.
-
-    Raises:
-        CameraError: they are impossible, or no five coefficients fit.
-    """
+    """Of the SDK's ``intrinsics``, with OpenCV's coefficients for whatever lens model it has, each fitted by its own rays,
+    since one of them is the inverse of OpenCV's. ``CameraError``: impossible ones, or no five coefficients fit."""
     lens: tuple[float, ...] = ()
     if any(reported.coeffs) and reported.model != load_realsense().distortion.none:
         lens = _fit_lens(reported)

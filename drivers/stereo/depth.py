@@ -26,12 +26,7 @@ LEAST_OVERLAP = 0.5  # of the width may be lost to rectification
 
 
 class StereoDepth:
-    """Makes rectified images and depth of pairs.
-
-    Args:
-        pair: Its calibration.
-        width: Of the images that come out, pixels; at most that of the camera's.
-        min_depth_m, max_depth_m: Beyond there is no depth.
+    """Makes rectified images, at most ``width`` pixels wide, and depth of pairs.
 
     Attributes:
         intrinsics: Of the rectified left camera.

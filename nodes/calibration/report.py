@@ -56,14 +56,8 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
 def write_stereo(out: Path, name: str, found: Calibration, settings: CalibrationSettings) -> list[Path]:
     """One TOML file of both cameras of a pair, and a picture of each; returns their paths.
 
-    Args:
-        out: Folder.
-        name: Of the pair.
-        found: Cameras left and right, named by the half of the image, with their rig, which tells whose half is which.
-        settings: Of the calibration.
-
-    Raises:
-        ConfigError: a file cannot be written; it is as it was.
+    Cameras are named by the half of the image; their rig tells whose half is which. ``ConfigError``: a file cannot be
+    written; it is as it was.
     """
     assert found.rig is not None
     left, right = (found.cameras[side] for side in SIDES)
@@ -117,7 +111,7 @@ def _explained(path: Path) -> Iterator[None]:
         raise ConfigError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error
 
 
-def report(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int) -> Iterator[Any]:
+def tables(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int) -> Iterator[Any]:
     """Tables for people; so many of the worst views are named."""
     for name, camera in found.cameras.items():
         yield _camera_table(name, camera, gathered[name], worst)
@@ -164,7 +158,7 @@ def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, wor
     return table
 
 
-def report_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: list[Path]) -> dict[str, Any]:
+def as_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: list[Path]) -> dict[str, Any]:
     """The same for programs."""
     cameras, rig = {}, None
     for name, camera in found.cameras.items():

@@ -53,11 +53,7 @@ class Source:
 
 
 def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
-    """Sources as ``[NAME=]PLACE``, see ``calibrate``.
-
-    Args:
-        texts: Of the command line.
-        size: "WIDTHxHEIGHT" to ask of V4L2 cameras; empty = as they are.
+    """Sources as ``[NAME=]PLACE``, see ``calibrate``; ``size`` as "WIDTHxHEIGHT" to ask of V4L2 cameras, or empty.
 
     Raises:
         ConfigError: not a place, no name for a camera, or two cameras of one name.
@@ -82,22 +78,17 @@ def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
     return found
 
 
-def parse_stereo(texts: Sequence[str], size: str) -> tuple[str, Source]:
+def parse_stereo(texts: Sequence[str], size: str) -> tuple[str, list[Source]]:
     """A stereo pair that gives both images side by side, as ``[NAME=]PLACE``: its name, and its halves as two cameras.
 
-    Args:
-        texts: Of the command line.
-        size: "WIDTHxHEIGHT" of both together, to ask of V4L2 cameras; empty = as they are.
-
-    Raises:
-        ConfigError: more than one, or not a place.
-        CameraError, DependencyError: a camera that cannot be opened.
+    As of ``parse_sources``, with the ``size`` of both together; ``ConfigError`` for more than one source.
     """
     if len(texts) != 1:
         raise ConfigError("--stereo calibrates one device that gives both images side by side; name one")
     name, _ = _split(texts[0], alone=True)
     (source,) = parse_sources(texts, size)
-    return ("stereo" if name == "camera" else name), replace(source, images=partial(_halves, source), known=False)
+    pair = replace(source, images=partial(_halves, source), known=False)
+    return "stereo" if name == "camera" else name, [pair]
 
 
 def _split(text: str, *, alone: bool) -> tuple[str, str]:

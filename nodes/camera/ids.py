@@ -11,13 +11,7 @@ from semantic_mapper.replay.log.sequence import open_log
 
 
 def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions], where: str) -> None:
-    """Raise ``ConfigError`` for frames of one name from two cameras at one node.
-
-    Args:
-        reader: Name of the node.
-        cameras: Those whose frames it takes, by node name.
-        where: For messages.
-    """
+    """Raise ``ConfigError`` for frames of one name from two cameras, by node name, that node ``reader`` takes."""
     if len(cameras) < 2:
         return
     taken: dict[str, str] = {}

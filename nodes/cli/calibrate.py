@@ -12,14 +12,8 @@ from semantic_mapper.config import load_config
 from semantic_mapper.drivers.calibrating.rig import solve
 from semantic_mapper.drivers.poses.board import sheet_png
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.calibration.report import (
-    CalibrationSettings,
-    report,
-    report_json,
-    write_files,
-    write_stereo,
-    write_whole,
-)
+from semantic_mapper.nodes.calibration import report
+from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources, parse_stereo
 from semantic_mapper.nodes.cli.verb import JsonOutput, verb
 from semantic_mapper.nodes.console import Output
@@ -65,12 +59,7 @@ def calibrate(
         raise typer.BadParameter("name a camera, video, log or folder; or --board FILE.png to print a board")
     with folder_for_results(out):
         gathered = Gathering(settings.board, settings.calibration)
-        name, places = "", []
-        if stereo:
-            name, pair = parse_stereo(sources, size)
-            places.append(pair)
-        else:
-            places += parse_sources(sources, size)
+        name, places = parse_stereo(sources, size) if stereo else ("", parse_sources(sources, size))
         with StopRequest() as stop:
             gathered.run(places, stop, seconds, rig=stereo or len(places) > 1)
         rig = len(gathered.cameras) > 1
@@ -79,10 +68,10 @@ def calibrate(
             names = ", ".join(keep) or "none"
             raise ConfigError(f"{names}: calibrated by its maker already; name several cameras to find where they sit")
         found = solve(gathered.cameras, keep, settings.calibration, rig=rig)
-        files = write_stereo(out, name, found, settings) if stereo else write_files(out, found, settings)
-    for part in (*report(found, gathered.cameras, _WORST), *files):
+        files = report.write_stereo(out, name, found, settings) if stereo else report.write_files(out, found, settings)
+    for part in (*report.tables(found, gathered.cameras, _WORST), *files):
         output.print(part)
-    output.json(report_json(found, gathered.cameras, files))
+    output.json(report.as_json(found, gathered.cameras, files))
 
 
 def board_settings(path: Path | None, square_mm: float) -> CalibrationSettings:
@@ -101,7 +90,7 @@ def _draw_board(output: Output, settings: CalibrationSettings, path: Path) -> No
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: the board is written as a PNG picture; give a name that ends with .png")
     prepare_file(path)
-    write_whole(path, sheet_png(settings.board))
+    report.write_whole(path, sheet_png(settings.board))
     b = settings.board
     output.print(
         f"{path}: {b.columns} x {b.rows} squares of {1000 * b.square_m:g} mm; print it at 100 %, on "

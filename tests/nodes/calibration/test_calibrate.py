@@ -16,7 +16,7 @@ from semantic_mapper.drivers.calibration import load_calibration, load_mount, lo
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.nodes.calibration.report import CalibrationSettings, report, report_json, write_files
+from semantic_mapper.nodes.calibration.report import CalibrationSettings, as_json, tables, write_files
 from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources, parse_stereo
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.format import LogWriter
@@ -73,9 +73,9 @@ def test_a_rig_is_written_into_the_files_of_its_cameras(pictures: Path, tmp_path
     assert found.rig is not None
     np.testing.assert_array_equal(mount, found.rig.cameras["right"].T_rig_camera)
     assert load_calibration(tmp_path / "left.toml") == found.cameras["left"].intrinsics
-    told = report_json(found, gathered.cameras, files)
+    told = as_json(found, gathered.cameras, files)
     assert json.loads(json.dumps(told)) == told and told["rig"]["cameras"]["left"]["moments"] > 8
-    assert len(list(report(found, gathered.cameras, 3))) == 3
+    assert len(list(tables(found, gathered.cameras, 3))) == 3
 
 
 def test_a_log_names_its_cameras_itself(tmp_path: Path) -> None:
