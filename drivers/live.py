@@ -223,8 +223,8 @@ class CaptureDevice(Device):
         if size != (width, height):
             capture.release()
             raise CameraError(
-                f"{source}: gives images of {size[0]}x{size[1]}, but was calibrated at {width}x{height}; calibrate for a "
-                "size that it offers"
+                f"{source}: gives images of {size[0]}x{size[1]}, but was calibrated at {width}x{height}; calibrate for "
+                "a size that it offers"
             )
         self._rectify = Rectifier(measured)
         hz = nominal_hz(self.get(cv2.CAP_PROP_FPS))

@@ -1,6 +1,8 @@
 """Kinds of cameras by name. Each is a package ``drivers.<kind>`` that is loaded when it is requested.
 
-A package offers ``Config``, ``open_camera(config, camera_id)`` and ``list_devices()``; see ``Driver``.
+A package offers ``Config``, a ``msgspec.Struct``; ``open_camera(config, camera_id)``, a ``Camera`` that is not open yet
+(``CameraError``, ``ConfigError``: it cannot work with this config); and ``list_devices()``, a list of ``FoundCamera``
+(``CameraError``, ``DependencyError``: it cannot be searched for), which opens nothing for longer than a question.
 """
 
 from __future__ import annotations
@@ -9,9 +11,7 @@ import difflib
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
-
-import msgspec
+from typing import Any
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
@@ -30,28 +30,14 @@ class FoundCamera:
     note: str = ""  # what else is worth knowing, for people
 
 
-class Driver(Protocol):
-    """What a package of a kind offers."""
-
-    Config: type[msgspec.Struct]
-
-    def open_camera(self, config: Any, camera_id: str) -> Camera:
-        """A camera that is not open yet; ``CameraError``, ``ConfigError``: it cannot work with this config."""
-        ...
-
-    def list_devices(self) -> Sequence[FoundCamera]:
-        """What is connected now; ``CameraError``, ``DependencyError``: it cannot be searched for."""
-        ...
-
-
-def load_driver(kind: str) -> Driver:
+def load_driver(kind: str) -> Any:
     """The package of a kind; ``ConfigError``: there is none, ``DependencyError``: something is not installed."""
     if kind not in KINDS:
         near = difflib.get_close_matches(kind, KINDS, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(KINDS)}"
         raise ConfigError(f"no kind of camera is called '{kind}'; {hint}")
     try:
-        return cast(Driver, importlib.import_module(f"semantic_mapper.drivers.{kind}"))
+        return importlib.import_module(f"semantic_mapper.drivers.{kind}")
     except ImportError as error:
         raise DependencyError(f"cameras of kind '{kind}' cannot be used here: {error}") from error
 

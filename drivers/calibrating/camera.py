@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.views import (
     CELLS,
     MIN_TILT_DEG,
     BoardView,
+    CalibrationConfig,
     area_counts,
     shortfalls,
     tilt_degrees,

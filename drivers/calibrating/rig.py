@@ -11,8 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.calibrating.camera import CameraCalibration, calibrate_camera, compare_camera, ideal_pixels
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
-from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibrating.views import BoardView, CalibrationConfig, ViewGatherer, simultaneous
 from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose

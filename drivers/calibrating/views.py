@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.config import Config, Positive
 from semantic_mapper.drivers.base import CameraImage
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibration import guess_intrinsics
 from semantic_mapper.drivers.poses.board import BoardFinder, board_poses, pose_of_vector
 from semantic_mapper.drivers.poses.config import BoardPoses
@@ -28,6 +30,14 @@ REGIONS = ("top left", "top", "top right", "left", "middle", "right", "bottom le
 _ACROSS = 3  # regions a side
 _SEEN_CELLS = 2  # of the four of a region that must have corners in them
 FLAT = 0.05  # corners whose spread across their main line is below this fraction of it are on a line
+
+
+class CalibrationConfig(Config, frozen=True):
+    """The lens model, and what a result has to be like to be written."""
+
+    coefficients: Literal[4, 5, 8] = 5  # of lens distortion; 8 for wide angles, 4 where few images are to be had
+    min_views: Annotated[int, msgspec.Meta(ge=4)] = 10
+    max_error_px: Positive = 1.0  # RMS reprojection error of the whole
 
 
 @dataclass(frozen=True, slots=True, eq=False)

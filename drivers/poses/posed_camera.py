@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Self
 
@@ -72,6 +73,7 @@ class PosedCamera:
         self._filters: dict[str, tuple[int, PoseOutlierFilter]] = {}  # by camera, with the world of its poses
         self._last_ns: dict[str, int] = {}
         self._trouble = ""
+        self._open = ExitStack()
         self._corrected: CorrectedWorld | None = None
         self.can_wait = camera.can_wait
         self.stop = camera.stop
@@ -101,19 +103,14 @@ class PosedCamera:
         return self._camera.last_poll_time
 
     def __enter__(self) -> Self:
-        self._poses.__enter__()
-        try:
-            self._camera.__enter__()
-        except BaseException as error:
-            self._poses.__exit__(type(error), error, error.__traceback__)
-            raise
+        with ExitStack() as stack:
+            stack.enter_context(self._poses)
+            stack.enter_context(self._camera)
+            self._open = stack.pop_all()
         return self
 
     def __exit__(self, *error: object) -> None:
-        try:
-            self._camera.__exit__(*error)
-        finally:
-            self._poses.__exit__(*error)
+        self._open.close()
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
         """As of ``PoseSource``, with poses of the camera; frames given from then on are of the corrected world."""

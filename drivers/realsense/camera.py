@@ -167,7 +167,7 @@ class RealSenseDevice(Device):
 
 
 def read_intrinsics(reported: Any) -> CameraIntrinsics:
-    """Of the SDK's ``intrinsics``, with OpenCV's coefficients for whatever lens model it has, each fitted by its own rays,
+    """Of the SDK's ``intrinsics``, with OpenCV's coefficients for whatever lens model it has, fitted by its own rays,
     since one of them is the inverse of OpenCV's. ``CameraError``: impossible ones, or no five coefficients fit."""
     lens: tuple[float, ...] = ()
     if any(reported.coeffs) and reported.model != load_realsense().distortion.none:

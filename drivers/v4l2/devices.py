@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import semantic_mapper.drivers.v4l2.ioctls as ioctls
@@ -33,40 +34,35 @@ def video_nodes() -> list[Path]:
 
 def list_devices() -> list[FoundCamera]:
     """One row for each device that gives images; what cannot be opened is listed with the reason."""
-    rows = [_describe(node) for node in video_nodes()]
-    return [row for row in rows if row is not None]
-
-
-def _describe(node: Path) -> FoundCamera | None:
-    """None where it is no camera: the metadata of one, a codec, or gone again."""
-    try:
-        with ioctls.opened(node) as fd:
-            who = ioctls.query_capability(fd)
-            formats = ioctls.list_formats(fd) if who.captures else ()
-    except FileNotFoundError:
-        return None
-    except PermissionError:
-        return FoundCamera("v4l2", "?", str(node), "no permission: add yourself to the group `video` and log in again")
-    except OSError as error:
-        return FoundCamera("v4l2", "?", str(node), f"does not answer: {error.strerror}")
-    if not who.captures:
-        return None
-    note = f"{node.name}; {' '.join(formats[:SHOWN_FORMATS]) or 'no formats'}; {who.driver} at {who.bus}"
-    return FoundCamera("v4l2", who.card, str(stable_path(node)), note)
+    found: list[FoundCamera] = []
+    for node in video_nodes():
+        try:
+            with ioctls.opened(node) as fd:
+                who = ioctls.query_capability(fd)
+                if not who.captures:  # the metadata of a camera, or a codec
+                    continue
+                formats = " ".join(ioctls.list_formats(fd)[:SHOWN_FORMATS]) or "no formats"
+            note = f"{node.name}; {formats}; {who.driver} at {who.bus}"
+            found.append(FoundCamera("v4l2", who.card, str(stable_path(node)), note))
+        except FileNotFoundError:  # gone again
+            continue
+        except PermissionError:
+            note = "no permission: add yourself to the group `video` and log in again"
+            found.append(FoundCamera("v4l2", "?", str(node), note))
+        except OSError as error:
+            found.append(FoundCamera("v4l2", "?", str(node), f"does not answer: {error.strerror}"))
+    return found
 
 
 def list_stereo() -> list[FoundCamera]:
     """Cameras with images as wide as two side by side; one that cannot be opened is in ``list_devices``."""
     found: list[FoundCamera] = []
     for node in video_nodes():
-        try:
-            with ioctls.opened(node) as fd:
-                who = ioctls.query_capability(fd)
-                sizes = ioctls.list_sizes(fd) if who.captures else ()
-        except OSError:
-            continue
-        wide = [f"{width}x{height}" for width, height in sizes if width > WIDER * height]
-        if wide:
-            note = f"{node.name}; side by side {' '.join(wide)}"
-            found.append(FoundCamera("stereo", who.card, str(stable_path(node)), note))
+        with suppress(OSError), ioctls.opened(node) as fd:
+            who = ioctls.query_capability(fd)
+            sizes = ioctls.list_sizes(fd) if who.captures else ()
+            wide = [f"{width}x{height}" for width, height in sizes if width > WIDER * height]
+            if wide:
+                note = f"{node.name}; side by side {' '.join(wide)}"
+                found.append(FoundCamera("stereo", who.card, str(stable_path(node)), note))
     return found

@@ -16,9 +16,8 @@ from rich.table import Table
 from semantic_mapper import __version__
 from semantic_mapper.config import Config
 from semantic_mapper.drivers.calibrating.camera import COEFFICIENT_NAMES, CameraCalibration, draw_calibration
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.rig import Calibration
-from semantic_mapper.drivers.calibrating.views import CELLS, ViewGatherer, missing_regions
+from semantic_mapper.drivers.calibrating.views import CELLS, CalibrationConfig, ViewGatherer, missing_regions
 from semantic_mapper.drivers.calibration import StereoCalibration, save_calibration, save_stereo
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError

@@ -17,9 +17,8 @@ import numpy as np
 import structlog
 
 from semantic_mapper.drivers.base import Camera, CameraImage
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.rig import MIN_INSTANTS
-from semantic_mapper.drivers.calibrating.views import ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibrating.views import CalibrationConfig, ViewGatherer, simultaneous
 from semantic_mapper.drivers.calibration import guess_intrinsics
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.drivers.registry import open_camera

@@ -15,8 +15,7 @@ import structlog
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
-from semantic_mapper.drivers.mounts import mount_for
-from semantic_mapper.drivers.poses.config import PoseChecks, begins_world, can_be_found, gives_metres
+from semantic_mapper.drivers.poses.config import PoseChecks, begins_world, can_be_found, gives_metres, mount_for
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 from semantic_mapper.drivers.registry import open_camera

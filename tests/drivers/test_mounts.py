@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.calibration import load_calibration, load_mount, save_calibration
-from semantic_mapper.drivers.mounts import mount_for
+from semantic_mapper.drivers.poses.config import mount_for
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 from semantic_mapper.errors import ConfigError

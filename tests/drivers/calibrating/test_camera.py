@@ -9,11 +9,11 @@ import pytest
 
 from semantic_mapper.drivers.calibrating import camera
 from semantic_mapper.drivers.calibrating.camera import calibrate_camera, compare_camera, draw_calibration, ideal_pixels
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.views import (
     MIN_CORNERS,
     REGIONS,
     BoardView,
+    CalibrationConfig,
     ViewGatherer,
     area_counts,
     missing_regions,

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.calibrating import rig
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.rig import calibrate_rig, solve
-from semantic_mapper.drivers.calibrating.views import MAX_VIEWS, MIN_CORNERS, BoardView, ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibrating.views import (
+    MAX_VIEWS,
+    MIN_CORNERS,
+    BoardView,
+    CalibrationConfig,
+    ViewGatherer,
+    simultaneous,
+)
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import Float64

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.rig import solve
+from semantic_mapper.drivers.calibrating.views import CalibrationConfig
 from semantic_mapper.drivers.calibration import load_calibration, load_mount, load_stereo
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
