@@ -132,7 +132,7 @@ def rigid_matrix(rows: Matrix, where: str) -> Float64:
 def save_calibration(
     path: Path, measured: CameraIntrinsics, T_rig_camera: Float64 | None, about: Mapping[str, str | float]
 ) -> None:
-    """Write a calibration file, TOML, that reads back to the same numbers; ``OSError`` where it cannot be written.
+    """Write a calibration file, TOML, that reads back to the same numbers; ``ConfigError`` where it cannot be written.
 
     Args:
         path: Replaced if it is there.
@@ -140,12 +140,12 @@ def save_calibration(
         T_rig_camera: (4, 4) where the camera is on a rig.
         about: When, how, how well: for people.
     """
-    lines = _lens_lines(measured)
+    lens = _lens_table(measured)
     if isinstance(measured, FisheyeIntrinsics):
-        lines.append("fisheye = true")
+        lens["fisheye"] = True
     if T_rig_camera is not None:
-        lines += _matrix_lines("T_rig_camera", T_rig_camera)
-    _write(path, lines, about)
+        lens["T_rig_camera"] = T_rig_camera.tolist()
+    _write(path, {"": lens, "about": about})
 
 
 def load_stereo(path: Path) -> StereoCalibration:
@@ -169,26 +169,23 @@ def load_stereo(path: Path) -> StereoCalibration:
 
 
 def save_stereo(path: Path, pair: StereoCalibration, about: Mapping[str, str | float]) -> None:
-    """Write the file of a pair, TOML, that reads back to the same numbers; ``OSError`` where it cannot be written."""
-    lines = [f"swapped = {str(pair.swapped).lower()}", *_matrix_lines("T_right_left", pair.T_right_left)]
-    _write(path, [*lines, "", "[left]", *_lens_lines(pair.left), "", "[right]", *_lens_lines(pair.right)], about)
+    """Write the file of a pair, TOML, that reads back to the same numbers; ``ConfigError``: it cannot be written."""
+    whole = {"swapped": pair.swapped, "T_right_left": pair.T_right_left.tolist()}
+    _write(path, {"": whole, "left": _lens_table(pair.left), "right": _lens_table(pair.right), "about": about})
 
 
-def _lens_lines(lens: CameraIntrinsics) -> list[str]:
-    values = [f"{name} = {getattr(lens, name)!r}" for name in ("fx", "fy", "cx", "cy", "width", "height")]
-    return [*values, f"distortion = {list(lens.distortion)!r}"]
+def _lens_table(lens: CameraIntrinsics) -> dict[str, Any]:
+    names = ("fx", "fy", "cx", "cy", "width", "height")
+    return {name: getattr(lens, name) for name in names} | {"distortion": list(lens.distortion)}
 
 
-def _matrix_lines(name: str, T: Float64) -> list[str]:
-    return [f"{name} = [", *(f"    {row!r}," for row in T.tolist()), "]"]
-
-
-def _write(path: Path, lines: list[str], about: Mapping[str, str | float]) -> None:
-    # A JSON string is a TOML one.
-    values = {name: json.dumps(value) if isinstance(value, str) else repr(value) for name, value in about.items()}
-    lines = [*lines, "", "[about]", *(f"{name} = {value}" for name, value in values.items())]
+def _write(path: Path, tables: Mapping[str, Mapping[str, Any]]) -> None:
+    lines: list[str] = []
+    for name, table in tables.items():
+        lines += ["", f"[{name}]"] if name else []
+        lines += [f"{key} = {json.dumps(value)}" for key, value in table.items()]  # as TOML has it, too
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, ("\n".join(lines) + "\n").encode())
+    write_bytes(path, ("\n".join(lines) + "\n").encode(), raises=ConfigError)
 
 
 def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraIntrinsics | None:

@@ -252,12 +252,8 @@ class KeyframeGraph:
 
 
 class LoopCloser:
-    """Measures motions between keyframes of a graph and searches for loops. Not for several threads at once.
-
-    Args:
-        graph: Gets the edges.
-        counters: Where "loops_closed" and "loops_refused" are counted.
-    """
+    """Measures motions between keyframes of a graph, which gets them, and searches for loops; counts "loops_closed" and
+    "loops_refused". Not for several threads at once."""
 
     def __init__(self, graph: KeyframeGraph, counters: Counter[str]) -> None:
         self._graph = graph
@@ -359,8 +355,7 @@ class LoopCloser:
         allowed_m = _SLACK_M + 3 * float(np.hypot(DRIFT * way_m, sigma_m))
         if moved_m > allowed_m or turned_deg > _SLACK_DEG + 3 * _DRIFT_DEG_M * way_m:
             self._counters["loops_refused"] += 1
-            moved = {"moved_m": round(moved_m, 3), "turned_deg": round(turned_deg, 1)}
-            _log.info("loop_refused", keyframes=(edge.a, edge.b), **moved)
+            _log.info("loop_refused", keyframes=(edge.a, edge.b), moved_m=round(moved_m, 3), deg=round(turned_deg, 1))
             return
         taken = [edge]
         if moved_m >= _SMALL[0] or turned_deg >= _SMALL[1]:

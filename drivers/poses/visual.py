@@ -109,8 +109,7 @@ class VisualPoseSource(PoseSource):
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose of the next image; None before the world begins, before the scale is known, and while lost.
 
-        Raises:
-            CameraError: images of another camera or size come in between.
+        ``CameraError``: it is of another camera or size.
         """
         self._expect_one_camera(image)
         odometry = self._odometry = self._odometry or VisualOdometry(image.intrinsics, self._counters)
@@ -145,7 +144,14 @@ class VisualPoseSource(PoseSource):
         if self._config.camera_height_m:
             return self._over_floor(odometry, pose)
         if self._reference is None:
-            return pose if self._world_begun else self._at_distance(odometry, pose)
+            if self._world_begun:
+                return pose
+            depth = odometry.center_depth() if self._config.distance_m else 1.0
+            if depth is None:
+                return pose
+            self._metric = bool(self._config.distance_m)
+            start = matrix(self._config.T_world_start)
+            return self._begin_world(odometry, pose, (self._config.distance_m or 1.0) / depth, start)
         if reference is None:
             return pose
         self._estimator.add(reference[:3, 3], pose[:3, 3])
@@ -157,17 +163,6 @@ class VisualPoseSource(PoseSource):
         self._estimator.rescaled(factor, pose, after)
         self._metric = True
         return after
-
-    def _at_distance(self, odometry: VisualOdometry, pose: Float64) -> Float64:
-        """The pose once the world begins, with its middle at the distance of the settings where they have one."""
-        start, distance_m = matrix(self._config.T_world_start), self._config.distance_m
-        if not distance_m:
-            return self._begin_world(odometry, pose, 1.0, start)
-        depth = odometry.center_depth()
-        if depth is None:
-            return pose
-        self._metric = True
-        return self._begin_world(odometry, pose, distance_m / depth, start)
 
     def _over_floor(self, odometry: VisualOdometry, pose: Float64) -> Float64:
         """The pose once the distance from the floor is brought to what the camera's height over it is."""
@@ -383,13 +378,9 @@ class VisualOdometry:
 
 
 def two_views(a: Float64, b: Float64, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64, Any] | None:
-    """Motion between two views from corners that both see at pixels (N, 2).
-
-    Returns:
-        T_a_b (4, 4) with a way of length 1; points (N, 3) in the axes of a; (N,) which of them can be used. None where
-        the motion is not sure: too little parallax (a camera that only turns), corners that agree on none, or that lie
-        all on one plane, which two motions explain.
-    """
+    """Motion between two views from corners that both see at pixels (N, 2): T_a_b (4, 4) with a way of length 1; points
+    (N, 3) in the axes of a; (N,) which of them can be used. None where it is not sure: too little parallax (a camera
+    that only turns), corners that agree on none, or that lie all on one plane, which two motions explain."""
     K = camera_matrix(intrinsics)
     cv2.setRNGSeed(1)
     H, flat = cv2.findHomography(a, b, cv2.RANSAC, 1.0)

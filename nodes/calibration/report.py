@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -46,8 +45,7 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
             about["rig"] = f"that of camera {next(iter(found.cameras))}; {', '.join(found.cameras)}"
             about["rig_position_sigma_mm"] = float(f"{1000 * place.position_sigma_m:.3g}")
             about["rig_turn_sigma_deg"] = float(f"{place.turn_sigma_deg:.3g}")
-        with _explained(out / f"{name}.toml"):
-            save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
+        save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
         written += [out / f"{name}.toml", _write_picture(out / f"{name}.png", name, camera)]
     return written
 
@@ -73,8 +71,7 @@ def write_stereo(out: Path, name: str, found: Calibration, settings: Calibration
         "sigma_baseline_mm": float(f"{1000 * place.position_sigma_m:.3g}"),
     }
     file = out / f"{name}.toml"
-    with _explained(file):
-        save_stereo(file, StereoCalibration(left.intrinsics, right.intrinsics, T_right_left, swapped), about)
+    save_stereo(file, StereoCalibration(left.intrinsics, right.intrinsics, T_right_left, swapped), about)
     sides = zip(SIDES, (left, right), strict=True)
     return [file, *(_write_picture(out / f"{name}-{side}.png", f"{name} {side}", camera) for side, camera in sides)]
 
@@ -90,24 +87,9 @@ def _about(settings: CalibrationSettings) -> dict[str, str | float]:
 
 def _write_picture(path: Path, name: str, camera: CameraCalibration) -> Path:
     drawn = draw_calibration(name, camera)
-    write_whole(path, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
+    data = cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes()
+    write_bytes(path, data, raises=ConfigError)
     return path
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file, or leave it as it was; ``ConfigError`` where it cannot be written."""
-    with _explained(path):
-        write_bytes(path, data)
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Make of what the system says an error that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or error
-        raise ConfigError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error
 
 
 def tables(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int) -> Iterator[Any]:

@@ -12,6 +12,7 @@ from semantic_mapper.config import load_config
 from semantic_mapper.drivers.calibrating.rig import solve
 from semantic_mapper.drivers.poses.board import sheet_png
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.calibration import report
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources, parse_stereo
@@ -90,7 +91,7 @@ def _draw_board(output: Output, settings: CalibrationSettings, path: Path) -> No
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: the board is written as a PNG picture; give a name that ends with .png")
     prepare_file(path)
-    report.write_whole(path, sheet_png(settings.board))
+    write_bytes(path, sheet_png(settings.board), raises=ConfigError)
     b = settings.board
     output.print(
         f"{path}: {b.columns} x {b.rows} squares of {1000 * b.square_m:g} mm; print it at 100 %, on "
