@@ -17,7 +17,8 @@ from tests.drivers.poses.images import ListCamera, image, rigid
 
 T_RIG_CAMERA = rigid((0.02, -0.4, 0.1), (0.12, -0.03, 0.05))
 ROWS = tuple(tuple(row) for row in T_RIG_CAMERA.tolist())
-RIG = read_pose_config({"kind": "topic", "endpoint": "ipc:///tmp/robot", "T_base_rig": np.eye(4).tolist()})
+TOPIC = {"kind": "topic", "endpoint": "ipc:///tmp/robot", "T_base_rig": np.eye(4).tolist()}
+RIG = read_pose_config(TOPIC)
 LENS = CameraIntrinsics(421.123456789012, 419.0, 326.25, 233.0, 640, 480, (-0.21, 0.06, 1e-17, -0.0006, 0.0))
 
 
@@ -74,16 +75,8 @@ def test_poses_of_the_camera_itself_are_left_alone_or_the_mistake_is_told(tmp_pa
     ("settings", "says"),
     [
         ({"kind": "fixed", "T_world_rig": np.eye(4).tolist(), "T_world_camera": T_RIG_CAMERA.tolist()}, "T_world_rig"),
-        (
-            {
-                "kind": "topic",
-                "endpoint": "ipc://x",
-                "T_base_rig": np.eye(4).tolist(),
-                "T_base_camera": T_RIG_CAMERA.tolist(),
-            },
-            "give T_base_camera or",
-        ),
-        ({"kind": "topic", "endpoint": "ipc://x", "T_base_rig": (2 * np.eye(4)).tolist()}, "T_base_rig"),
+        ({**TOPIC, "T_base_camera": T_RIG_CAMERA.tolist()}, "give T_base_camera or"),
+        ({**TOPIC, "T_base_rig": (2 * np.eye(4)).tolist()}, "T_base_rig"),
     ],
 )
 def test_what_contradicts_itself_is_refused(settings: dict[str, object], says: str) -> None:

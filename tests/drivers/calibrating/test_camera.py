@@ -11,15 +11,11 @@ from semantic_mapper.drivers.calibrating import camera
 from semantic_mapper.drivers.calibrating.camera import calibrate_camera, compare_camera, draw_calibration, ideal_pixels
 from semantic_mapper.drivers.calibrating.views import (
     MIN_CORNERS,
-    REGIONS,
     BoardView,
     CalibrationConfig,
     ViewGatherer,
-    area_counts,
-    missing_regions,
 )
 from semantic_mapper.errors import CameraError
-from semantic_mapper.geometry import camera_matrix, project
 from semantic_mapper.types import CameraIntrinsics, Float64
 from tests.figures import figure_of, misplaced_texts
 
@@ -130,14 +126,6 @@ def test_a_camera_that_is_calibrated_is_compared_only() -> None:
         compare_camera("cam", made_up(views(12)), wrong, CONFIG)
 
 
-def test_ideal_pixels_are_those_of_the_pinhole_camera() -> None:
-    T = views(1)[0]
-    points, pixels = corners_of(T, LENS)
-    at = points @ T[:3, :3].T + T[:3, 3]
-    assert np.abs(ideal_pixels(pixels, LENS) - project(at, LENS)).max() < 1e-6
-    assert camera_matrix(LENS)[0, 0] == LENS.fx
-
-
 def test_streams_give_a_view_only_where_the_board_is_held_still() -> None:
     first, second = views(2)
     moving = first.copy()
@@ -157,9 +145,3 @@ def test_images_without_a_board_and_of_another_size_are_told() -> None:
     small = CameraIntrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
     with pytest.raises(CameraError, match="160x120 among those of"):
         gatherer.take(dataclasses.replace(blank, rgb=np.zeros((120, 160, 3), np.uint8), intrinsics=small))
-
-
-def test_parts_of_the_image_have_their_names() -> None:
-    assert missing_regions(area_counts([], SIZE)) == REGIONS
-    left_half = np.array([(x, y) for x in range(0, 320, 20) for y in range(0, 480, 20)], np.float64)
-    assert missing_regions(area_counts([left_half], SIZE)) == ("top right", "right", "bottom right")

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from datetime import timedelta
 from pathlib import Path
 
@@ -152,37 +151,12 @@ def test_the_same_device_is_looked_for_again(calibration: Path) -> None:
     assert asked == ["", "1844301000000000"]
 
 
-def test_a_stream_that_stalls_is_opened_again(calibration: Path) -> None:
-    start = long_ago(60)
-    warnings: list[str] = []
-
-    def again() -> Sources:
-        warnings.extend(camera.warnings)
-        return host.played(calibration, [rgb_message(k, start) for k in (40, 41)], None)
-
-    first = [rgb_message(k, start) for k in range(3)]
-    camera = host.camera(lambda: host.played(calibration, first, None), again)
-    with camera:
-        seqs = [image.seq for image in take(camera, 5)]
-    assert seqs == [0, 1, 2, 40, 41]
-    assert len(warnings) == 1 and "gives no images" in warnings[0]
-
-
 def test_a_device_without_images_is_refused(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "START_S", 0.3)
     rgb, _ = messages(3)
     camera = host.camera(lambda: host.played(calibration, rgb, []))
     with pytest.raises(CameraError, match=r"was opened, but has given no image for 0\.3 s"), camera:
         pass
-
-
-def test_stop_ends_the_iteration(calibration: Path) -> None:
-    rgb, _ = messages(3)
-    with host.camera(lambda: host.played(calibration, rgb, None)) as camera:
-        for _ in zip(range(3), camera, strict=False):
-            pass
-        threading.Timer(0.1, camera.stop).start()
-        assert not list(camera)
 
 
 def test_images_that_are_not_what_was_asked_for_are_an_error(calibration: Path) -> None:

@@ -122,6 +122,8 @@ def test_boards_that_cannot_be_are_refused() -> None:
         make_board(BoardPoses(dictionary="DICT_9X9"))
     with pytest.raises(ConfigError, match="50 markers, the board needs 200"):
         make_board(BoardPoses(dictionary="DICT_4X4_50", columns=20, rows=20))
+    with pytest.raises(ConfigError, match="too large to be drawn"):
+        sheet_png(BoardPoses(square_m=1.0, marker_m=0.8))
 
 
 BOARDS = [BoardPoses(), BoardPoses(pattern="tags", columns=3, rows=2, square_m=0.06, marker_m=0.045)]
@@ -138,8 +140,3 @@ def test_the_sheet_is_the_board_and_the_file_says_how_large_it_is(board: BoardPo
     assert len(points) == 24
     off = pixels + 0.5 - (points[:, :2] + MARGIN_M) * a_metre
     assert np.abs(off).max() < 1.5  # of 12 pixels a millimetre
-
-
-def test_a_wall_is_no_sheet() -> None:
-    with pytest.raises(ConfigError, match="too large to be drawn"):
-        sheet_png(BoardPoses(square_m=1.0, marker_m=0.8))
