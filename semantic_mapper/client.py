@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import uuid
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -21,9 +21,9 @@ from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.questions import AnswerT, Correction, MapInfo, Point, Request, Weights
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.queries.surface import RayHits
-from semantic_mapper.transport.endpoints import default_endpoint
+from semantic_mapper.transport.endpoints import Closing, default_endpoint
 from semantic_mapper.transport.keys import ServerIdentity
-from semantic_mapper.transport.query_sockets import QuerySocket
+from semantic_mapper.transport.sockets import QuerySocket
 from semantic_mapper.types import Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
@@ -31,7 +31,7 @@ MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
 GRACE_S = 0.5  # in which a question that timed out is sent again, and keeps its turn
 
 
-class MapClient:
+class MapClient(Closing):
     """The queries of ``semantic_mapper.queries`` on the map of a running mapper; a context manager.
 
     Every call answers as the query of its name does on a snapshot, raises what that raises (``MapError``,
@@ -204,12 +204,6 @@ class MapClient:
     def close(self) -> None:
         """Free the socket. Harmless when repeated."""
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _ask(self, request: Request[AnswerT]) -> AnswerT:
         return self._ask_about(request)[1]

@@ -131,9 +131,7 @@ class LiveCorrection:
             raise MapError("correct_poses: a frame is given twice")
         if request.within_ns:
             return self._nearest_frames(request, camera)
-        if names == [""]:
-            return dict(zip(stamps.tolist(), poses, strict=True))
-        keys = [(names[c], s) for c, s in zip(camera.tolist(), stamps.tolist(), strict=True)]
+        keys = [(names[c], s) if names[c] else s for c, s in zip(camera.tolist(), stamps.tolist(), strict=True)]
         return dict(zip(keys, poses, strict=True))
 
     def _nearest_frames(

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import structlog
 
@@ -34,8 +34,9 @@ from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.questions import Request, encode_error
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, points_in_box
+from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.keys import Keys
-from semantic_mapper.transport.query_sockets import QueryServer
+from semantic_mapper.transport.sockets import QueryServer
 
 PERIOD_S = 0.1  # between two snapshots, at least
 MAX_BLOCKS = 600  # copied between two frames (unless one frame has more): bounds what a step may cost
@@ -67,7 +68,7 @@ class _PendingRequest:
     answer: Future[list[bytes] | None] | None = None
 
 
-class QueryService:
+class QueryService(Closing):
     """Answers questions about a map that another thread changes. A context manager.
 
     Answers are about the map as it was a moment ago, and say about which version. Without questions there are no
@@ -153,12 +154,6 @@ class QueryService:
         for worker in (self._quick, self._long):
             worker.shutdown(cancel_futures=True)
         self._server.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _copy(self, limit: int) -> None:
         changes = self._map.copy_changes(self._copied_version, limit)

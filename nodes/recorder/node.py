@@ -226,12 +226,15 @@ class Recorder:
         before = self._context.note(NOTE) if self._goes_on else ""
         name = before or uuid.uuid4().hex
         self._context.try_to_leave_note(NOTE, name, "who replaces it begins another recording next to it")
+        kept, note = [self._calibration()], (self._context.folder or Path()) / LAUNCH
+        if self._context.folder is not None and note.exists():
+            kept.append(LogAttachment(LAUNCH, "application/json", note.read_bytes()))
         self.recording = Recording(
             self._path,
             info,
             self._rules,
             recording=name,
-            attachments=self._attachments(),
+            attachments=kept,
             overwrite=self._options.overwrite,
             goes_on=self._goes_on,
         )
@@ -243,13 +246,6 @@ class Recorder:
     def _calibration(self) -> LogAttachment:
         cameras = msgspec.json.format(msgspec.json.encode({"cameras": self._cameras}), indent=1)
         return LogAttachment("calibration.json", "application/json", cameras)
-
-    def _attachments(self) -> list[LogAttachment]:
-        kept = [self._calibration()]
-        folder = self._context.folder
-        if folder is not None and (folder / LAUNCH).exists():
-            kept.append(LogAttachment(LAUNCH, "application/json", (folder / LAUNCH).read_bytes()))
-        return kept
 
     def _packed(self, parts: list[bytes], topic: str) -> list[bytes]:
         if topic != "frame":

@@ -12,10 +12,9 @@ import re
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Self
 
 import zmq
 
@@ -104,7 +103,21 @@ def is_loopback(address: str) -> bool:
         return False
 
 
-class ServerSocket:
+class Closing:
+    """A context manager that closes at its end."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class ServerSocket(Closing):
     """A bound socket (``socket``), and its ``endpoint`` as ZeroMQ names it.
 
     The file of an ``ipc://`` socket is this user's alone from the start (mode 0600).
@@ -124,20 +137,22 @@ class ServerSocket:
         self, kind: zmq.SocketType, endpoint: str, keys: Keys | None, options: Mapping[zmq.SocketOption, int]
     ) -> None:
         check_bind(endpoint, keys)
-        is_ipc = endpoint.startswith("ipc://")
-        self._lock = _lock_path(endpoint) if is_ipc else None
+        self._lock = _lock_path(endpoint) if endpoint.startswith("ipc://") else None
         self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
         for option, value in options.items():
             self.socket.setsockopt(option, value)
         if keys is not None:
             secure_server(self.socket, keys)
-        try:
-            with _owner_only() if is_ipc else nullcontext():
+        with _umask_lock:  # a socket's file gets its mode by the umask alone, which all threads share
+            before = os.umask(0o177)
+            try:
                 self.socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            self.socket.setsockopt(zmq.LINGER, 0)
-            ServerSocket.close(self)
-            raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
+            except zmq.ZMQError as error:
+                self.socket.setsockopt(zmq.LINGER, 0)
+                ServerSocket.close(self)
+                raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
+            finally:
+                os.umask(before)
         self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def close(self) -> None:
@@ -167,17 +182,6 @@ def client_socket(
         socket.close()
         raise
     return socket
-
-
-@contextmanager
-def _owner_only() -> Iterator[None]:
-    """The mode of a socket's file is given by the umask alone, which all threads share: hence no longer than needed."""
-    with _umask_lock:
-        before = os.umask(0o177)
-        try:
-            yield
-        finally:
-            os.umask(before)
 
 
 def _lock_path(endpoint: str) -> IO[bytes]:

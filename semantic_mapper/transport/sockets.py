@@ -1,14 +1,16 @@
-"""Sockets of topics: ``Publisher``, and the two ways to subscribe, ``NewestSubscriber`` and ``LosslessSubscriber``."""
+"""Sockets of topics: ``Publisher``, and the two ways to subscribe, ``NewestSubscriber`` and ``LosslessSubscriber``; and
+the two ends of question and answer: ``QueryServer`` (ROUTER) and ``QuerySocket`` (REQ, made again when lost)."""
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Literal, Self, cast
+from typing import Literal, cast
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
@@ -16,7 +18,7 @@ from zmq.utils.monitor import recv_monitor_message
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.codec import decode, read_envelope
-from semantic_mapper.transport.endpoints import ServerSocket, client_socket
+from semantic_mapper.transport.endpoints import Closing, ServerSocket, client_socket
 from semantic_mapper.transport.keys import Keys, ServerIdentity
 from semantic_mapper.transport.messages import (
     MAX_HEADER_BYTES,
@@ -25,6 +27,7 @@ from semantic_mapper.transport.messages import (
     MAX_PARTS,
     MAX_WEIGHTS_BYTES,
     TOPICS,
+    Buffer,
     Message,
     Parts,
     subscription,
@@ -54,6 +57,11 @@ _SUBSCRIBER_OPTIONS = {
     zmq.TCP_KEEPALIVE_CNT: 3,
 }
 _MAX_SLOTS = 256  # cameras and nodes that a mailbox serves; an unknown client's invented ones stop here
+MAX_REQUEST_BYTES = 10_000_000  # of a part: 65,536 poses, and some room; a client that sends more is cut off
+_QUESTION_PARTS = 5  # who asks, the empty part that REQ sockets put first, and a question's three
+_WAITING = 64  # questions and answers that may wait for each client
+_SERVER_OPTIONS = {zmq.LINGER: 200, zmq.RCVHWM: _WAITING, zmq.SNDHWM: _WAITING, zmq.MAXMSGSIZE: MAX_REQUEST_BYTES}
+_CLIENT_OPTIONS = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_PART_BYTES, zmq.RECONNECT_IVL: 50, zmq.RECONNECT_IVL_MAX: 1000}
 _GIVEN_UP_S = 0.3  # ZeroMQ says at once whether it tries again
 _TRIES_AGAIN = (zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED)
 _EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_TRIES_AGAIN)
@@ -80,7 +88,7 @@ def receive_bounded(
     return parts, f"{count} parts of {size} bytes in all; a message has at most {max_parts} and {max_bytes} bytes"
 
 
-class Publisher:
+class Publisher(Closing):
     """Binds an endpoint and sends encoded messages to all subscribers. Any thread may call any method.
 
     Args:
@@ -178,12 +186,6 @@ class Publisher:
         with self._mutex:
             self._server.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     @contextmanager
     def _in_use(self) -> Iterator[None]:
         """Hold the socket, once what subscribers have sent is heard."""
@@ -253,7 +255,7 @@ def _known(topic: str) -> tuple[str, str | None]:
     return name, source or None
 
 
-class _Subscriber:
+class _Subscriber(Closing):
     """A subscriber, as the two below are; any thread may call its methods.
 
     A thread of its own takes messages off the socket as they come and checks their headers; images are decoded by the
@@ -374,12 +376,6 @@ class _Subscriber:
             self._changed.notify_all()
         self._thread.join()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _run(self) -> None:
         try:
             while not self._closed:
@@ -498,3 +494,133 @@ class _Connections:
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=0)
+
+
+class QueryServer(ServerSocket):
+    """Binds an endpoint, receives questions and sends answers. One thread uses it; any thread may ``wake`` that one.
+
+    A client that does not take its answers loses them; nothing here ever waits for a client. Arguments and errors as
+    of ``ServerSocket``.
+    """
+
+    def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
+        super().__init__(zmq.ROUTER, endpoint, keys, _SERVER_OPTIONS)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._poller = zmq.Poller()
+        self._poller.register(self.socket, zmq.POLLIN)
+        self._poller.register(self._wake, zmq.POLLIN)
+
+    def wake(self) -> None:
+        """End the present or the next ``wait``."""
+        os.eventfd_write(self._wake, 1)
+
+    def wait(self, timeout_s: float) -> None:
+        """Until there is a question, somebody calls ``wake``, or the time is over."""
+        if self._wake in dict(self._poller.poll(int(timeout_s * 1000))):
+            os.eventfd_read(self._wake)
+
+    def receive(self) -> tuple[bytes, list[bytes]] | None:
+        """Who asks, and the parts of the question; None where nobody does. One that is too large has a part too many,
+        or lacks its last ones."""
+        limit = MAX_REQUEST_BYTES + MAX_HEADER_BYTES
+        try:
+            (sender, *parts), _ = receive_bounded(
+                self.socket, max_parts=_QUESTION_PARTS + 1, max_bytes=limit, flags=zmq.NOBLOCK
+            )
+        except zmq.Again:
+            return None
+        return sender, parts[1:] if parts[:1] == [b""] else parts
+
+    def send(self, client: bytes, parts: Sequence[Buffer]) -> None:
+        """Answer a client; where it is gone, the answer is, too."""
+        try:
+            self.socket.send_multipart([client, b"", *parts], zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return
+
+    def close(self) -> None:
+        """Free the endpoint."""
+        super().close()
+        os.close(self._wake)
+
+
+class QuerySocket(Closing):
+    """Asks a ``QueryServer``. Any thread may ask; questions wait for each other.
+
+    Where no answer comes in time the socket is thrown away and the question sent again through a new one, so that a
+    server that was restarted is found again. Questions change nothing, so to ask twice does no harm; a request that
+    does carries an id, and a server that has seen it only answers.
+
+    Args:
+        endpoint: Where the server listens.
+        timeout_s: How long to wait for an answer each time.
+        attempts: How often to ask.
+        identity: Of a server that has keys.
+
+    Raises:
+        TransportError: see ``client_socket``.
+    """
+
+    def __init__(
+        self, endpoint: str, *, timeout_s: float, attempts: int, identity: ServerIdentity | None = None
+    ) -> None:
+        self.endpoint = endpoint
+        self._timeout_s = timeout_s
+        self._attempts = attempts
+        self._identity = identity
+        self._lock = threading.Lock()
+        self._closed = False
+        self._socket = self._connect()
+
+    def ask(self, parts: Sequence[Buffer]) -> list[bytes]:
+        """The parts of the answer.
+
+        Raises:
+            TransportError: closed, nobody has answered, or the answer is beyond all limits.
+        """
+        with self._lock:
+            for _ in range(self._attempts):
+                if self._closed:
+                    raise TransportError(f"{self.endpoint}: the client is closed")
+                answer = self._ask_once(parts)
+                if answer is not None:
+                    return answer
+        raise TransportError(
+            f"{self.endpoint}: no answer within {self._attempts} x {self._timeout_s:g} s; is a mapper running, and "
+            "does it answer questions there (option `query`)?"
+            + ("" if self._identity is None else " Does it know this machine's key, and is its own the one we have?")
+        )
+
+    def close(self) -> None:
+        """Free the socket. Harmless when repeated."""
+        with self._lock:
+            self._closed = True
+            self._socket.close()
+
+    def _ask_once(self, parts: Sequence[Buffer]) -> list[bytes] | None:
+        answered = False
+        try:
+            self._socket.send_multipart(parts, copy=False)
+            answered = bool(self._socket.poll(int(self._timeout_s * 1000), zmq.POLLIN))
+            if not answered:
+                return None
+            answer, trouble = receive_bounded(self._socket, max_bytes=MAX_PARTS * MAX_PART_BYTES)
+            if trouble:
+                raise TransportError(f"{self.endpoint}: {trouble}")
+            return answer
+        except zmq.Again:
+            return None
+        finally:  # also after Ctrl-C: a REQ socket that has sent can only wait for that answer
+            if not answered:
+                self._socket.close()
+                self._socket = self._connect()
+
+    def _connect(self) -> zmq.Socket[bytes]:
+        options = {**_CLIENT_OPTIONS, zmq.SNDTIMEO: int(self._timeout_s * 1000)}
+        socket = client_socket(zmq.REQ, [self.endpoint], self._identity, options)
+        try:
+            socket.connect(self.endpoint)
+        except zmq.ZMQError as error:
+            socket.close()
+            raise TransportError(f"{self.endpoint}: cannot be connected to: {error}") from error
+        return socket

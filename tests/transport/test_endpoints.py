@@ -10,8 +10,7 @@ import pytest
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.transport.endpoints import default_endpoint
 from semantic_mapper.transport.messages import parse_topic
-from semantic_mapper.transport.query_sockets import QueryServer
-from semantic_mapper.transport.sockets import Publisher
+from semantic_mapper.transport.sockets import Publisher, QueryServer
 
 
 def test_default_endpoints_are_the_same_for_all_processes_and_differ_by_name(monkeypatch, tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.endpoints import check_connect
 from semantic_mapper.transport.keys import Keys, ServerIdentity, allow, forget, load_keys, make_keys
 from semantic_mapper.transport.messages import Status
-from semantic_mapper.transport.query_sockets import QueryServer, QuerySocket
-from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
+from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher, QueryServer, QuerySocket
 
 STATUS = Status(node="mapper", state="running", stamp_ns=1)
 

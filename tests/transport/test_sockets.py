@@ -17,8 +17,14 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
-from semantic_mapper.transport.query_sockets import QueryServer, QuerySocket
-from semantic_mapper.transport.sockets import MAX_MESSAGE_BYTES, LosslessSubscriber, NewestSubscriber, Publisher
+from semantic_mapper.transport.sockets import (
+    MAX_MESSAGE_BYTES,
+    LosslessSubscriber,
+    NewestSubscriber,
+    Publisher,
+    QueryServer,
+    QuerySocket,
+)
 from semantic_mapper.types import PosedFrame
 
 from . import samples

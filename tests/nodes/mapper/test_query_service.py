@@ -42,7 +42,7 @@ from semantic_mapper.queries.questions import (
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, points_in_box
 from semantic_mapper.transport.keys import Keys
-from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
+from semantic_mapper.transport.sockets import MAX_REQUEST_BYTES
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_moving import THING_M as PASSES_AT_M
 from tests.mapping.test_moving import scene as passer_by
