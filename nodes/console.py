@@ -15,16 +15,7 @@ from typing import Any, TextIO
 
 import structlog
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -143,7 +134,7 @@ class FrameProgress(JobMonitor):
 
     def __init__(self, progress: Progress, what: str, total: int | None, unit: str, stop: StopRequest | None) -> None:
         self._progress = progress
-        self._task = progress.add_task(what, total=total, note="")
+        self._task = progress.add_task(what, total=total, note="", rate="")
         self._what, self._total, self._unit = what, total, unit
         self._stop = stop
         self._done = 0
@@ -167,13 +158,13 @@ class FrameProgress(JobMonitor):
     def set(self, done: int, note: str = "") -> None:
         """This many are done by now; ``note`` replaces the text next to the bar."""
         self._done = done
-        more: dict[str, Any] = {"note": note} if note else {}
-        self._progress.update(self._task, completed=done, **more)
         now = time.monotonic()
+        rate = f"{done / max(now - self._began, 1e-9):.2f} {self._unit}/s"
+        more: dict[str, Any] = {"rate": rate} | ({"note": note} if note else {})
+        self._progress.update(self._task, completed=done, **more)
         if not self._progress.console.is_terminal and now - self._reported >= LOG_PERIOD_S:
             self._reported = now
-            rate = done / max(now - self._began, 1e-9)
-            _log.info(self._what, done=done, total=self._total, rate=f"{rate:.2f} {self._unit}/s", **more)
+            _log.info(self._what, done=done, total=self._total, **more)
 
 
 @contextmanager
@@ -185,7 +176,7 @@ def frame_progress(
         TextColumn("{task.description}", "bold", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        _RateColumn(unit),
+        TextColumn("{task.fields[rate]}", "cyan", markup=False),
         TextColumn("eta"),
         TimeRemainingColumn(),
         TimeElapsedColumn(),
@@ -194,13 +185,3 @@ def frame_progress(
     console = stderr_console()
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         yield FrameProgress(progress, what, total, unit, stop)
-
-
-class _RateColumn(ProgressColumn):
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.1f} {self._unit}/s", style="cyan")

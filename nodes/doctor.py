@@ -55,11 +55,8 @@ def _packages() -> Iterator[Check]:
                 wrong.append(f"{requirement.name} {version}, not {requirement.specifier}")
         except metadata.PackageNotFoundError:
             wrong.append(f"{requirement.name} is missing")
-    python = f"Python {platform.python_version()} at {sys.executable}"
-    if wrong:
-        yield Check("packages", "bad", f"{python}: {'; '.join(wrong)}", "make setup")
-    else:
-        yield Check("packages", "ok", f"all that is needed, {python}")
+    found = f"{'; '.join(wrong) or 'all that is needed'}, Python {platform.python_version()} at {sys.executable}"
+    yield Check("packages", "bad" if wrong else "ok", found, "make setup" if wrong else "")
 
 
 def _open3d() -> Iterator[Check]:
@@ -129,11 +126,11 @@ def _sockets() -> Iterator[Check]:
 
 def _machine() -> Iterator[Check]:
     yield Check("CPU", "ok", f"{usable_cores()} cores, {platform.machine()}")
-    free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
-    total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
+    pages, total_pages = os.sysconf("SC_AVPHYS_PAGES"), os.sysconf("SC_PHYS_PAGES")
+    free, total = (count * os.sysconf("SC_PAGE_SIZE") / 1e9 for count in (pages, total_pages))
     small = total < MEMORY_GB
-    fix = "use a larger --voxel-size" if small else ""
-    yield Check("memory", "note" if small else "ok", f"{total:.1f} GB, {free:.1f} GB free", fix)
+    found = f"{total:.1f} GB, {free:.1f} GB free"
+    yield Check("memory", "note" if small else "ok", found, "use a larger --voxel-size" if small else "")
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     full = free < DISK_GB
     fix = "free some space; logs and maps take gigabytes" if full else ""

@@ -97,7 +97,7 @@ class QueryService(Closing):
         self._map = voxel_map
         self._correction = correction
         self._weights = weights
-        self._moving = moving
+        self._moving = moving or MovingSpace()
         self._pose_in_map = pose_in_map or PoseInMap()
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
@@ -259,7 +259,7 @@ class QueryService(Closing):
                 about = (snapshot.block_count, snapshot.voxel_size_m, snapshot.truncation_voxels, snapshot.label_set)
                 return questions.MapInfo(self.map_id, snapshot.version, snapshot.epoch, *about, snapshot.scale_known)
             case questions.AtRequest():
-                return at(self._with_moving(snapshot), request.points, request.radius_m)
+                return at(snapshot.with_moving(self._moving.points), request.points, request.radius_m)
             case questions.NearestRequest():
                 return nearest(snapshot, request.class_name, request.point, request.min_confidence)
             case questions.RaysRequest():
@@ -269,10 +269,10 @@ class QueryService(Closing):
             case questions.InstancesRequest():
                 return self._find_instances(snapshot, request)
             case questions.OccupancyRequest():
-                return occupancy(self._with_moving(snapshot), request.points)
+                return occupancy(snapshot.with_moving(self._moving.points), request.points)
             case questions.DistanceRequest():
                 box, occupied = (request.lower, request.upper), request.unknown_is_occupied
-                return distance_field(self._with_moving(snapshot), *box, unknown_is_occupied=occupied)
+                return distance_field(snapshot.with_moving(self._moving.points), *box, unknown_is_occupied=occupied)
             case questions.ChangesRequest():
                 since = request.since if request.map_id in ("", self.map_id) else 0
                 return snapshot.changes(since, min(request.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
@@ -289,9 +289,6 @@ class QueryService(Closing):
                 return self._pose_in_map.last
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
-
-    def _with_moving(self, snapshot: MapSnapshot) -> MapSnapshot:
-        return snapshot if self._moving is None else snapshot.with_moving(self._moving.points)
 
     def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> questions.InstanceArrays:
         # Out of there while it updates: one that fails half way is not used again.

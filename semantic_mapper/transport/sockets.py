@@ -284,7 +284,6 @@ class _Subscriber(Closing):
         self.endpoints = (endpoints,) if isinstance(endpoints, str) else tuple(endpoints)
         self.topics = tuple(topics)
         self.rejected = 0
-        self.last_error: CodecError | None = None
         self._hwm = hwm
         self._changed = threading.Condition()
         # What waits to be read, in order: by topic where messages give way to newer ones, else by serial number. One
@@ -295,8 +294,7 @@ class _Subscriber(Closing):
         self._sync_topic = SYNC_PREFIX + uuid.uuid4().hex.encode() + b"/"
         self._synced = 0
         self._identity = identity
-        self._closed = False
-        self._failure: zmq.ZMQError | None = None  # of the thread that takes messages off the socket
+        self._over = ""  # why nothing comes any more
         self._max_bytes = max(_OF_TOPIC.get(topic.partition("/")[0], MAX_MESSAGE_BYTES) for topic in self.topics)
         options = {**_SUBSCRIBER_OPTIONS, zmq.RCVHWM: hwm, zmq.MAXMSGSIZE: min(MAX_PART_BYTES, self._max_bytes)}
         try:
@@ -329,15 +327,16 @@ class _Subscriber(Closing):
     def wait_until_heard(self, timeout_s: float = 10.0) -> None:
         """Block until every publisher knows of our subscriptions: what it sends from then on arrives.
         ``TransportError`` where it takes longer than ``timeout_s``."""
+        count = len(self.endpoints)
         with self._changed:
-            self._changed.wait_for(lambda: self._synced >= len(self.endpoints) or self._failure is not None, timeout_s)
-            self._check_receiving()
-            if self._synced < len(self.endpoints):
-                raise TransportError(
-                    f"{self._synced} of {len(self.endpoints)} publishers at {', '.join(self.endpoints)} have answered "
-                    f"within {timeout_s:g} s; is the other node running?"
-                    + (" Does it know this machine's key, and is its own the one we have?" if self._identity else "")
-                )
+            self._changed.wait_for(lambda: self._synced >= count or bool(self._over), timeout_s)
+            if self._synced >= count and not self._over:
+                return
+            why = self._over or (
+                f"{self._synced} of {count} publishers have answered within {timeout_s:g} s; is the other node running?"
+                + (" Does it know this machine's key, and is its own the one we have?" if self._identity else "")
+            )
+            raise TransportError(f"{', '.join(self.endpoints)}: {why}")
 
     def receive(self, timeout_s: float | None = None) -> Message | None:
         """The message that has waited longest, decoded; None when none came in time (``timeout_s`` None: wait for
@@ -359,11 +358,10 @@ class _Subscriber(Closing):
     def receive_parts(self, timeout_s: float | None = None) -> list[bytes] | None:
         """As ``receive``, as it came over the wire, its header checked: for who may not want what is in it."""
         with self._changed:
-            self._changed.wait_for(lambda: bool(self._waiting) or self._closed or self._failure is not None, timeout_s)
-            if self._closed:
-                raise TransportError(f"{self.endpoints}: the subscriber is closed")
+            self._changed.wait_for(lambda: bool(self._waiting) or bool(self._over), timeout_s)
+            if not self._waiting and self._over:
+                raise TransportError(f"{', '.join(self.endpoints)}: {self._over}")
             if not self._waiting:
-                self._check_receiving()
                 return None
             parts = self._waiting.pop(next(iter(self._waiting)))
             self._changed.notify_all()  # there is room again
@@ -371,21 +369,23 @@ class _Subscriber(Closing):
 
     def close(self) -> None:
         """Stop the thread and free the socket. Harmless when repeated."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+        self._end("the subscriber is closed")
         self._thread.join()
+        self._waiting.clear()
+
+    def _end(self, why: str) -> None:
+        with self._changed:
+            self._over = self._over or why
+            self._changed.notify_all()
 
     def _run(self) -> None:
         try:
-            while not self._closed:
+            while not self._over:
                 self._connections.follow()
                 if self._socket.poll(_POLL_MS):
                     self._take(*receive_bounded(self._socket, max_bytes=self._max_bytes))
         except zmq.ZMQError as error:
-            with self._changed:
-                self._failure = error
-                self._changed.notify_all()
+            self._end(f"nothing is received any more: {error}; subscribe again")
         finally:
             self._connections.close()  # by the thread that used it
 
@@ -413,22 +413,15 @@ class _Subscriber(Closing):
 
     def _reject(self, error: CodecError) -> None:
         self.rejected += 1
-        self.last_error = error
         if is_power_of_two(self.rejected):
             log.warning("message_rejected", endpoints=self.endpoints, rejected=self.rejected, error=str(error))
-
-    def _check_receiving(self) -> None:
-        if self._failure is not None:
-            raise TransportError(
-                f"{self.endpoints}: nothing is received any more: {self._failure}; subscribe again"
-            ) from self._failure
 
 
 class LosslessSubscriber(_Subscriber):
     """Gets every message, in order; with a ``Publisher`` of policy "block" none is lost. Arguments: ``_Subscriber``."""
 
     def _put(self, parts: list[bytes], queue: str) -> None:
-        self._changed.wait_for(lambda: len(self._waiting) < self._hwm or self._closed)
+        self._changed.wait_for(lambda: len(self._waiting) < self._hwm or bool(self._over))
         self._serial += 1
         self._waiting[self._serial] = parts
 

@@ -275,7 +275,7 @@ def test_a_message_of_too_many_parts_or_too_much_in_them_costs_itself_only(endpo
         other.send_multipart(encode_frame(samples.make_frame(5)))
         frame = subscriber.receive(WAIT_S)
         assert isinstance(frame, PosedFrame) and frame.seq == 5
-        assert subscriber.rejected == 2 and "5 parts of 33" in str(subscriber.last_error)
+        assert subscriber.rejected == 2
 
 
 def test_an_answer_of_too_many_parts_is_an_error_and_the_next_one_is_not() -> None:
