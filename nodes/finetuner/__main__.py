@@ -1,6 +1,30 @@
-"""The process of a finetuner node."""
+"""The process of a finetuner: its priority and its threads. ``finetuner.py`` has what it does."""
 
-from semantic_mapper.nodes.finetuner.node import main
+from __future__ import annotations
+
+import os
+from typing import NoReturn
+
+from semantic_mapper.nodes.node import NodeContext, run_node
+from semantic_mapper.nodes.options import FinetunerOptions, NodeJob
+
+
+def run(context: NodeContext, options: FinetunerOptions) -> None:
+    """Learn until a stop request, with the threads and the priority of the options, which threads inherit."""
+    os.environ["OMP_NUM_THREADS"] = str(options.threads)
+    os.setpriority(os.PRIO_PROCESS, 0, max(options.niceness, os.getpriority(os.PRIO_PROCESS, 0)))
+    import torch
+
+    from semantic_mapper.nodes.finetuner import finetuner  # loads torch, in the threads that were set
+
+    torch.set_num_threads(options.threads)  # a forked process has read the variable before
+    finetuner.run_finetuner(context, options)
+
+
+def main(job: NodeJob | None = None) -> NoReturn:
+    """Run the node of this process to its end, then exit."""
+    run_node(FinetunerOptions, run, job)
+
 
 if __name__ == "__main__":
     main()

@@ -22,8 +22,8 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.finetuner import finetuner
+from semantic_mapper.nodes.finetuner.__main__ import run as run_finetuner
 from semantic_mapper.nodes.finetuner.finetuner import FinetuneRound
-from semantic_mapper.nodes.finetuner.node import run_finetuner
 from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
 from semantic_mapper.nodes.process import run_when_idle
