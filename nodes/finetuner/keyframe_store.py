@@ -97,7 +97,10 @@ class LearningStore:
         record = self._read_record()
         for file in record.keyframes:
             try:
-                keyframe = self._read(file.digest)
+                data = read_regular(self._path(file.digest), MAX_FILE_BYTES)
+                if digest_of(data) != file.digest:
+                    raise CodecError("the file is damaged")
+                keyframe = decode_as(LabelledKeyframe, unpack_parts(data))
                 pool.restore(Kept(keyframe.frame, file.held_out, file.proved_at, file.trials), keyframe.label_set)
             except (SemanticMapperError, FileNotFoundError) as error:
                 _log.warning("keyframe_lost", file=file.digest, reason=str(error))
@@ -112,12 +115,6 @@ class LearningStore:
         except (ConfigError, ValueError) as error:
             _log.warning("keyframes_lost", reason=f"{path}: {error}")
         return _Record()
-
-    def _read(self, digest: str) -> LabelledKeyframe:
-        data = read_regular(self._path(digest), MAX_FILE_BYTES)
-        if digest_of(data) != digest:
-            raise CodecError("the file is damaged")
-        return decode_as(LabelledKeyframe, unpack_parts(data))
 
     def _save(self, frame: PosedFrame) -> str:
         for digest, saved in self._saved.items():

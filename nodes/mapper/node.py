@@ -100,21 +100,15 @@ class MapperNode:
             self._weights: LiveWeights | None = None
             if options.learner:
                 self._weights = stack.enter_context(LiveWeights(context, options, self._bundle, self._publisher))
-            self._queries = stack.enter_context(self._answer_queries()) if options.query else None
+            self._queries: QueryService | None = None
+            if options.query:
+                keys = load_keys(Path(options.keys).expanduser()) if options.keys else None
+                moving, pose_in_map = self._pipeline.moving.space, self._pipeline.pose_in_map
+                endpoint, parts = context.endpoint(options.query), (self._correction, keys, self._weights)
+                service = QueryService(endpoint, self._bundle.voxel_map, *parts, moving, pose_in_map)
+                self._queries = stack.enter_context(service)
             self._resources = stack.pop_all()
         _log.info("ready", weights=self._bundle.weights_path.name, input=options.cameras, delivery=options.delivery)
-
-    def _answer_queries(self) -> QueryService:
-        keys = self._options.keys
-        return QueryService(
-            self._context.endpoint(self._options.query),
-            self._bundle.voxel_map,
-            self._correction,
-            load_keys(Path(keys).expanduser()) if keys else None,
-            self._weights,
-            self._pipeline.moving.space,
-            self._pipeline.pose_in_map,
-        )
 
     def __enter__(self) -> Self:
         return self

@@ -575,9 +575,21 @@ class QuerySocket(Closing):
             for _ in range(self._attempts):
                 if self._closed:
                     raise TransportError(f"{self.endpoint}: the client is closed")
-                answer = self._ask_once(parts)
-                if answer is not None:
-                    return answer
+                answered = False
+                try:
+                    self._socket.send_multipart(parts, copy=False)
+                    answered = bool(self._socket.poll(int(self._timeout_s * 1000), zmq.POLLIN))
+                    if answered:
+                        answer, trouble = receive_bounded(self._socket, max_bytes=MAX_PARTS * MAX_PART_BYTES)
+                        if trouble:
+                            raise TransportError(f"{self.endpoint}: {trouble}")
+                        return answer
+                except zmq.Again:
+                    continue
+                finally:  # also after Ctrl-C: a REQ socket that has sent can only wait for that answer
+                    if not answered:
+                        self._socket.close()
+                        self._socket = self._connect()
         raise TransportError(
             f"{self.endpoint}: no answer within {self._attempts} x {self._timeout_s:g} s; is a mapper running, and "
             "does it answer questions there (option `query`)?"
@@ -589,24 +601,6 @@ class QuerySocket(Closing):
         with self._lock:
             self._closed = True
             self._socket.close()
-
-    def _ask_once(self, parts: Sequence[Buffer]) -> list[bytes] | None:
-        answered = False
-        try:
-            self._socket.send_multipart(parts, copy=False)
-            answered = bool(self._socket.poll(int(self._timeout_s * 1000), zmq.POLLIN))
-            if not answered:
-                return None
-            answer, trouble = receive_bounded(self._socket, max_bytes=MAX_PARTS * MAX_PART_BYTES)
-            if trouble:
-                raise TransportError(f"{self.endpoint}: {trouble}")
-            return answer
-        except zmq.Again:
-            return None
-        finally:  # also after Ctrl-C: a REQ socket that has sent can only wait for that answer
-            if not answered:
-                self._socket.close()
-                self._socket = self._connect()
 
     def _connect(self) -> zmq.Socket[bytes]:
         options = {**_CLIENT_OPTIONS, zmq.SNDTIMEO: int(self._timeout_s * 1000)}
