@@ -19,20 +19,15 @@ def test_default_endpoints_are_the_same_for_all_processes_and_differ_by_name(mon
     assert one == default_endpoint("camera") == f"ipc://{tmp_path}/semantic-mapper/default/camera"
     assert other != one
     assert (tmp_path / "semantic-mapper").stat().st_mode & 0o077 == 0
+    for name in ("", "../x", "a/b", ".hidden", "a b"):
+        with pytest.raises(TransportError):
+            default_endpoint(name)
 
 
-@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "a b"])
-def test_a_name_that_would_leave_the_folder_is_refused(name: str) -> None:
-    with pytest.raises(TransportError):
-        default_endpoint(name)
-
-
-@pytest.mark.parametrize(
-    "topic", [b"", b"frame", b"frame/", b"frame/a", b"frame/a/b", b"frames/a/", b"\xff/a/", b"frame/ /"]
-)
-def test_foreign_topics_are_refused(topic: bytes) -> None:
-    with pytest.raises(CodecError):
-        parse_topic(topic)
+def test_foreign_topics_are_refused() -> None:
+    for topic in (b"", b"frame", b"frame/", b"frame/a", b"frame/a/b", b"frames/a/", b"\xff/a/", b"frame/ /"):
+        with pytest.raises(CodecError):
+            parse_topic(topic)
 
 
 @pytest.mark.parametrize("server", ["publisher", "queries"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -194,11 +193,3 @@ def test_a_restarted_mapper_goes_on_with_the_weights_that_its_forerunner_used(le
         assert (learner.in_use().digest, learner.in_use().newest) == (digest, 3)
         assert learner.client.weights().before == 0
         learner.robot.end(6)
-
-
-def test_a_mapper_without_a_learner_says_so(weights, tmp_path):
-    with running_robot(weights, tmp_path / "out", 0) as robot, MapClient(robot.query, timeout_s=60) as client:
-        with pytest.raises(MapError, match="takes no weights while it runs"):
-            client.weights()
-        robot.send(list(FRAMES[:1]))
-        assert json.loads(json.dumps(robot.end(1)))["weights"]["learned"] is None

@@ -310,10 +310,6 @@ def test_nobody_at_home(endpoint: str) -> None:
                 QueryService(endpoint, small_map(LABELS))
     with pytest.raises(TransportError, match="the client is closed"):
         client.info()
-    with pytest.raises(TransportError, match="other machines could connect, which needs keys"):
-        QueryService("tcp://0.0.0.0:5555", small_map(LABELS))
-    with pytest.raises(TransportError, match="nowhere: no endpoint; endpoints read ipc://PATH"):
-        MapClient("nowhere")
 
 
 def test_a_mapper_that_nobody_asks_is_not_looked_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
