@@ -157,7 +157,7 @@ class QueryService(Closing):
 
     def _copy(self, limit: int) -> None:
         changes = self._map.copy_changes(self._copied_version, limit)
-        self._copied_version = changes.version
+        self._copied_version = changes.result.version
         self._copies.append(changes)
         self._server.wake()
 
@@ -185,7 +185,7 @@ class QueryService(Closing):
                 self._copied_at, self._map_is_busy = time.monotonic(), False
         except Exception:  # noqa: BLE001 -- whatever it is, the mapper continues
             self._broken = True
-            _log.exception("snapshot_failed", version=self._copies[0].version)
+            _log.exception("snapshot_failed", version=self._copies[0].result.version)
 
     def _take(self, address: bytes, parts: list[bytes]) -> None:
         """Pass a question on to a worker, or let it wait for a snapshot."""

@@ -17,7 +17,7 @@ from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, PackedBlocks
-from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8
+from semantic_mapper.types import Bool, Int32, Int64, UInt8
 
 TSDF_STEPS = 127  # of the quantised TSDF, a truncation
 UNOBSERVED = -128  # in the quantised TSDF
@@ -78,7 +78,6 @@ class BlockChanges:
 class Decision(NamedTuple):
     """How class evidence is read: see ``surface``. Voxels of less than ``min_weight`` are not observed."""
 
-    label_set: LabelSet
     vote_discount: float
     unknown_below: float
     min_weight: float
@@ -88,44 +87,30 @@ class Decision(NamedTuple):
 class CopiedChanges:
     """Blocks of a map as they were, not compact yet: what a thread that must not be held up hands to another one."""
 
-    # since, version, newest, epoch, keys, scale_known, cleared: of the result
-    since: int
-    version: int
-    newest: int
-    epoch: int
-    keys: Int32
-    decision: Decision  # how it is read
+    result: BlockChanges  # of ``empty_changes``, to be filled
     parts: Iterable[tuple[Int64, PackedBlocks]]  # rows of the result, and the blocks there
-    scale_known: bool = True
-    cleared: ClearedBlocks = NONE_CLEARED
+    label_set: LabelSet
+    decision: Decision
 
     def compact(self) -> BlockChanges:
-        """The blocks as they were; any thread may call it, without the map."""
-        flat = (len(self.keys), BLOCK_VOXELS)
-        tsdf = np.empty(flat, np.int8)
-        label, confidence, computed = (np.empty(flat, np.uint8) for _ in range(3))
-        rgb = np.empty((*flat, 3), np.uint8)
-        labels, vote_discount, unknown_below, min_weight = self.decision
-        ids = np.array((*labels.ids, labels.ignore_id), np.uint8)
+        """The blocks as they were; any thread may call it, once, without the map."""
+        to, ids = self.result, np.array((*self.label_set.ids, self.label_set.ignore_id), np.uint8)
+        assert to.computed is not None
+        voxels = to.tsdf, to.label, to.confidence, to.rgb, to.computed
         for rows, blocks in self.parts:
-            _compact_blocks(
-                blocks.data,
-                blocks.ends,
-                np.ascontiguousarray(rows),
-                ids,
-                vote_discount,
-                unknown_below,
-                min_weight,
-                tsdf,
-                label,
-                confidence,
-                rgb,
-                computed,
-            )
+            _compact_blocks(blocks, np.ascontiguousarray(rows), ids, self.decision, *voxels)
             del blocks  # while the next ones are read
-        since, version, newest, epoch = self.since, self.version, self.newest, self.epoch
-        read = self.keys, tsdf, label, confidence, rgb
-        return BlockChanges(since, version, newest, epoch, *read, self.scale_known, computed, self.cleared)
+        return to
+
+
+def empty_changes(
+    since: int, version: int, newest: int, epoch: int, keys: Int32, *, scale_known: bool, cleared: ClearedBlocks
+) -> BlockChanges:
+    """Changes of blocks (B, 3) whose voxels are still to be filled."""
+    flat = (len(keys), BLOCK_VOXELS)
+    label, confidence, computed = (np.empty(flat, np.uint8) for _ in range(3))
+    voxels = np.empty(flat, np.int8), label, confidence, np.empty((*flat, 3), np.uint8)
+    return BlockChanges(since, version, newest, epoch, keys, *voxels, scale_known, computed, cleared)
 
 
 def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, PackedBlocks]]:
@@ -136,8 +121,8 @@ def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, Packed
 
 
 def oldest_first(versions: Int64, limit: int, newest: int) -> tuple[Int64, int]:
-    """Which of the changed blocks (B,) come first: whole versions, at least one, and else at most ``limit`` blocks (0
-    = all).
+    """Which of the changed blocks (B,) come first: whole versions, at least one, and else at most ``limit`` blocks (0 =
+    all).
 
     Returns:
         Their positions, ascending, and the version that they complete; ``newest`` is the map's.
@@ -153,13 +138,10 @@ def oldest_first(versions: Int64, limit: int, newest: int) -> tuple[Int64, int]:
 # Serial: it runs next to the mapper, which needs the other threads.
 @kernel
 def _compact_blocks(
-    data: Float32,
-    ends: Int64,
+    blocks: PackedBlocks,
     rows: Int64,
     ids: UInt8,
-    vote_discount: float,
-    unknown_below: float,
-    min_weight: float,
+    decision: Decision,
     tsdf: NDArray[np.int8],
     label: UInt8,
     confidence: UInt8,

@@ -31,7 +31,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, KEY_LIMIT, BlockValues, PackedBlocks, pack_blocks, pack_keys
-from semantic_mapper.mapping.changes import BlockChanges, CopiedChanges, Decision
+from semantic_mapper.mapping.changes import NONE_CLEARED, BlockChanges, CopiedChanges, Decision, empty_changes
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Int32, Int64
@@ -74,8 +74,7 @@ _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeEr
 
 
 class MapChunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Blocks that are stored together: how many, how many of their voxels are measured and have votes, and the SHA-256
-    of their arrays in the order of the file."""
+    """Blocks that are stored together, their voxels that are measured and that have votes, SHA-256 of their arrays."""
 
     blocks: Annotated[int, msgspec.Meta(ge=1, le=CHUNK_BLOCKS)]
     measured: Annotated[int, msgspec.Meta(ge=0, le=CHUNK_BLOCKS * BLOCK_VOXELS)]
@@ -84,8 +83,7 @@ class MapChunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlaceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The places that the map is found again by (``localization.places``), the features of all of them, and the names
-    of the cameras that have seen them."""
+    """The places that the map is found again by (``localization.places``), their features, the cameras of them."""
 
     places: NotNegative
     features: NotNegative
@@ -100,7 +98,6 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     version: int = FORMAT_VERSION
     config: VoxelMapConfig
     label_set: LabelSet
-    # frames, last_stamp_ns: Frames fused so far, and stamp of the last of them, 0 before the first.
     frames: NotNegative
     last_stamp_ns: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
     blocks: NotNegative = 0  # blocks of 8^3 voxels
@@ -119,11 +116,7 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 def parse_manifest(content: bytes, where: str) -> MapManifest:
-    """Read a manifest and check it.
-
-    Raises:
-        MapError: it is not one, of another format version, or says what cannot be.
-    """
+    """Read a manifest and check it: ``MapError`` where it is none, of another version, or says what cannot be."""
     try:
         plain = msgspec.json.decode(content, type=dict[str, Any])
         kind, version = plain["format"], plain["version"]
@@ -140,27 +133,20 @@ def parse_manifest(content: bytes, where: str) -> MapManifest:
         manifest = convert_config(plain, MapManifest, where)
     except ConfigError as error:
         raise MapError(f"{error}. {ADVICE}") from error
-    if manifest.blocks != sum(chunk.blocks for chunk in manifest.chunks):
-        raise MapError(f"{where}: its chunks do not hold {manifest.blocks} blocks. {ADVICE}")
-    if manifest.blocks > manifest.config.max_blocks:
-        raise MapError(f"{where}: {manifest.blocks} blocks, but max_blocks {manifest.config.max_blocks}. {ADVICE}")
-    for n, chunk in enumerate(manifest.chunks):
-        if max(chunk.measured, chunk.voted) > chunk.blocks * BLOCK_VOXELS:
-            raise MapError(f"{where}: chunk {n} has more voxels than its {chunk.blocks} blocks can hold. {ADVICE}")
+    chunks, blocks = manifest.chunks, manifest.blocks
+    fits = blocks == sum(chunk.blocks for chunk in chunks) and blocks <= manifest.config.max_blocks
+    if not fits or any(max(c.measured, c.voted) > c.blocks * BLOCK_VOXELS for c in chunks):
+        raise MapError(f"{where}: its chunks do not hold {blocks} blocks, or more than max_blocks allows. {ADVICE}")
     return manifest
 
 
 def write_map(
-    path: Path,
-    manifest: MapManifest,
-    parts: Iterable[BlockPart],
-    places: Sequence[Place] = (),
+    path: Path, manifest: MapManifest, parts: Iterable[BlockPart], places: Sequence[Place] = ()
 ) -> MapManifest:
     """Write a map, replacing a file of that name in one step; returns the manifest as written.
 
     Args:
-        path: The file.
-        manifest: Its settings, classes and counters; what depends on the blocks is filled in here.
+        manifest: Settings, classes and counters; what depends on the blocks is filled in here.
         parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
         places: What the map is found again by.
 
@@ -177,11 +163,12 @@ def write_map(
             for keys, values in parts:
                 chunks.append(_write_chunk(archive, len(chunks), keys, values))
                 corners += [keys.min(axis=0), keys.max(axis=0) + 1]
-            blocks = sum(chunk.blocks for chunk in chunks)
-            bounds = _bounds_m(corners, manifest.config.voxel_size_m)
-            found = _write_places(archive, places) if places else None
             manifest = msgspec.structs.replace(
-                manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks), places=found
+                manifest,
+                blocks=sum(chunk.blocks for chunk in chunks),
+                bounds_m=_bounds_m(corners, manifest.config.voxel_size_m),
+                chunks=tuple(chunks),
+                places=_write_places(archive, places) if places else None,
             )
             content = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
             with archive.open(_MANIFEST, "w") as member:
@@ -189,8 +176,7 @@ def write_map(
             archive.comment = _comment(content)
     except OSError as error:
         raise MapError(
-            f"{path}: cannot write the map: {error.strerror or error}. What is there is whole, the old map or the new "
-            "one; make room, or choose another folder"
+            f"{path}: cannot write the map: {error.strerror or error}; make room, or choose another folder"
         ) from error
     return manifest
 
@@ -214,12 +200,10 @@ def open_map(path: Path) -> Iterator[MapReader]:
     """
     try:
         file = open_regular(path)
-    except ConfigError as error:
-        raise MapError(f"{path}: damaged or not a map: it is no regular file; copy its content to one") from error
     except FileNotFoundError as error:
         raise MapError(f"{path}: no such map file") from error
-    except OSError as error:
-        raise MapError(f"{path}: damaged or not a map: {error.strerror}") from error
+    except (ConfigError, OSError) as error:
+        raise MapError(f"{path}: damaged or not a map: {error}") from error
     with file:
         with _explained(f"{path}: damaged or not a map"):
             archive = zipfile.ZipFile(file)
@@ -228,14 +212,10 @@ def open_map(path: Path) -> Iterator[MapReader]:
 
 
 class MapReader:
-    """A saved map that is open.
+    """A saved map that is open; ``manifest`` is checked.
 
-    Args:
-        manifest: What it says of itself, checked.
-
-    Attributes:
-        digest: SHA-256 of the manifest as it stands in the file: that of the map, as it holds those of all chunks.
-    """
+    ``digest`` is the SHA-256 of the manifest as it stands in the file: that of the map, as it holds those of all
+    chunks."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, manifest: MapManifest) -> None:
         self.manifest = manifest
@@ -244,11 +224,7 @@ class MapReader:
         self._archive = archive
 
     def parts(self) -> Iterator[BlockPart]:
-        """All blocks in lexicographic order, a chunk at a time, each checked before it is given out.
-
-        Raises:
-            MapError: a chunk is damaged; says which.
-        """
+        """All blocks in lexicographic order, a chunk at a time, each checked: ``MapError`` says which is damaged."""
         last = -1
         for n, chunk in enumerate(self.manifest.chunks):
             where = f"{self._path}: chunk {n} of {len(self.manifest.chunks)}"
@@ -266,12 +242,13 @@ class MapReader:
         Raises:
             MapError: a chunk is damaged, or there is no memory.
         """
-        saved = self.manifest
-        decision = Decision(saved.label_set, saved.config.vote_discount, saved.config.unknown_below, SURFACE_WEIGHT)
+        saved, config = self.manifest, self.manifest.config
+        decision = Decision(config.vote_discount, config.unknown_below, SURFACE_WEIGHT)
         try:
             keys = np.empty((saved.blocks, 3), np.int32)
-            packed, frames = self._packed_into(keys), saved.frames
-            return CopiedChanges(0, frames, frames, 0, keys, decision, packed, saved.scale_known).compact()
+            versions = 0, saved.frames, saved.frames, 0
+            result = empty_changes(*versions, keys, scale_known=saved.scale_known, cleared=NONE_CLEARED)
+            return CopiedChanges(result, self._packed_into(keys), saved.label_set, decision).compact()
         except MemoryError as error:
             raise MapError(f"{self._path}: no memory for its {saved.blocks:,} blocks: {error}") from error
 
@@ -286,11 +263,7 @@ class MapReader:
             del values  # while the next ones are read
 
     def places(self) -> tuple[Place, ...]:
-        """What the map is found again by; nothing where it does not say.
-
-        Raises:
-            MapError: what it says is damaged.
-        """
+        """What the map is found again by, nothing where it does not say; ``MapError`` where it is damaged."""
         table = self.manifest.places
         if table is None:
             return ()

@@ -69,12 +69,16 @@ def test_a_copy_is_made_compact_later_and_is_of_its_moment(memory_mb: int) -> No
         at_once, copied = voxel_map.changes(since, limit), voxel_map.copy_changes(since, limit)
         walk(voxel_map, 2)
         later = copied.compact()
-        assert (later.since, later.version, later.epoch) == (since, copied.version, 0) == (since, at_once.version, 0)
+        assert (
+            (later.since, later.version, later.epoch)
+            == (since, copied.result.version, 0)
+            == (since, at_once.version, 0)
+        )
         for name in FIELDS:
             np.testing.assert_array_equal(getattr(later, name), getattr(at_once, name), err_msg=name)
         assert len(later.keys) > 300
     assert (voxel_map.stored_blocks > 0) == (memory_mb > 0)
-    with pytest.raises(MapError, match="from 0 to 12"):
+    with pytest.raises(MapError, match="versions 0 to 12"):
         voxel_map.copy_changes(13)
 
 
@@ -90,9 +94,8 @@ def test_voxels_are_rounded_as_plain_numpy_rounds_them(rng: np.random.Generator)
     tsdf, label, confidence = np.empty((3, 512), np.int8), np.empty((3, 512), np.uint8), np.empty((3, 512), np.uint8)
     rgb = np.empty((3, 512, 3), np.uint8)
     computed = np.empty((3, 512), np.uint8)
-    changes_module._compact_blocks(
-        packed.data, packed.ends, rows, ids, 0.3, 0.4, 0.25, tsdf, label, confidence, rgb, computed
-    )
+    decision = changes_module.Decision(0.3, 0.4, 0.25)
+    changes_module._compact_blocks(packed, rows, ids, decision, tsdf, label, confidence, rgb, computed)
     for row, block in zip(rows, order, strict=True):
         seen, value = values.weight[block] >= 0.25, values.tsdf[block].astype(float)
         steps = np.nan_to_num(np.rint(np.clip(value, -1, 1) * 127))

@@ -127,7 +127,7 @@ def test_what_is_wrong_is_named(saved: tuple[VoxelMap, Path]) -> None:
         ({"chunks": []}, "its chunks do not hold 72 blocks"),
         ({"frames": None}, "manifest.json.*frames"),
         ({"frames": -1}, "manifest.json.*frames"),
-        ({"config": {"max_blocks": 50}}, "72 blocks, but max_blocks 50"),
+        ({"config": {"max_blocks": 50}}, "72 blocks, or more than max_blocks"),
     ]
     for change, message in cases:
         path.write_bytes(good)
