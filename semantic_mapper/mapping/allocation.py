@@ -38,14 +38,8 @@ class Camera(NamedTuple):
 
 def make_camera(intrinsics: CameraIntrinsics, T_world_camera: Float64) -> Camera:
     """Camera of a checked pose."""
-    return Camera(
-        float(intrinsics.fx),
-        float(intrinsics.fy),
-        float(intrinsics.cx),
-        float(intrinsics.cy),
-        np.ascontiguousarray(T_world_camera[:3, :3], np.float64),
-        np.ascontiguousarray(T_world_camera[:3, 3], np.float64),
-    )
+    R, t = (np.ascontiguousarray(part, np.float64) for part in (T_world_camera[:3, :3], T_world_camera[:3, 3]))
+    return Camera(float(intrinsics.fx), float(intrinsics.fy), float(intrinsics.cx), float(intrinsics.cy), R, t)
 
 
 def frame_budget(max_blocks: int) -> int:
@@ -63,8 +57,6 @@ def blocks_in_band(
 ) -> Int64:
     """Packed keys (B,) of the blocks that rays cross within ``truncation_m`` of their depth, sorted, each once.
 
-    Time and memory are bounded: by the pixels times ``MAX_CROSSINGS``, and by ``budget``.
-
     Raises:
         FrameError: the camera stands so far from the origin that block coordinates overflow, a ray would cross more
             than ``MAX_CROSSINGS`` blocks, or all rays together more than ``budget``.
@@ -74,15 +66,14 @@ def blocks_in_band(
     reach = float(np.abs(camera.t).max()) + slope * (depth_max_m + truncation_m)
     if not reach / block_m < KEY_LIMIT:  # NaN, too
         raise FrameError(
-            f"the camera is at {camera.t} m and sees up to {slope * depth_max_m:.4g} m far, beyond the "
-            f"{KEY_LIMIT * block_m / 1000:.0f} km that a map of {voxel_size_m} m voxels can address; give poses "
-            "relative to a nearer origin, and check the intrinsics"
+            f"the camera is at {camera.t} m and sees beyond the {KEY_LIMIT * block_m / 1000:.0f} km that a map of "
+            f"{voxel_size_m} m voxels can address; give poses relative to a nearer origin, and check the intrinsics"
         )
     crossings = slope * 2 * (truncation_m + voxel_size_m) / block_m * 3**0.5
     if crossings > MAX_CROSSINGS:
         raise FrameError(
-            f"a ray at the edge of the image crosses {crossings:.3g} blocks near the surface, at most {MAX_CROSSINGS} "
-            "are accepted; check the intrinsics, or lower voxel_map.truncation_voxels"
+            f"a ray at the edge of the image crosses {crossings:.3g} blocks near the surface, {MAX_CROSSINGS} may be; "
+            "check the intrinsics, or lower voxel_map.truncation_voxels"
         )
     depth, capacity = np.ascontiguousarray(depth_m), _FIRST_CAPACITY
     while True:
@@ -96,9 +87,8 @@ def blocks_in_band(
                 return found
         if counts.max() <= capacity or capacity >= budget:
             raise FrameError(
-                f"the frame touches more than {budget} blocks of {voxel_size_m} m voxels, its budget (1/{FRAME_SHARE} "
-                f"of voxel_map.max_blocks, at least {LEAST_FRAME_BUDGET}); check the depth and the intrinsics, use "
-                "larger voxels or a smaller voxel_map.depth_max_m, or raise voxel_map.max_blocks"
+                f"the frame touches more than {budget} blocks of {voxel_size_m} m voxels; check the depth and the "
+                "intrinsics, use larger voxels, lower voxel_map.depth_max_m, or raise voxel_map.max_blocks"
             )
         capacity *= 4  # a band of the image crosses unusually many blocks (fine voxels): again with more room
 

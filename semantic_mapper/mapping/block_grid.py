@@ -1,11 +1,11 @@
 """Storage of the map: sparse voxel blocks in one pool of memory, with one index, and growth in bounded steps.
 
 With a limit on memory, the blocks that were used longest ago go to a ``BlockStore`` on disk and come back, equal to the
-bit, when they are requested.
+bit, when they are requested. What brings blocks in raises ``MapError`` where the map would exceed ``max_blocks``, or
+the disk fails.
 
-A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block (x, y, z) is the point
-``(8 * (x, y, z) + (i, j, k)) * voxel_size_m`` in the world.
-"""
+A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block (x, y, z) is the point ``(8 * (x, y, z)
++ (i, j, k)) * voxel_size_m`` in the world."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ BLOCK_SIDE = 8
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
 EVICTED_AT_ONCE = 32  # at least, and
 EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting out what to evict looks at all of it
-TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
+TILE_BLOCKS = 4096  # blocks read at a time; Open3D fails past 262,100, and needs 8 KiB a block to mesh
 SPARE_SHARE = 1.5  # of what one frame touches, where memory is to have room for it without pushing the last one out
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
 _READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room next to both
@@ -71,16 +71,9 @@ class GridBuffers(NamedTuple):
 class BlockGrid:
     """Blocks of 8^3 voxels by their key; grows by half when full and never past ``max_blocks``, in memory and on disk.
 
-    Args:
-        voxel_size_m: Edge of a voxel.
-        classes: L, channels of the class evidence.
-        initial_blocks: Capacity at start.
-        max_blocks: At most.
-        memory_bytes: For blocks in memory; 0 = no limit.
-
-    Attributes:
-        watchers: Called with the packed keys that ``activate`` gets, before anything is done with them.
-    """
+    ``classes`` L are the channels of evidence, ``initial_blocks`` the capacity at start, ``memory_bytes`` those of
+    blocks in memory, 0 = no limit. ``watchers`` are called with the packed keys that ``activate`` gets, before it does
+    anything."""
 
     def __init__(
         self, voxel_size_m: float, classes: int, initial_blocks: int, max_blocks: int, memory_bytes: int = 0
@@ -96,7 +89,7 @@ class BlockGrid:
         capacity = max(1, min(initial_blocks, max_blocks))
         self._buffers = self._make_buffers(capacity)
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
-        self._store: BlockStore | None = None
+        self._store = BlockStore()
         self._warned_of_batches = False
         self._clock = 0
         # By buffer index:
@@ -121,17 +114,17 @@ class BlockGrid:
     @property
     def stored_count(self) -> int:
         """Blocks on disk."""
-        return 0 if self._store is None else len(self._store)
+        return len(self._store)
 
     @property
     def stored_bytes(self) -> int:
         """Bytes that the file of those on disk takes."""
-        return 0 if self._store is None else self._store.file_bytes
+        return self._store.file_bytes
 
     @property
     def stored_surface(self) -> Int64:
         """Packed keys, sorted, of blocks on disk that hold a surface."""
-        return np.empty(0, np.int64) if self._store is None else self._store.keys[self._store.surface]
+        return self._store.keys[self._store.surface]
 
     @property
     def capacity(self) -> int:
@@ -160,8 +153,7 @@ class BlockGrid:
 
     def all_packed(self) -> Int64:
         """Packed keys (B,) of all blocks, sorted."""
-        resident = self._packed[self._packed != _FREE]
-        return np.sort(resident if self._store is None else np.concatenate((resident, self._store.keys)))
+        return np.sort(np.concatenate((self._packed[self._packed != _FREE], self._store.keys)))
 
     def all_keys(self) -> Int32:
         """Keys (B, 3) of all blocks in lexicographic order."""
@@ -169,21 +161,15 @@ class BlockGrid:
 
     def keys_between(self, low: Int64, high: Int64) -> Int32:
         """Those of ``all_keys`` from ``low`` (3,) to ``high`` (3,), both included, without sorting the others."""
-        keys = self._buffers.keys[self._packed != _FREE]
-        if self._store is not None:
-            keys = np.concatenate((keys, unpack_keys(self._store.keys)))
+        keys = np.concatenate((self._buffers.keys[self._packed != _FREE], unpack_keys(self._store.keys)))
         keys = keys[((keys >= low) & (keys <= high)).all(axis=1)]
         return keys[np.argsort(pack_keys(keys))]
 
     def activate(self, packed: Int64) -> Int32:
         """Make sure that the blocks of unique packed keys (B,), about to change, are in memory; return indices (B,).
 
-        New ones are zero; those on disk come back as they were.
-
-        Raises:
-            MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory (``batches`` takes
-                any number of them), or the disk fails; no block has changed then.
-        """
+        New ones are zero; those on disk come back as they were. They have to fit in memory; ``batches`` takes any
+        number. After an error no block has changed."""
         for watcher in self.watchers:
             watcher(packed)
         found = self._bring_together(packed)
@@ -191,26 +177,21 @@ class BlockGrid:
         return found
 
     def batches(self, packed: Int64) -> Iterator[Int32]:
-        """``activate`` unique packed keys (B,) this many at a time as memory has room for.
+        """``activate`` unique packed keys (B,) this many at a time as memory has room for, checked as a whole first.
 
-        Yields:
-            Buffer indices of a part of them, valid until the next; one empty part where there are no keys.
-
-        Raises:
-            MapError: where the map would exceed ``max_blocks``, before the first part; or the disk fails.
-        """
+        Yields buffer indices of a part of them, valid until the next; one empty part where there are no keys."""
         if len(packed) > self._max_resident:
             found = find_blocks(self._index, packed)
             self._check_room(packed[found < 0])
             if not self._warned_of_batches:
                 self._warned_of_batches = True
+                advised = advised_mb(len(packed), self.block_bytes)
                 _log.warning(
                     "memory_is_short",
                     blocks=len(packed),
                     room=self._max_resident,
-                    reason="a frame touches more blocks than memory has room for: it goes through the disk part by "
-                    "part, which is slow; raise voxel_map.memory_mb to "
-                    f"{advised_mb(len(packed), self.block_bytes)} or more, or use larger voxels",
+                    reason="a frame touches more blocks than memory has room for and goes through the disk, which is "
+                    f"slow; raise voxel_map.memory_mb to {advised} or more, or use larger voxels",
                 )
             packed = packed[np.argsort(found < 0, kind="stable")]  # first those in memory: they need not come back
         for start in range(0, max(len(packed), 1), self._max_resident):
@@ -247,33 +228,24 @@ class BlockGrid:
         count = self.block_count
         versions = version + np.arange(count) // each
         self._version[indices] = versions[: len(indices)]
-        if self._store is not None:
-            self._store.versions = versions[len(indices) :].copy()
+        self._store.versions = versions[len(indices) :].copy()
         return version + max(count - 1, 0) // each
 
     def versions_since(self, version: int) -> tuple[Int64, Int64]:
         """Packed keys (B,) of all blocks that were changed after ``version``, sorted, and when each was: (B,)."""
         there = self._packed != _FREE
-        packed, versions = self._packed[there], self._version[there]
-        if self._store is not None:
-            packed = np.concatenate((packed, self._store.keys))
-            versions = np.concatenate((versions, self._store.versions))
+        packed = np.concatenate((self._packed[there], self._store.keys))
+        versions = np.concatenate((self._version[there], self._store.versions))
         newer = np.flatnonzero(versions > version)
         newer = newer[np.argsort(packed[newer])]
         return packed[newer], versions[newer]
 
     def tiles(self) -> Iterator[tuple[Int32, Int32, BlockGrid]]:
-        """All blocks, in lexicographic order, in parts that fit in memory.
-
-        Yields:
-            Keys (B, 3), their buffer indices (B,) in a grid, and that grid: this one where nothing is on disk, else a
-            temporary one, which also holds the next blocks along each axis.
-        """
-        if not self.stored_count:
-            yield (*self.sorted_blocks(), self)
-            return
+        """All blocks, in lexicographic order, in parts that fit in memory: keys (B, 3), their buffer indices (B,) in a
+        grid, and that grid: this one where nothing is on disk, else a temporary one, which also holds the next
+        blocks along each axis."""
         everything = self.all_packed()
-        for start in range(0, len(everything), TILE_BLOCKS):
+        for start in range(0, max(len(everything), 1), TILE_BLOCKS):
             part = everything[start : start + TILE_BLOCKS]
             around = np.unique(pack_keys((unpack_keys(part)[:, None] + NEIGHBOURS).reshape(-1, 3)))
             tile = self.holding(around[np.isin(around, everything)])
@@ -293,18 +265,14 @@ class BlockGrid:
         away = np.flatnonzero(found < 0)
         values = BlockValues(*(array[found] for array in self._buffers.values))
         if len(away):
-            assert self._store is not None
             for array in values:
                 array[away] = 0
             self._store.read_into(values, away, packed[away])
         return values
 
     def pack(self, packed: Int64) -> Iterator[tuple[Int64, PackedBlocks]]:
-        """A packed copy of blocks (B,) that exist, part by part: first those in memory, then those on disk.
-
-        Yields:
-            Positions in ``packed`` (P,), and the blocks there.
-        """
+        """A packed copy of blocks (B,) that exist, part by part, first those in memory: positions in ``packed`` (P,),
+        and the blocks there."""
         found = find_blocks(self._index, packed)
         here, away = np.flatnonzero(found >= 0), np.flatnonzero(found < 0)
         yield here, pack_blocks(self._buffers.values, found[here])
@@ -333,12 +301,11 @@ class BlockGrid:
         return found
 
     def _check_room(self, missing: Int64) -> None:
-        new = len(missing) - (0 if self._store is None else int(self._store.find(missing)[1].sum()))
+        new = len(missing) - int(self._store.find(missing)[1].sum())
         if self.block_count + new > self._max_blocks:
             raise MapError(
                 f"the map is full: {self.block_count} blocks, {new} more requested, limit {self._max_blocks} "
-                f"(voxel_map.max_blocks; {self.block_bytes / 1024:.0f} KiB a block). Raise the limit, use larger "
-                "voxels, or start a new map; what is in this one stays usable"
+                "(voxel_map.max_blocks). Raise the limit, use larger voxels, or start a new map; this one stays usable"
             )
 
     def _bring_in(self, packed: Int64, missing: Int64) -> None:
@@ -349,9 +316,6 @@ class BlockGrid:
         elif needed > self.capacity:
             self._grow(needed)
         stored = self._store
-        if stored is None:
-            self._add(missing)
-            return
         _, there = stored.find(missing)
         back = missing[there]
         for start in range(0, len(back), _READ_AT_ONCE):
@@ -370,8 +334,7 @@ class BlockGrid:
 
     def _evict(self, count: int, keep: Int64) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
-        if self._store is None:
-            self._store = BlockStore()
+        if not self.stored_count:
             _log.info("map_pages", resident=self._max_resident, reason="voxel_map.memory_mb is used up")
         keys, indices = self.sorted_blocks()
         packed = pack_keys(keys)
@@ -392,20 +355,12 @@ class BlockGrid:
             self._index = make_block_index(*self.sorted_blocks())
 
     def _make_buffers(self, capacity: int) -> GridBuffers:
-        """Zeros for this many blocks; the machine gives the memory page by page as it is written.
-
-        Raises:
-            MapError: the machine does not have so much memory, or none that is free.
-        """
+        """Zeros for this many blocks; the machine gives the memory page by page as it is written."""
         needed, there = capacity * self.block_bytes, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        advice = "lower voxel_map.max_blocks or memory_mb, or use larger voxels"
-        if needed > there:
-            raise MapError(
-                f"memory for {capacity} blocks is {needed / 1e9:.1f} GB, this machine has {there / 1e9:.1f} GB; "
-                f"{advice}"
-            )
         flat = (capacity, BLOCK_VOXELS)
         try:
+            if needed > there:
+                raise OSError(f"this machine has {there / 1e9:.1f} GB")
             return GridBuffers(
                 keys=_zeros((capacity, 3), np.int32),
                 tsdf=_zeros(flat, np.float32),
@@ -417,7 +372,7 @@ class BlockGrid:
         except OSError as error:
             raise MapError(
                 f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB): {error}; free some, raise the limit "
-                f"(ulimit -v), or {advice}"
+                "(ulimit -v), lower voxel_map.max_blocks or memory_mb, or use larger voxels"
             ) from error
 
     def _grow(self, needed: int) -> None:

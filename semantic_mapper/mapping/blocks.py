@@ -14,6 +14,7 @@ import sqlite3
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -31,7 +32,6 @@ _EMPTY = -1
 
 BLOCK_VOXELS = 512
 _CACHE_KIB = 4096  # of SQLite's own pages
-_KEYS_A_QUERY = 500
 
 
 class BlockIndex(NamedTuple):
@@ -101,9 +101,8 @@ def empty_blocks(count: int, classes: int) -> BlockValues:
 
 
 class PackedBlocks(NamedTuple):
-    """B blocks one behind the other, each: which voxels are measured and which have votes, as two bit masks of 512 bits
-    (of a byte, the highest first); TSDF, weight and colour of those measured; evidence and votes of those with votes.
-    """
+    """B blocks one behind the other: of each, two masks of 512 bits (of a byte, the highest first): voxels that are
+    measured, and that have votes; then TSDF, weight and colour of the first, evidence and votes of the second."""
 
     data: Float32  # (N,) float32; of masks, the bits
     ends: Int64  # (B + 1,) where blocks begin and end in it
@@ -115,15 +114,10 @@ class PackedBlocks(NamedTuple):
 
 
 class ScratchFile:
-    """Blobs by an integer key. Calls may come from several threads, one at a time.
-
-    Args:
-        what: Of what the blobs are, for messages, such as "blocks".
-        advice: Which setting helps where the disk is full.
-
-    Raises:
-        MapError: no file can be made in the system's folder for temporary files.
-    """
+    """Blobs by an integer key. Calls may come from several threads, one at a time. What fails is a ``MapError``: no
+    file can be made in the system's folder for temporary files, the disk is full (then the file is as it was, and
+    can be used again once there is room), or a blob is not what was put there. ``what`` the blobs are and ``advice``
+    are for messages."""
 
     def __init__(self, what: str, advice: str) -> None:
         self._what, self._advice = what, advice
@@ -142,44 +136,28 @@ class ScratchFile:
         return pages * page_bytes
 
     def put(self, keys: Sequence[int], blobs: Sequence[bytes | memoryview]) -> None:
-        """Put blobs on disk.
-
-        Raises:
-            MapError: the disk is full or fails; the file is as it was, and can be used again once there is room.
-        """
+        """Put blobs on disk."""
         rows = [(key, zlib.crc32(blob), blob) for key, blob in zip(keys, blobs, strict=True)]
         with self._transaction(f"{len(rows)} {self._what} cannot be put on disk"):
             self._database.executemany("INSERT OR REPLACE INTO blobs VALUES (?, ?, ?)", rows)
 
     def get(self, keys: Sequence[int]) -> list[bytes]:
-        """Read blobs, in the order of the keys; they stay on disk.
-
-        Raises:
-            MapError: one is not there, or is not what was put there.
-        """
-        found: dict[int, tuple[int, bytes]] = {}
-        try:
-            for part in _parts(keys):
-                marks = ",".join("?" * len(part))
-                rows = self._database.execute(f"SELECT key, crc, blob FROM blobs WHERE key IN ({marks})", part)
-                found.update((key, (crc, blob)) for key, crc, blob in rows)
-        except sqlite3.Error as error:
-            raise MapError(f"{self._what} on disk cannot be read: {error}") from error
+        """Read blobs, in the order of the keys; they stay on disk."""
+        blobs: list[bytes] = []
         for key in keys:
-            if key not in found or zlib.crc32(found[key][1]) != found[key][0]:
-                reason = "damaged" if key in found else "missing"
-                raise MapError(f"{self._what} on disk: number {key} is {reason}; its disk fails")
-        return [found[key][1] for key in keys]
+            try:
+                found = self._database.execute("SELECT crc, blob FROM blobs WHERE key = ?", (key,)).fetchone()
+            except sqlite3.Error as error:
+                raise MapError(f"{self._what} on disk cannot be read: {error}") from error
+            if found is None or zlib.crc32(found[1]) != found[0]:
+                raise MapError(f"{self._what} on disk: number {key} is missing or damaged; its disk fails")
+            blobs.append(found[1])
+        return blobs
 
     def drop(self, keys: Sequence[int]) -> None:
-        """Forget blobs.
-
-        Raises:
-            MapError: see ``put``.
-        """
+        """Forget blobs."""
         with self._transaction(f"{len(keys)} {self._what} cannot be taken off the disk"):
-            for part in _parts(keys):
-                self._database.execute(f"DELETE FROM blobs WHERE key IN ({','.join('?' * len(part))})", part)
+            self._database.executemany("DELETE FROM blobs WHERE key = ?", [(key,) for key in keys])
 
     def close(self) -> None:
         """Give the disk space back. Harmless when repeated."""
@@ -201,27 +179,23 @@ class ScratchFile:
             ) from error
 
 
-def _parts(keys: Sequence[int]) -> Iterator[Sequence[int]]:
-    for start in range(0, len(keys), _KEYS_A_QUERY):
-        yield keys[start : start + _KEYS_A_QUERY]
-
-
 class BlockStore:
     """Blocks on disk by packed key: ``keys`` (B,), ascending; when each had last changed, and whether it holds a
     surface.
 
-    Raises:
-        MapError: no file can be made in the system's folder for temporary files.
-    """
+    What fails is a ``MapError`` of ``ScratchFile``, and the store is as it was."""
 
     def __init__(self) -> None:
-        self._scratch = ScratchFile("blocks", "raise voxel_map.memory_mb")
         self.keys = np.empty(0, np.int64)
         self.versions = np.empty(0, np.int64)
         self.surface = np.empty(0, np.bool_)
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    @cached_property
+    def _scratch(self) -> ScratchFile:
+        return ScratchFile("blocks", "raise voxel_map.memory_mb")
 
     @property
     def file_bytes(self) -> int:
@@ -233,11 +207,7 @@ class BlockStore:
         return find_sorted(self.keys, keys)
 
     def put(self, keys: Int64, blocks: PackedBlocks, versions: Int64, surface: Bool) -> None:
-        """Put blocks (B,) away that are not in the store.
-
-        Raises:
-            MapError: the disk is full or fails; the store is as it was, and can be used again once there is room.
-        """
+        """Put blocks (B,) away that are not in the store."""
         self._scratch.put(keys.tolist(), blocks.blobs())
         order = np.argsort(keys)
         rows = np.searchsorted(self.keys, keys[order])
@@ -246,19 +216,11 @@ class BlockStore:
         self.surface = np.insert(self.surface, rows, surface[order])
 
     def read_into(self, values: BlockValues, rows: Int64, keys: Int64) -> None:
-        """Fill ``rows`` (B,) of ``values``, which are zero, with blocks (B,) of the store, where they stay.
-
-        Raises:
-            MapError: a block is not there, or is not what was put away.
-        """
+        """Fill ``rows`` (B,) of ``values``, which are zero, with blocks (B,) of the store, where they stay."""
         unpack_blocks(self._scratch.get(keys.tolist()), values, rows)
 
     def drop(self, keys: Int64) -> None:
-        """Forget blocks (B,).
-
-        Raises:
-            MapError: see ``put``.
-        """
+        """Forget blocks (B,)."""
         self._scratch.drop(keys.tolist())
         rows, there = self.find(keys)
         rows = rows[there]
@@ -286,9 +248,7 @@ def pack_blocks(values: BlockValues, rows: NDArray[np.int32]) -> PackedBlocks:
 def unpack_blocks(blobs: Sequence[bytes | memoryview], values: BlockValues, rows: Int64) -> None:
     """Fill blocks ``rows`` (B,), whose voxels are all zero, with those that ``pack_blocks`` has packed.
 
-    Raises:
-        MapError: bytes are no packed block with as many classes.
-    """
+    ``MapError``: bytes are no packed block with as many classes."""
     sizes = np.array([0, *map(len, blobs)], np.int64)
     count = 0
     if not (sizes % 4).any():

@@ -1,25 +1,20 @@
 """Free space clears: a surface that a frame sees through loses its weight, and is gone after a few such frames.
 
 A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel is
-measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise, the edge of a hole may be that of a
-thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far
-as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth edges and grazing views are
-safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). A pixel without depth,
-or farther than ``depth_max``, clears nothing: black and shiny things return nothing. Nor does a pixel as near to the
-edge of the image as a pose may be off, nor computed or rendered depth: where pictures are matched wrongly, that lies
-far behind, frame after frame.
+measured, of the eight around at most ``MOST_HOLES`` are not, and all that is measured in its surroundings lies well
+behind what the voxel says. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``,
+``ASIDE_PER_M``), so that thin things, depth edges and grazing views are safe; the margin grows with the voxels and with
+the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). Nothing is cleared by a pixel without depth or farther than
+``depth_max`` (black and shiny things return nothing), as near to the edge of the image as a pose may be off, or of
+computed or rendered depth: where pictures are matched wrongly, that lies far behind, frame after frame.
 
 Each such frame halves the weight of the voxel, of which ``MOST_KEPT`` stays at most, and leaves its TSDF alone. Where
 less than one measurement is left, the voxel becomes free and loses its class votes. So three frames that see through it
-clear any surface, and one is enough for what a single frame saw, or for what was only computed. A frame that sees the
-surface adds its measurement as ever: what is seen through in every second frame or less, as by mirrors, stays.
-
-The state of this is the weight alone: what pages, saves, restores and rebuilds the map need not know of it.
+clear any surface, and one is enough for what a single frame saw, or for what was only computed. What is seen through in
+every second frame or less, as by mirrors, stays. The state of this is the weight alone.
 
 The blocks of the truncation band are fused anyway, and cleared in that pass (``fusion.c``). This module finds and
-clears the others: those in view, in front of the depth, that hold a surface. Its numbers stand in ``see_through.h``,
-too.
-"""
+clears the others that are in view. Its numbers stand in ``see_through.h``, too."""
 
 from __future__ import annotations
 
@@ -54,6 +49,15 @@ class FusionLimits(NamedTuple):
     max_weight: float  # cap of TSDF weight and of votes; beyond it old measurements fade
 
 
+class Scene(NamedTuple):
+    """A frame as kernels take it, and the limits of the map."""
+
+    camera: Camera
+    limits: FusionLimits
+    depth: Float32  # (H, W) metres
+    rgb: UInt8  # (H, W, 3)
+
+
 class DepthBounds(NamedTuple):
     """Least and greatest depth of parts of an image that is cut into square cells, for any square at once.
 
@@ -75,8 +79,7 @@ def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BO
     """Bounds of depth (H, W) in metres; what is farther than ``depth_max_m`` is not measured.
 
     They take the memory of ``before``, which nobody looks at any more, where the size is the same: new memory of 2 MB
-    costs as much as filling it.
-    """
+    costs as much as filling it."""
     cell = max(1, max(depth.shape) // _CELLS)
     h, w = depth.shape[0] // cell, depth.shape[1] // cell
     bounds = before
@@ -88,90 +91,66 @@ def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BO
 
 
 def clear_in_view(
-    grid: BlockGrid,
-    band: Int64,
-    camera: Camera,
-    limits: FusionLimits,
-    depth: Float32,
-    rgb: UInt8,
-    bounds: DepthBounds,
-    version: int,
+    grid: BlockGrid, band: Int64, scene: Scene, bounds: DepthBounds, version: int
 ) -> Iterator[tuple[Int64, Int64]]:
     """Clear what a frame sees through outside of the truncation band, in place; hold the map's lock meanwhile.
 
+    Blocks on disk come back where the frame may see through them.
+
     Args:
-        grid: The map's storage. Blocks on disk come back where the frame may see through them.
         band: (B,) sorted packed keys of the blocks that the frame was fused into.
-        camera, limits: Of the frame and the map.
-        depth, rgb: (H, W) float32 metres, from a sensor, and (H, W, 3) uint8.
-        bounds: Of ``depth``.
+        scene: Its depth is a sensor's.
+        bounds: Of the depth.
         version: Of the map, for the blocks that change.
 
     Yields:
         Packed keys (B,) of blocks that have changed, and how many of their voxels were cleared (B,).
-
-    Raises:
-        MapError: the disk fails.
     """
-    packed = _candidates(grid, band, camera, limits, bounds)
+    packed = _candidates(grid, band, scene, bounds)
     for start in range(0, len(packed), grid.room):
         part = packed[start : start + grid.room]
-        seen, _ = _clear(grid.page_in(part), grid.buffers(), camera, limits, depth, rgb, bounds, changes=False)
+        seen, _ = _clear(grid.page_in(part), grid.buffers(), scene, bounds, changes=False)
         if seen.any():  # only these count as changed
             changing = part[seen > 0]
             blocks = grid.activate(changing)
-            _, cleared = _clear(blocks, grid.buffers(), camera, limits, depth, rgb, bounds, changes=True)
+            _, cleared = _clear(blocks, grid.buffers(), scene, bounds, changes=True)
             grid.mark_changed(blocks, version)
             yield changing, cleared
 
 
-def _candidates(grid: BlockGrid, band: Int64, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> Int64:
+def _candidates(grid: BlockGrid, band: Int64, scene: Scene, bounds: DepthBounds) -> Int64:
     """Packed keys (B,), sorted, of blocks outside of the band that hold a surface, in front of some depth."""
     considered = grid.may_hold_surface()
     inside = find_blocks(grid.index, band)
     considered[inside[inside >= 0]] = 0
     keys = grid.buffers().keys
-    slots = np.flatnonzero(_before_depth(keys, considered, camera, limits, bounds)).astype(np.int32)
+    slots = np.flatnonzero(_before_depth(keys, considered, scene, bounds)).astype(np.int32)
     slots = slots[grid.hold_surface(slots)]
     stored = grid.stored_surface
     if not len(stored):
         return np.sort(pack_keys(keys[slots]))
     stored = stored[~np.isin(stored, band)]
-    before = _before_depth(unpack_keys(stored), np.ones(len(stored), np.uint8), camera, limits, bounds)
+    before = _before_depth(unpack_keys(stored), np.ones(len(stored), np.uint8), scene, bounds)
     return np.sort(np.concatenate((pack_keys(keys[slots]), stored[before > 0])))
 
 
-def _before_depth(keys: Int32, considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds) -> UInt8:
+def _before_depth(keys: Int32, considered: UInt8, scene: Scene, bounds: DepthBounds) -> UInt8:
     found = np.empty(len(keys), np.uint8)
-    _blocks_before_depth(len(keys), keys, considered, camera, limits.voxel_size, bounds, found)
+    _blocks_before_depth(len(keys), keys, considered, scene.camera, scene.limits.voxel_size, bounds, found)
     return found
 
 
 def _clear(
-    blocks: Int32,
-    buffers: GridBuffers,
-    camera: Camera,
-    limits: FusionLimits,
-    depth: Float32,
-    rgb: UInt8,
-    bounds: DepthBounds,
-    *,
-    changes: bool,
+    blocks: Int32, buffers: GridBuffers, scene: Scene, bounds: DepthBounds, *, changes: bool
 ) -> tuple[Int64, Int64]:
     seen, cleared = np.empty(len(blocks), np.int64), np.empty(len(blocks), np.int64)
-    _clear_blocks(len(blocks), blocks, buffers, camera, limits, depth, rgb, bounds, changes, seen, cleared)
+    _clear_blocks(len(blocks), blocks, buffers, scene, bounds, changes, seen, cleared)
     return seen, cleared
 
 
 @parallel_kernel()
 def _blocks_before_depth(
-    count: int,
-    keys: Int32,
-    considered: UInt8,
-    camera: Camera,
-    voxel_size: float,
-    bounds: DepthBounds,
-    found: UInt8,
+    count: int, keys: Int32, considered: UInt8, camera: Camera, voxel_size: float, bounds: DepthBounds, found: UInt8
 ) -> None:
     """Which of the blocks (B, 3) that are ``considered`` (B,) may have a voxel in front of the depth: (B,) to fill."""
     ...
@@ -182,10 +161,7 @@ def _clear_blocks(
     count: int,
     indices: Int32,
     buffers: GridBuffers,
-    camera: Camera,
-    limits: FusionLimits,
-    depth: Float32,
-    rgb: UInt8,
+    scene: Scene,
     bounds: DepthBounds,
     changes: bool,
     seen: Int64,

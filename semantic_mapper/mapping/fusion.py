@@ -25,8 +25,8 @@ from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.allocation import Camera
 from semantic_mapper.mapping.block_grid import GridBuffers
-from semantic_mapper.mapping.clearing import NO_BOUNDS, DepthBounds, FusionLimits
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, Int64, UInt8
+from semantic_mapper.mapping.clearing import NO_BOUNDS, DepthBounds, FusionLimits, Scene
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, Int64
 
 MEASURED = 1.0
 COMPUTED_LOOK = 1 / 32
@@ -45,11 +45,7 @@ _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or di
 
 
 def make_limits(config: VoxelMapConfig) -> FusionLimits:
-    """Limits of a map.
-
-    Raises:
-        ConfigError: a value that no map can be built with.
-    """
+    """Limits of a map; ``ConfigError`` where no map can be built with a value."""
     for name, (least, most) in _BOUNDS.items():
         value = getattr(config, name)
         if not least <= value <= most:  # NaN, too
@@ -96,9 +92,7 @@ def checked_depth(
 ) -> tuple[Float32, Float32]:
     """Depth (H, W) as one piece of memory, without what is not trusted, and its weights as ``fuse_blocks`` takes them.
 
-    Raises:
-        ShapeError: depth or weights do not fit the intrinsics, are not float32, or weights are not in 0..1.
-    """
+    ``ShapeError``: depth or weights do not fit the intrinsics, are not float32, or weights are not in 0..1."""
     size = f"{intrinsics.height} {intrinsics.width}"
     _expect(depth_m, size, np.float32, f"{where}: depth_m")
     if trust is None:
@@ -110,18 +104,11 @@ def checked_depth(
 
 
 def probability_table(
-    depth: Float32,
-    probabilities: Float32,
-    known: Bool | None,
-    rows: Int32 | None,
-    classes: int,
-    where: str,
+    depth: Float32, probabilities: Float32, known: Bool | None, rows: Int32 | None, classes: int, where: str
 ) -> ProbabilityTable:
     """Class probabilities and the row of each pixel, however they were given; see ``VoxelMap.integrate``.
 
-    Raises:
-        ShapeError: something does not fit the depth (H, W), or is of another dtype.
-    """
+    ``ShapeError``: something does not fit the depth (H, W), or is of another dtype."""
     size = f"{depth.shape[0]} {depth.shape[1]}"
     if rows is None:
         _expect(probabilities, f"{size} {classes}", np.float32, f"{where}: probabilities")
@@ -148,17 +135,12 @@ def frame_votes(
 ) -> Votes:
     """Votes of a frame, none without a table; each weighs what the depth under it does, where ``trust`` says so.
 
-    Raises:
-        FrameError: invalid probabilities.
-    """
+    ``FrameError``: invalid probabilities."""
     if table is None:
         return Votes(np.zeros((1, classes), np.float32), np.zeros(depth.shape, np.int32), np.zeros_like(depth))
     votes, bad = make_votes(*table, depth, camera, depth_max_m)
     if bad:
-        raise FrameError(
-            f"{where}: {bad} known pixels hold class probabilities that are NaN, negative or do not sum to 1; "
-            "give a softmax, or mark the pixels as not known"
-        )
+        raise FrameError(f"{where}: probabilities of {bad} known pixels are NaN, negative or do not sum to 1")
     return votes if trust is None or not trust.size else votes._replace(weights=votes.weights * trust)
 
 
@@ -171,34 +153,23 @@ def _expect(array: NDArray[np.generic], shape: str, dtype: type[np.generic], nam
 def fuse_blocks(
     indices: Int32,
     buffers: GridBuffers,
-    camera: Camera,
-    limits: FusionLimits,
-    depth: Float32,
-    rgb: UInt8,
+    scene: Scene,
     trust: Float32,
     votes: Votes,
     *,
     measured: bool = True,
     bounds: DepthBounds = NO_BOUNDS,
 ) -> Int64:
-    """Fuse one frame into blocks, in place.
+    """Fuse one frame into blocks (B,), each once, in place; returns how many surface voxels of each were cleared (B,).
 
     Args:
-        indices: (B,) buffer indices of the blocks, each once.
-        buffers, camera, limits: Of the grid, the frame and the map.
-        depth, rgb: (H, W) float32 metres and (H, W, 3) uint8.
         trust: (H, W) float32 fraction of its full weight that each depth counts, or (0, 0): 1.
-        votes: Of the frame.
         measured: Whether a sensor measured the depth.
         bounds: Of the depth, where what the frame sees through is to be cleared; see ``clearing``.
-
-    Returns:
-        (B,) voxels of a surface that were cleared.
     """
     cleared = np.empty(len(indices), np.int64)
-    look, cap = (MEASURED, limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
-    args = (indices, buffers, camera, limits, depth, rgb, trust, votes, look, cap)
-    _fuse_frame_into_blocks(len(indices), *args, bounds, cleared)
+    look, cap = (MEASURED, scene.limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
+    _fuse_frame_into_blocks(len(indices), indices, buffers, scene, trust, votes, look, cap, bounds, cleared)
     return cleared
 
 
@@ -232,10 +203,7 @@ def _fuse_frame_into_blocks(
     count: int,
     indices: Int32,
     buffers: GridBuffers,
-    camera: Camera,
-    limits: FusionLimits,
-    depth: Float32,
-    rgb: UInt8,
+    scene: Scene,
     trust: Float32,
     votes: Votes,
     look: float,

@@ -25,15 +25,8 @@ _log = get_logger(__name__)
 class FrozenMap:
     """A map as it was when this was made, to be written, or to be begun with again. Close it when it has served.
 
-    A block that is about to change is copied first. Where it cannot be copied, the frame that changes it goes on, and
-    the next reading fails.
-
-    Args:
-        grid: Of the map; is watched until ``close``.
-        lock: Of the map, which the caller holds meanwhile.
-        manifest: Settings, classes and counters of the map.
-        places: What it is found again by.
-    """
+    A block of ``grid`` that is about to change is copied first, until ``close``. Where it cannot be copied, the frame
+    that changes it goes on, and the next reading fails. The caller holds the ``lock`` of the map meanwhile."""
 
     def __init__(
         self, grid: BlockGrid, lock: AbstractContextManager[object], manifest: MapManifest, places: tuple[Place, ...]
@@ -50,35 +43,23 @@ class FrozenMap:
     def write(self, path: Path, between: Callable[[], object] = lambda: None) -> None:
         """Write a map file, whole or not at all, in memory for ``CHUNK_BLOCKS``; closes this.
 
-        Args:
-            path: Of the file.
-            between: Called after every ``CHUNK_BLOCKS``, without the lock; an error of its own ends the writing.
+        ``between`` is called after every ``CHUNK_BLOCKS``, without the lock; an error of its own ends the writing.
 
         Raises:
             MapError: the file cannot be written, or the disk fails; a file that was there before is as it was.
         """
-
-        def parts() -> Iterator[BlockPart]:
-            for part in self.parts(last=True):
-                yield part
-                between()
-
         try:
-            manifest = write_map(path, self.manifest, parts(), self.places)
+            manifest = write_map(path, self.manifest, self.parts(between, last=True), self.places)
         finally:
             self.close()
         size = path.stat().st_size
         _log.info("map_saved", path=str(path), frames=manifest.frames, blocks=manifest.blocks, bytes=size)
 
-    def parts(self, *, last: bool = False) -> Iterator[BlockPart]:
-        """All blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time.
+    def parts(self, between: Callable[[], object] = lambda: None, *, last: bool = False) -> Iterator[BlockPart]:
+        """All blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time; copies go as they are read where it is the
+        ``last`` time.
 
-        Args:
-            last: Nothing will be read again, so that copies can go.
-
-        Raises:
-            MapError: the disk is full or fails, or has failed.
-        """
+        ``MapError``: the disk is full or fails, or has failed."""
         for start in range(0, len(self._keys), CHUNK_BLOCKS):
             packed = self._keys[start : start + CHUNK_BLOCKS]
             with self._lock:
@@ -88,6 +69,7 @@ class FrozenMap:
                     for key in packed.tolist():
                         self._copies.pop(key, None)
             yield unpack_keys(packed), values
+            between()
 
     def close(self) -> None:
         """Give memory and disk back and watch the grid no more. Harmless when repeated."""

@@ -2,12 +2,9 @@
 
 Two maps with the same voxels add up: weights, evidence and votes are sums, TSDF and colour are means by weight; the
 caps are those of fusion, except that where votes pass theirs, old and new fade alike, since neither map is the older.
-Maps whose voxels do not coincide are interpolated first, between the eight voxels around each new one (trilinear), over
-those of them that were observed and only where these outweigh the others. Across a depth edge, where free space meets
-the back of something, the nearest voxel is taken: in between there would be a surface that nobody saw.
-
-Works on some blocks at a time: what is in memory at once does not grow with the maps. No order among threads matters.
-"""
+Maps whose voxels do not coincide are interpolated first, between the eight voxels around each new one, over those that
+were observed and only where these outweigh the others. Across a depth edge the nearest voxel is taken: in between there
+would be a surface that nobody saw."""
 
 from __future__ import annotations
 
@@ -47,11 +44,8 @@ def voxel_transform(T_a_b: Float64, voxel_size_m: float) -> VoxelTransform:
 
 
 def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapConfig, labels_b: LabelSet) -> None:
-    """Refuse maps whose voxels mean different things.
-
-    Raises:
-        MapError: another voxel size, or other classes (their colours and the set's name do not matter).
-    """
+    """Refuse maps of another voxel size or other classes (their colours and the set's name do not matter):
+    ``MapError``."""
     if config_a.voxel_size_m != config_b.voxel_size_m:
         raise MapError(
             f"maps of different voxel_map.voxel_size_m ({config_a.voxel_size_m:g} and {config_b.voxel_size_m:g}) "
@@ -67,37 +61,12 @@ def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapCo
 
 
 def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTransform, cap: float, version: int) -> None:
-    """Add all that ``source`` holds to ``target``; blocks without a measurement are left out.
+    """Add all that ``source`` holds to ``target``, a grid of the same voxels and classes; blocks without a measurement
+    are left out. ``cap`` is of weights and of votes, ``version`` that of the blocks that change.
 
-    Args:
-        target, source: Grids of the same voxel size and classes.
-        T_target_source: Where the source lies.
-        cap: Of weights and of votes.
-        version: That the blocks are marked as changed at.
-
-    Raises:
-        MapError: the target has no room.
-    """
-    pairs = overlaps(source.all_packed(), T_target_source)
-    for packed, added in moved_blocks(source, T_target_source, pairs):
-        add_values(target, packed, added, cap, version)
-
-
-def moved_blocks(
-    source: BlockGrid, T_target_source: VoxelTransform, pairs: Int64
-) -> Iterator[tuple[Int64, BlockValues]]:
-    """Blocks of a target with what a source says of them; those without a measurement are left out.
-
-    Args:
-        source: Is read.
-        T_target_source: Where the source lies.
-        pairs: (P, 2) of ``overlaps``: all, or all pairs of some target blocks.
-
-    Yields:
-        Packed keys (B,), sorted, and their values; at most ``MERGED_AT_ONCE`` at a time.
-    """
+    Works on ``MERGED_AT_ONCE`` blocks of the target at a time."""
     R_source_target = np.ascontiguousarray(T_target_source.R.T)
-    for wanted, needed in _parts(pairs):
+    for wanted, needed in _parts(overlaps(source.all_packed(), T_target_source)):
         grid = source.holding(needed)
         moved = empty_blocks(len(wanted), source.classes)
         _resample_blocks(
@@ -105,26 +74,14 @@ def moved_blocks(
         )
         holds = (moved.weight > 0).any(axis=1)  # votes come with weight
         if holds.any():
-            yield wanted[holds], BlockValues(*(part[holds] for part in moved))
-
-
-def add_values(target: BlockGrid, packed: Int64, added: BlockValues, cap: float, version: int) -> None:
-    """Add blocks (B,) of ``moved_blocks`` to a grid; see ``add_blocks``.
-
-    Raises:
-        MapError: the target has no room.
-    """
-    blocks = target.activate(packed)
-    _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
-    target.mark_changed(blocks, version)
+            blocks = target.activate(wanted[holds])
+            added = BlockValues(*(part[holds] for part in moved))
+            _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
+            target.mark_changed(blocks, version)
 
 
 def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
-    """Make ``target``, which is empty and of the same classes, hold what ``source`` has measured, as of ``version``.
-
-    Raises:
-        MapError: the target has no room.
-    """
+    """Make ``target``, which is empty and of the same classes, hold what ``source`` has measured, as of ``version``."""
     packed = source.all_packed()
     for start in range(0, len(packed), MERGED_AT_ONCE):
         part = packed[start : start + MERGED_AT_ONCE]

@@ -41,25 +41,19 @@ LEAST_WEIGHT = 1e-9  # where nothing looks alike, the coarse pixels still count 
 
 
 class RenderedView(NamedTuple):
-    """What a field says of a view: probabilities (h, w, L) float32, where they mean something (h, w), depth (h, w) or
-    0.
+    """What a field says of a view. ``rays`` were rendered, with so many ``samples`` each; 0 where the field draws its
+    own."""
 
-    ``rays`` were rendered, with so many ``samples`` each; 0 where the field draws its own.
-    """
-
-    probabilities: Float32
-    known: Bool
-    depth_m: Float32
+    probabilities: Float32  # (h, w, L)
+    known: Bool  # (h, w) where they mean something
+    depth_m: Float32  # (h, w), or 0
     rays: int = 0
     samples: int = 0
 
 
 class ViewRenderer:
-    """Renders views from one field.
-
-    Raises:
-        ConfigError: ``config.target_hz`` with a field that has no samples to set.
-    """
+    """Renders views from one field, which has samples to set where ``config.target_hz`` is one (else
+    ``ConfigError``)."""
 
     def __init__(self, field: SemanticField, config: RenderConfig, sampling: SamplingConfig) -> None:
         self.field = field  # may be exchanged for one of the same kind
@@ -121,11 +115,8 @@ class ViewRenderer:
 
 
 def add_own_image(view: RenderedView, field: SemanticField, current: EncodedViews, weight: float) -> RenderedView:
-    """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it
-    is known.
-
-    The view is returned as it is where the field has no opinion of single images, or ``weight``, 0..1, is 0.
-    """
+    """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it is
+    known; the view as it is where the field has no opinion of single images, or ``weight``, 0..1, is 0."""
     if weight == 0 or not isinstance(field, ImageClassifier):
         return view
     with torch.inference_mode():
@@ -211,20 +202,10 @@ def upsample(
     look = np.dstack((rgb_low.astype(np.float32), depth_low))
     one_class = np.empty(channel.shape, np.bool_)
     find_one_class(len(channel), channel, one_class)
-    upsample_view(
-        len(depth),
-        np.ascontiguousarray(probabilities.reshape(-1, probabilities.shape[2])),
-        channel,
-        one_class,
-        look,
-        np.ascontiguousarray(rgb),
-        np.ascontiguousarray(depth),
-        out,
-        COLOUR_RATE,
-        DEPTH_SIGMA,
-        LARGEST_STEP,
-        LEAST_WEIGHT,
-    )
+    table = np.ascontiguousarray(probabilities.reshape(-1, probabilities.shape[2]))
+    images = np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
+    weights = COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT
+    upsample_view(len(depth), table, channel, one_class, look, *images, out, *weights)
     return out
 
 

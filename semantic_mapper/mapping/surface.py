@@ -4,14 +4,10 @@ Open3D's own ``ray_cast`` is off by half a voxel and can crash when its range bu
 from block to block, steps by the TSDF and finds the zero crossing on the interpolated field. There, and at any other
 point, the map is read by interpolation over the eight voxels around it, then label and confidence.
 
-With n votes of evidence e, what the votes say together is ``p = softmax(e * n_eff / n)``, where
-``n_eff = n / (1 + rho (n - 1))`` for n > 1: views of one place repeat each other's errors, so a hundred of them are
-worth at most 1 / rho independent ones. A vote that is trusted less, n < 1, weighs less against others, but where it is
-the only one it means what the field said: n_eff = 1. The label is the argmax, its confidence p[label]. Below
-``unknown_below`` the label is unknown; the confidence stays that of the likeliest class.
-
-The C code of it is in ``ray_casting.h``, ``readout.h`` and ``extract.c``.
-"""
+With n votes of evidence e, what the votes say together is ``p = softmax(e * n_eff / n)``, where ``n_eff = n / (1 + rho
+(n - 1))`` for n > 1: views of one place repeat each other's errors, so a hundred of them are worth at most 1 / rho
+independent ones. A single vote of less trust, n < 1, means what the field said: n_eff = 1. The label is the argmax, its
+confidence p[label]. Below ``unknown_below`` the label is unknown, the confidence stays."""
 
 from __future__ import annotations
 
@@ -23,15 +19,12 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.kernels import parallel_kernel
-from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.allocation import Camera, blocks_in_view, blocks_within_reach
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, NEIGHBOURS, BlockGrid, GridBuffers
 from semantic_mapper.mapping.blocks import BlockIndex, find_blocks, pack_keys, unpack_keys
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, UInt8
-
-MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
 
 
 class Window(NamedTuple):
@@ -51,43 +44,37 @@ class Window(NamedTuple):
         return self._replace(width=half), self._replace(left=self.left + half, width=self.width - half)
 
 
+class Readout(NamedTuple):
+    """What a map says at points or pixels (...)."""
+
+    rgb: UInt8  # (..., 3)
+    channel: Int64  # of the class; -1 = unknown
+    confidence: Float32  # 0 = no votes
+    measured: Bool  # False where depth of a voxel around was computed, or none lies around
+
+
+def _empty_readout(shape: tuple[int, ...]) -> Readout:
+    channel, confidence = np.full(shape, -1, np.int64), np.zeros(shape, np.float32)
+    return Readout(np.zeros((*shape, 3), np.uint8), channel, confidence, np.zeros(shape, np.bool_))
+
+
 def cast_view(
     grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
-) -> tuple[Float32, UInt8, Int64, Float32, Bool]:
-    """See the map through a camera, up to ``depth_max_m`` away.
+) -> tuple[Float32, Readout]:
+    """See the map through a camera, up to ``depth_max_m`` away: depth (H, W), 0 = miss, and the rest.
 
     What it may see and is on disk comes back into memory; where there is no room for all of it, for a part of the image
     after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)
-
-    Returns:
-        depth (H, W) float32 metres (0 = miss), rgb (H, W, 3) uint8, channel (H, W) int64 (-1 = unknown),
-        confidence (H, W) float32, measured (H, W) bool.
     """
     size = (intrinsics.height, intrinsics.width)
-    depth, confidence = np.zeros(size, np.float32), np.zeros(size, np.float32)
-    rgb, channel = np.zeros((*size, 3), np.uint8), np.full(size, -1, np.int64)
-    measured = np.zeros(size, np.bool_)
-    for window, seen in _windows(grid, camera, intrinsics, config):
-        if len(seen):
-            grid.page_in(seen)
-        _cast_view_rows(
-            window.height,
-            camera,
-            window,
-            config.voxel_size_m,
-            config.truncation_voxels,
-            config.depth_max_m,
-            config.vote_discount,
-            config.unknown_below,
-            grid.index,
-            grid.buffers(),
-            depth,
-            rgb,
-            channel,
-            confidence,
-            measured,
-        )
-    return depth, rgb, channel, confidence, measured
+    depth, seen = np.zeros(size, np.float32), _empty_readout(size)
+    lengths = config.voxel_size_m, config.truncation_voxels, config.depth_max_m
+    for window, needed in _windows(grid, camera, intrinsics, config):
+        if len(needed):
+            grid.page_in(needed)
+        memory = config.vote_discount, config.unknown_below, grid.index, grid.buffers()
+        _cast_view_rows(window.height, camera, window, *lengths, *memory, depth, seen)
+    return depth, seen
 
 
 def _windows(
@@ -95,8 +82,7 @@ def _windows(
 ) -> Iterator[tuple[Window, Int64]]:
     """Parts of an image that together are all of it, each with packed keys (B,) of what it may see, nearest first.
 
-    One part, and no keys, where nothing is on disk.
-    """
+    One part, and no keys, where nothing is on disk."""
     whole = Window(0, 0, intrinsics.height, intrinsics.width)
     if not grid.stored_count:
         yield whole, np.empty(0, np.int64)
@@ -114,25 +100,12 @@ def _windows(
 
 
 def read_points(
-    voxels: Float64,
-    index: BlockIndex,
-    buffers: GridBuffers,
-    label_set: LabelSet,
-    vote_discount: float,
-    unknown_below: float,
-) -> tuple[UInt8, UInt8, Float32, Bool]:
-    """What a map says at points (N, 3), float64, in units of voxels.
-
-    Returns:
-        rgb (N, 3) uint8, label (N,) uint8 ids (ignore id = unknown), confidence (N,) float32 (0 = no votes), measured
-        (N,) bool, False where depth of a voxel around was computed, or none lies around.
-    """
-    rgb, channel = np.zeros((len(voxels), 3), np.uint8), np.full(len(voxels), -1, np.int64)
-    confidence, measured = np.zeros(len(voxels), np.float32), np.zeros(len(voxels), np.bool_)
-    points = np.ascontiguousarray(voxels)
-    decision = (vote_discount, unknown_below)
-    _read_map_points(len(points), points, index, buffers, *decision, rgb, channel, confidence, measured)
-    return rgb, label_set.to_ids(channel), confidence, measured
+    voxels: Float64, index: BlockIndex, buffers: GridBuffers, vote_discount: float, unknown_below: float
+) -> Readout:
+    """What a map says at points (N, 3), float64, in units of voxels."""
+    points, read = np.ascontiguousarray(voxels), _empty_readout((len(voxels),))
+    _read_map_points(len(points), points, index, buffers, vote_discount, unknown_below, read)
+    return read
 
 
 def surface_voxels(keys: Int32, blocks: Int32, grid: BlockGrid, min_weight: float) -> Float64:
@@ -150,45 +123,30 @@ def surface_voxels(keys: Int32, blocks: Int32, grid: BlockGrid, min_weight: floa
     return points
 
 
-def triangle_mesh(
-    keys: Int32, blocks: Int32, grid: BlockGrid, voxel_size_m: float, min_weight: float
-) -> tuple[Float32, Int32]:
-    """Marching cubes over sorted blocks, tile by tile: vertices (V, 3) in metres, faces (F, 3), in a fixed order."""
-    parts: list[Float32] = []
-    for start in range(0, len(blocks), MESH_TILE_BLOCKS):
-        tile = keys[start : start + MESH_TILE_BLOCKS]
-        parts.append(_tile_triangles(tile, grid.index, grid.buffers(), voxel_size_m, min_weight))
-    triangles = np.concatenate(parts) if parts else np.empty((0, 3, 3), np.float32)
-    vertices, inverse = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+def triangle_mesh(tile: Int32, grid: BlockGrid, voxel_size_m: float, min_weight: float) -> tuple[Float32, Int32]:
+    """Marching cubes over the cells of sorted blocks (B, 3): vertices (V, 3) in metres, faces (F, 3), in a fixed order.
+
+    Cells reach into the next blocks, so those are copied, too.
+    """
+    wanted = np.unique(pack_keys((tile[:, None] + NEIGHBOURS).reshape(-1, 3)))
+    found, buffers = find_blocks(grid.index, wanted), grid.buffers()
+    keys, source = unpack_keys(wanted[found >= 0]), found[found >= 0]
+    attributes = {name: getattr(buffers, name)[source] for name in ("tsdf", "weight", "color")}
+    triangles = np.empty((0, 3, 3), np.float32)
+    if len(keys):
+        # Open3D keeps what is strictly above its threshold.
+        least = float(np.nextafter(np.float32(min_weight), np.float32(0)))
+        mesh = open3d_grid(keys, voxel_size_m, **attributes).extract_triangle_mesh(least)
+        if not mesh.is_empty() and "indices" in mesh.triangle:
+            triangles = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
+    cell = np.floor(triangles.mean(axis=1) / voxel_size_m)
+    own = np.isin(pack_keys((cell // BLOCK_SIDE).astype(np.int32)), pack_keys(tile))
+    vertices, inverse = np.unique(triangles[own].reshape(-1, 3), axis=0, return_inverse=True)
     return vertices.astype(np.float32), _in_order(inverse.reshape(-1, 3))
 
 
-def _tile_triangles(
-    tile: Int32, index: BlockIndex, buffers: GridBuffers, voxel_size_m: float, min_weight: float
-) -> Float32:
-    """Triangles (T, 3, 3) of the cells of the tile's blocks; cells reach into the next blocks, so those are copied."""
-    wanted = np.unique(pack_keys((tile[:, None] + NEIGHBOURS).reshape(-1, 3)))
-    found = find_blocks(index, wanted)
-    keys, source = unpack_keys(wanted[found >= 0]), found[found >= 0]
-    grid = open3d_grid(
-        keys, voxel_size_m, tsdf=buffers.tsdf[source], weight=buffers.weight[source], color=buffers.color[source]
-    )
-    # Open3D keeps what is strictly above its threshold.
-    mesh = grid.extract_triangle_mesh(float(np.nextafter(np.float32(min_weight), np.float32(0))))
-    if mesh.is_empty() or "indices" not in mesh.triangle:
-        return np.empty((0, 3, 3), np.float32)
-    triangles = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
-    cell = np.floor(triangles.mean(axis=1) / voxel_size_m)
-    own = np.isin(pack_keys((cell // BLOCK_SIDE).astype(np.int32)), pack_keys(tile))
-    return triangles[own]
-
-
 def open3d_grid(keys: Int32, voxel_size_m: float, **attributes: NDArray[np.generic]) -> Any:
-    """An ``open3d.t.geometry.VoxelBlockGrid`` on the CPU of blocks (B, 3), with attributes (B, 512) or (B, 512, C).
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
-    """
+    """An ``open3d.t.geometry.VoxelBlockGrid`` on the CPU of blocks (B, 3), with attributes (B, 512) or (B, 512, C)."""
     o3d = load_open3d()
     dtypes = tuple(o3d.core.Tensor.from_numpy(np.empty(0, values.dtype)).dtype for values in attributes.values())
     shapes = tuple(values.shape[2:] or (1,) for values in attributes.values())
@@ -234,10 +192,7 @@ def _cast_view_rows(
     index: BlockIndex,
     buffers: GridBuffers,
     depth: Float32,
-    rgb: UInt8,
-    channel: Int64,
-    confidence: Float32,
-    measured: Bool,
+    seen: Readout,
 ) -> None:
     """Fill the rows of a window of what ``cast_view`` returns."""
     ...
@@ -251,12 +206,9 @@ def _read_map_points(
     buffers: GridBuffers,
     vote_discount: float,
     unknown_below: float,
-    rgb: UInt8,
-    channel: Int64,
-    confidence: Float32,
-    measured: Bool,
+    read: Readout,
 ) -> None:
-    """Fill rgb (N, 3), channel (N,), -1 = unknown, confidence (N,) and measured (N,) of points (N, 3)."""
+    """Fill what ``read_points`` returns."""
     ...
 
 

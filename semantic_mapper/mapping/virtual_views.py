@@ -236,7 +236,6 @@ def add_votes(
     have fewer than ``MAX_VOTES``. ``frames`` does not count the view, ``version`` does.
 
     Args:
-        voxel_map: Whose surface it is.
         T_world_camera, intrinsics: (4, 4) of the view, and of ``depth_m``.
         depth_m: (H, W) float32, z of the map's surface in the view; 0 = none.
         table: Probabilities (K, L) float32, and the row (H, W) int32 that each pixel takes, -1 = unknown.

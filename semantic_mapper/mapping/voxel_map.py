@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,11 @@ from semantic_mapper.mapping.changes import (
     ClearedBlocks,
     CopiedChanges,
     Decision,
+    empty_changes,
     oldest_first,
     packed_parts,
 )
-from semantic_mapper.mapping.clearing import NO_BOUNDS, clear_in_view, depth_bounds
+from semantic_mapper.mapping.clearing import NO_BOUNDS, Scene, clear_in_view, depth_bounds
 from semantic_mapper.mapping.fusion import (
     SURFACE_WEIGHT,
     checked_depth,
@@ -51,7 +52,7 @@ from semantic_mapper.mapping.surface import (
     surface_voxels,
     triangle_mesh,
 )
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, PosedFrame
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, PosedFrame, UInt8
 
 # One lock for all maps of a process: growth moves the memory that readers look at, and merging takes two maps at once.
 _KERNEL_LOCK = threading.RLock()
@@ -64,17 +65,14 @@ class VoxelMap:
     """Posed depth, colour and class probabilities in; surface points, mesh, views and files out.
 
     Deterministic: the same frames in the same order give the same ``block_state``, bit for bit. Safe to call from
-    several threads: calls wait for each other, and the long ones leave the GIL to others.
+    several threads: calls wait for each other, and the long ones leave the GIL to others. L = len(label_set) channels
+    of class evidence.
 
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
     are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
     where none did. ``places`` are views to find the map again by. ``cleared`` counts the voxels of surfaces that frames
     saw through, and that were forgotten (``clear_free_space``), in this process.
-
-    Args:
-        config: Voxel size, truncation, caps and limits.
-        label_set: Classes; L = len(label_set) evidence channels in its channel order.
 
     Raises:
         ConfigError: a value of ``config`` that no map can be built with.
@@ -117,10 +115,8 @@ class VoxelMap:
         return self._grid.stored_count
 
     def changed_since(self, version: int) -> Int32:
-        """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order.
-
-        After a new ``epoch`` these are all blocks of the map, and those of before are gone.
-        """
+        """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order; of a new
+        ``epoch``, all."""
         with _KERNEL_LOCK:
             return unpack_keys(self._grid.versions_since(version)[0])
 
@@ -128,8 +124,8 @@ class VoxelMap:
         """The blocks changed after ``version`` was ``since`` (0: the whole map), in compact form.
 
         At most ``limit`` blocks (0 = all), those that have been waiting longest, but never less than one whole version
-        (a frame; a loaded map is one version): a caller that goes on asking with the version they got comes to the
-        present map. Voxels of less than ``min_weight`` count as not observed; 1 = only what was measured.
+        (a frame; a loaded map is one version): who goes on asking with the version they got comes to the present map.
+        Voxels of less than ``min_weight`` count as not observed; 1 = only what was measured.
 
         Raises:
             MapError: ``since`` is not a version of this map, or a bad ``limit`` or ``min_weight``.
@@ -159,7 +155,7 @@ class VoxelMap:
         trust: Float32 | None = None,
         measured: bool = True,
     ) -> int:
-        """Fuse one frame.
+        """Fuse one frame; returns blocks touched, 0 where the depth image holds no measurement.
 
         Args:
             frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
@@ -171,14 +167,11 @@ class VoxelMap:
             trust: (H, W) float32 0..1, how much of its full weight each depth and its vote count; None = 1.
             measured: Whether a sensor measured the depth; what was computed weighs less (``mapping/fusion.py``).
 
-        Returns:
-            Blocks touched, 0 where the depth image holds no measurement.
-
         Raises:
             PoseError, FrameError, ShapeError: the frame cannot be used.
             MapError: the map would grow past ``max_blocks``, or the disk fails.
-            In every case the map is as it was, and the next frame is welcome; save where the disk fails in the midst of
-            a frame that ``memory_mb`` has no room for: a part of its blocks has been fused then.
+            The map is as it was, and the next frame is welcome; save where the disk fails in the midst of a frame that
+            ``memory_mb`` has no room for: a part of its blocks has been fused then.
         """
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
@@ -191,15 +184,9 @@ class VoxelMap:
         camera = make_camera(frame.intrinsics, frame.T_world_camera)
         with _KERNEL_LOCK:
             votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where, weights)
-            packed = blocks_in_band(
-                depth,
-                camera,
-                self.config.voxel_size_m,
-                self.truncation_m,
-                self.config.depth_max_m,
-                frame_budget(self.config.max_blocks),
-            )
-            rgb = np.ascontiguousarray(frame.rgb)
+            lengths = self.config.voxel_size_m, self.truncation_m, self.config.depth_max_m
+            packed = blocks_in_band(depth, camera, *lengths, frame_budget(self.config.max_blocks))
+            scene = Scene(camera, self._limits, depth, np.ascontiguousarray(frame.rgb))
             clears = measured and self.config.clear_free_space
             bounds = NO_BOUNDS
             if clears:
@@ -207,22 +194,19 @@ class VoxelMap:
             cleared: list[tuple[Int64, Int64]] = []
             for blocks in self.changing(packed):
                 buffers = self._grid.buffers()
-                scene = blocks, buffers, camera, self._limits, depth, rgb, weights, votes
-                cleared.append((pack_keys(buffers.keys[blocks]), fuse_blocks(*scene, measured=measured, bounds=bounds)))
+                gone = fuse_blocks(blocks, buffers, scene, weights, votes, measured=measured, bounds=bounds)
+                cleared.append((pack_keys(buffers.keys[blocks]), gone))
             if clears:
-                cleared += clear_in_view(self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version)
-                self._note_cleared(cleared, frame.stamp_ns)
+                cleared += clear_in_view(self._grid, packed, scene, bounds, self.version)
+                for keys, voxels in cleared:
+                    self.cleared += int(voxels.sum())
+                    some = np.flatnonzero(voxels)
+                    version, stamp = np.full(len(some), self.version), np.full(len(some), frame.stamp_ns)
+                    rows_cleared = ClearedBlocks(keys[some], voxels[some], version, stamp)
+                    self._cleared_rows = self._cleared_rows.followed_by(rows_cleared)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
         return len(packed)
-
-    def _note_cleared(self, cleared: Sequence[tuple[Int64, Int64]], stamp_ns: int) -> None:
-        for keys, voxels in cleared:
-            self.cleared += int(voxels.sum())
-            some = np.flatnonzero(voxels)
-            version, stamp = np.full(len(some), self.version), np.full(len(some), stamp_ns)
-            rows = ClearedBlocks(keys[some], voxels[some], version, stamp)
-            self._cleared_rows = self._cleared_rows.followed_by(rows)
 
     @contextmanager
     def locked(self) -> Iterator[BlockGrid]:
@@ -233,12 +217,7 @@ class VoxelMap:
     def changing(self, packed: Int64) -> Iterator[Int32]:
         """Bring blocks with unique packed keys (B,) into memory for a pass that changes them; hold the lock meanwhile.
 
-        Yields:
-            Buffer indices of those that memory has room for at a time. Together they are one new ``version``.
-
-        Raises:
-            MapError: see ``BlockGrid.batches``.
-        """
+        Yields buffer indices of those that memory has room for at a time. Together they are one new ``version``."""
         version = self.version + 1
         for blocks in self._grid.batches(packed):
             yield blocks
@@ -265,9 +244,8 @@ class VoxelMap:
             self.epoch += 1
 
     def points(self, min_weight: float = SURFACE_WEIGHT) -> MapPoints:
-        """Points of the surface, at most three a voxel, in a fixed order; voxels of less than ``min_weight`` are left
-        out (1 = only what was measured).
-        """
+        """Points of the surface, at most three a voxel, in a fixed order, without voxels of less than ``min_weight`` (1
+        = only what was measured)."""
         _check_min_weight(min_weight)
         parts: list[MapPoints] = []
         with _KERNEL_LOCK:
@@ -278,30 +256,21 @@ class VoxelMap:
         return MapPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in POINT_FIELDS))
 
     def mesh(self, min_weight: float = SURFACE_WEIGHT) -> MapMesh:
-        """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``.
-
-        Raises:
-            DependencyError: Open3D cannot be loaded.
-        """
+        """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``. Needs Open3D."""
         _check_min_weight(min_weight)
         parts: list[MapMesh] = []
         with _KERNEL_LOCK:
-            for keys, blocks, grid in self._grid.tiles():
-                vertices, faces = triangle_mesh(keys, blocks, grid, self.config.voxel_size_m, min_weight)
+            for keys, _, grid in self._grid.tiles():
+                vertices, faces = triangle_mesh(keys, grid, self.config.voxel_size_m, min_weight)
                 read = self._read(grid, vertices.astype(np.float64) / self.config.voxel_size_m)
                 parts.append(MapMesh(vertices, faces, *read))
         return parts[0] if len(parts) == 1 else join_meshes(parts)
 
     def to_open3d(self) -> Any:
-        """A copy of the whole map as an ``open3d.t.geometry.VoxelBlockGrid``, for what Open3D does with one.
+        """A copy of the whole map, which is not empty, as an ``open3d.t.geometry.VoxelBlockGrid``.
 
         Its attributes are tsdf, weight and color (float32, as Open3D's own ``integrate`` leaves them), label (uint8 id,
-        the ignore id where unknown), and evidence and votes as they are stored.
-
-        Raises:
-            MapError: the map is empty.
-            DependencyError: Open3D cannot be loaded.
-        """
+        the ignore id where unknown), and evidence and votes as they are stored."""
         state = self.block_state()
         keys = np.asarray(state.pop("keys"), np.int32)
         if not len(keys):
@@ -310,16 +279,12 @@ class VoxelMap:
         return open3d_grid(keys, self.config.voxel_size_m, **flat, label=self.changes(0, min_weight=1e-9).label)
 
     def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> MapView:
-        """The map as a camera (4, 4) would see it, up to ``depth_max_m`` away; pixel centres are integers.
-
-        Raises:
-            PoseError: the pose is not a rigid transform.
-        """
+        """The map as a camera (4, 4) would see it, up to ``depth_max_m`` away; pixel centres are integers."""
         check_pose(T_world_camera, "ray_cast")
         camera = make_camera(intrinsics, T_world_camera)
         with _KERNEL_LOCK:
-            depth_m, rgb, channel, confidence, measured = cast_view(self._grid, camera, intrinsics, self.config)
-        return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence, measured)
+            depth_m, seen = cast_view(self._grid, camera, intrinsics, self.config)
+        return MapView(depth_m, seen.rgb, self.label_set.to_ids(seen.channel), seen.confidence, seen.measured)
 
     def block_state(self, keys: Int32 | None = None) -> dict[str, NDArray[np.generic]]:
         """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
@@ -338,11 +303,7 @@ class VoxelMap:
         """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.
 
         Other threads may go on integrating: they wait for a copy of ``CHUNK_BLOCKS`` at most. ``between`` is called
-        after each of them.
-
-        Raises:
-            MapError: the file cannot be written; one that was there before is as it was.
-        """
+        after each of them. ``MapError``: the file cannot be written; one that was there before is as it was."""
         self.snapshot().write(path, between)
 
     def snapshot(self) -> FrozenMap:
@@ -360,11 +321,7 @@ class VoxelMap:
 
     @classmethod
     def restored(cls, snapshot: FrozenMap) -> VoxelMap:
-        """Another map, as one was when the snapshot was made, bit for bit.
-
-        Raises:
-            MapError: there is no memory, or the disk fails.
-        """
+        """Another map, as one was when the snapshot was made, bit for bit."""
         made = cls(snapshot.manifest.config, snapshot.manifest.label_set)
         made._begin_with(snapshot.manifest, snapshot.parts(), snapshot.places)
         return made
@@ -422,13 +379,12 @@ class VoxelMap:
     def add(self, other: VoxelMap, T_self_other: Float64) -> None:
         """Add all that another map, which lies at ``T_self_other`` (4, 4) in this one, has measured; see ``merge``.
 
-        Where voxels coincide (no rotation but quarter turns, a shift by whole voxels) measurements add up exactly;
-        else those of ``other`` are interpolated. After an error of the disk the map holds a part of ``other``.
+        Where voxels coincide (no rotation but quarter turns, a shift by whole voxels) measurements add up exactly; else
+        those of ``other`` are interpolated. After an error of the disk the map holds a part of ``other``.
 
         Raises:
             MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or this
                 one would grow past ``max_blocks``.
-            PoseError: the pose is not a rigid transform.
         """
         check_pose(T_self_other, "merge")
         check_fit(self.config, self.label_set, other.config, other.label_set)
@@ -459,27 +415,21 @@ class VoxelMap:
         _check_min_weight(min_weight)
         if not 0 <= since <= self.version or limit < 0:
             raise MapError(
-                f"changes since version {since}, limit {limit}: versions of this map go from 0 to {self.version}, and "
-                "a limit is not negative; a mirror of another map restarts from version 0"
+                f"changes since version {since}, limit {limit}: this map has versions 0 to {self.version}; a mirror of "
+                "another map restarts from 0, and a limit is not negative"
             )
         packed, changed_at = self._grid.versions_since(since)
         rows, version = oldest_first(changed_at, limit, self.version)
-        packed = packed[rows]
-        return CopiedChanges(
-            since,
-            version,
-            self.version,
-            self.epoch,
-            unpack_keys(packed),
-            Decision(self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight),
-            packed_parts(self._grid, packed),
-            self.scale_known,
-            self._cleared_rows.between(since, version),
-        )
+        keys, cleared = unpack_keys(packed[rows]), self._cleared_rows.between(since, version)
+        versions = since, version, self.version, self.epoch
+        result = empty_changes(*versions, keys, scale_known=self.scale_known, cleared=cleared)
+        decision = Decision(self.config.vote_discount, self.config.unknown_below, min_weight)
+        return CopiedChanges(result, packed_parts(self._grid, packed[rows]), self.label_set, decision)
 
-    def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32, Bool]:
-        decision = (self.label_set, self.config.vote_discount, self.config.unknown_below)
-        return read_points(voxels, grid.index, grid.buffers(), *decision)
+    def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[UInt8, UInt8, Float32, Bool]:
+        """Colour, label, confidence and whether it was measured, at points (N, 3) in voxels."""
+        read = read_points(voxels, grid.index, grid.buffers(), self.config.vote_discount, self.config.unknown_below)
+        return read.rgb, self.label_set.to_ids(read.channel), read.confidence, read.measured
 
 
 def _check_min_weight(min_weight: float) -> None:

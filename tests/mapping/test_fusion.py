@@ -11,6 +11,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.allocation import make_camera
 from semantic_mapper.mapping.block_grid import GridBuffers
+from semantic_mapper.mapping.clearing import Scene
 from semantic_mapper.mapping.fusion import (
     COMPUTED_CAP,
     COMPUTED_LOOK,
@@ -128,7 +129,7 @@ def test_a_fused_frame_is_that_of_plain_numpy(trusted: bool, measured: bool, rng
     depth, rgb = some_depth(rng), rng.integers(0, 256, (*SIZE, 3), np.uint8)
     votes = some_votes(rng, depth)
     trust = rng.uniform(0.1, 1, SIZE).astype(np.float32) if trusted else np.empty((0, 0), np.float32)
-    fuse_blocks(blocks, buffers, CAMERA, LIMITS, depth, rgb, trust, votes, measured=measured)
+    fuse_blocks(blocks, buffers, Scene(CAMERA, LIMITS, depth, rgb), trust, votes, measured=measured)
     expected, sums = copy(before), before.evidence.astype(np.float64)
     seen = seen_voxels(before.keys[blocks], depth, LIMITS.truncation)
     seen = seen._replace(at=(blocks[seen.at[0]], seen.at[1]))

@@ -49,7 +49,7 @@ def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(
     good = replace(tiny_frames()[0], depth_m=np.full((72, 96), 1.0, np.float32))
     noise = replace(good, seq=1, depth_m=rng.uniform(0.5, 5, (72, 96)).astype(np.float32))
     a.step(good)
-    with pytest.raises(FrameError, match=r"more than 400 blocks of 0\.02 m voxels, its budget"):
+    with pytest.raises(FrameError, match=r"more than 400 blocks of 0\.02 m voxels"):
         a.step(noise)
     a.step(replace(good, seq=2))
     b.step(good)
@@ -62,7 +62,7 @@ def test_a_map_takes_frames_of_so_many_cameras_and_no_more(monkeypatch: pytest.M
     pipeline, frame = make_pipeline(), tiny_frames()[0]
     for name in ("left", "right", "left"):
         pipeline.step(replace(frame, camera_id=name))
-    with pytest.raises(FrameError, match="frames of 2 cameras already"):
+    with pytest.raises(FrameError, match="takes 2 cameras"):
         pipeline.step(replace(frame, camera_id="third"))
     pipeline.step(replace(frame, camera_id="right"))
 

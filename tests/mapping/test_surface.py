@@ -160,7 +160,8 @@ def test_points_are_read_as_plain_numpy_reads_them(rng: np.random.Generator) -> 
     )
     points = rng.uniform(-12, 18, (400, 3))
     points[::5] = np.round(points[::5])  # at voxels: the others count nothing
-    rgb, label, confidence, measured = read_points(points, index, buffers, labels, rho, 0.0)
+    rgb, channel, confidence, measured = read_points(points, index, buffers, rho, 0.0)
+    label = labels.to_ids(channel)
     assert 20 < measured.sum() < len(points) - 20
     for n, p in enumerate(points):
         around = [(f, at) for f, at in corners(buffers, p) if f >= 1e-3]
@@ -187,8 +188,8 @@ def test_points_are_read_as_plain_numpy_reads_them(rng: np.random.Generator) -> 
 
 def test_points_beyond_all_numbers_do_no_harm_and_unknown_ones_are_unknown(rng: np.random.Generator) -> None:
     index, buffers = random_grid(rng)
-    labels = make_label_set("four", ("a", "b", "c", "d"), ignore_id=0)
     wild = np.array([[np.nan] * 3, [np.inf, 0, 0], [1e300, -1e300, 0], [-1e19] * 3, [1e9] * 3])
-    assert np.isin(read_points(wild, index, buffers, labels, 0.5, 0.0)[1], (0, *labels.ids)).all()
+    assert np.isin(read_points(wild, index, buffers, 0.5, 0.0).channel, range(-1, 4)).all()
     for points in (np.full((2, 3), 300.0), wild[:0]):
-        assert not any(values.any() for values in read_points(points, index, buffers, labels, 0.5, 0.0))
+        read = read_points(points, index, buffers, 0.5, 0.0)
+        assert (read.channel == -1).all() and not (read.rgb.any() or read.confidence.any() or read.measured.any())

@@ -9,13 +9,7 @@ from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.blocks import unpack_keys
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.virtual_views import (
-    MARGIN_M,
-    VOTE_WEIGHT,
-    ViewpointChooser,
-    add_votes,
-    surface_patches,
-)
+from semantic_mapper.mapping.virtual_views import MARGIN_M, VOTE_WEIGHT, ViewpointChooser, add_votes, surface_patches
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, small_map

@@ -112,19 +112,6 @@ def test_what_the_map_is_unsure_of_is_unknown_wherever_it_is_read(tmp_path: Path
     assert set(np.unique(seen).tolist()) == {LABELS.ignore_id, 9}
 
 
-def test_images_that_do_not_fit_are_refused_by_name() -> None:
-    voxel_map, depth = small_map(), np.ones((120, 160), np.float32)
-    with pytest.raises(ShapeError, match="depth_m"):
-        voxel_map.integrate(frame(), depth[:60], None, None)
-    with pytest.raises(ShapeError, match=r"depth_m.*float32"):
-        voxel_map.integrate(frame(), depth.astype(np.float64), None, None)  # type: ignore[arg-type]
-    with pytest.raises(ShapeError, match="probabilities"):
-        voxel_map.integrate(frame(), depth, sure(0)[..., :2], None)
-    with pytest.raises(ShapeError, match="known"):
-        voxel_map.integrate(frame(), depth, sure(0), np.ones((120, 160), np.uint8))  # type: ignore[arg-type]
-    assert voxel_map.block_count == 0
-
-
 @pytest.mark.parametrize("wrong", [np.nan, -0.5, 3.0])
 def test_what_is_no_probability_is_refused_and_changes_nothing(wrong: float) -> None:
     voxel_map = small_map()
@@ -139,15 +126,24 @@ def test_what_is_no_probability_is_refused_and_changes_nothing(wrong: float) -> 
     assert voxel_map.integrate(frame(), depth, probabilities, known) > 0
 
 
-def test_unrectified_and_far_away_frames_are_refused() -> None:
-    depth = np.ones((120, 160), np.float32)
-    distorted = CameraIntrinsics(130, 130, 80, 60, 160, 120, (0.1, 0.0, 0.0, 0.0))
-    with pytest.raises(FrameError, match="rectified"):
-        small_map().integrate(frame(intrinsics=distorted), depth, None, None)
+def test_frames_that_cannot_be_fused_are_refused_by_name() -> None:
+    voxel_map, depth = small_map(), np.ones((120, 160), np.float32)
     far = np.eye(4)
     far[0, 3] = 1e7
-    with pytest.raises(FrameError, match="origin"):
-        small_map().integrate(frame(far), depth, None, None)
+    distorted = CameraIntrinsics(130, 130, 80, 60, 160, 120, (0.1, 0.0, 0.0, 0.0))
+    no_bool = np.ones((120, 160), np.uint8)
+    refused: list[tuple[tuple, type[Exception], str]] = [
+        ((frame(), depth[:60], None), ShapeError, "depth_m"),
+        ((frame(), depth.astype(np.float64), None), ShapeError, r"depth_m.*float32"),
+        ((frame(), depth, sure(0)[..., :2]), ShapeError, "probabilities"),
+        ((frame(), depth, sure(0), no_bool), ShapeError, "known"),
+        ((frame(intrinsics=distorted), depth, None), FrameError, "rectified"),
+        ((frame(far), depth, None), FrameError, "origin"),
+    ]
+    for arguments, error, message in refused:
+        with pytest.raises(error, match=message):
+            voxel_map.integrate(*arguments)
+    assert voxel_map.block_count == 0
 
 
 def test_a_full_map_refuses_and_stays_usable() -> None:
@@ -205,10 +201,7 @@ def test_impossible_configurations_are_refused_by_name() -> None:
     for change in ({"voxel_size_m": 0.0}, {"depth_max_m": np.nan}):
         with pytest.raises(ConfigError, match=next(iter(change))):
             VoxelMap(VoxelMapConfig(**change), LABELS)
+    with pytest.raises(MapError, match="this machine has"):
+        small_map(memory_mb=10**9, max_blocks=10**8)
     with pytest.raises(MapError, match="min_weight"):
         small_map().points(0)
-
-
-def test_more_memory_than_the_machine_has_is_refused_before_it_is_taken() -> None:
-    with pytest.raises(MapError, match="GB, this machine has"):
-        small_map(memory_mb=10**9, max_blocks=10**8)
