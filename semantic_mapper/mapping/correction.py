@@ -38,8 +38,9 @@ from semantic_mapper.mapping.blocks import ScratchFile
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.map_snapshot import FrozenMap
 from semantic_mapper.mapping.map_types import ALWAYS, CorrectedPoses, CorrectionStatus
+from semantic_mapper.mapping.rendering import RenderedView
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
+from semantic_mapper.types import Float64, PosedFrame
 
 FRAMES_A_STEP = 4  # of a rebuild, that a step itself fuses where the history is full
 
@@ -59,14 +60,9 @@ class PosePair(NamedTuple):
 class PoseCorrection:
     """How a correction moves frames. All cameras are taken to sit on one body: they follow the same motion in time.
 
-    A frame moves with given poses of its own world alone: a camera that came back in another world was found in the map
-    by itself.
-
-    Args:
-        pairs: At least one. Where several cameras have the same stamp, the first by name speaks for the others.
-        until_ns: Frames later than the last pair, up to this stamp, move with the last pair; the frames after it were
-            posed in the corrected world already. ``ALWAYS``: all of them, those to come as well.
-    """
+    A frame moves with given poses of its own world alone. Where several cameras have the same stamp, the first by name
+    speaks for the others. Frames later than the last pair, up to ``until_ns``, move with the last pair; ``ALWAYS``: all
+    of them, those to come as well."""
 
     def __init__(self, pairs: Sequence[PosePair], until_ns: int) -> None:
         self.until_ns = until_ns
@@ -125,18 +121,6 @@ def _between(a: Float64, b: Float64, fraction: float, T_world_camera: Float64) -
     return out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FusedFrame:
-    """What fusing a frame once more needs: the frame at the pose that it was fused at, without the depth that was left
-    out, and the rendered view (h, w) before it was upsampled; its depth is looked at only where the frame has none.
-    """
-
-    frame: PosedFrame
-    probabilities: Float32
-    known: Bool
-    rendered_depth_m: Float32
-
-
 class _Entry(NamedTuple):
     """A frame of the history: without its images, at its pose in the map, and its bytes on disk."""
 
@@ -170,7 +154,7 @@ class MapCorrector:
     Args:
         config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
         voxel_map, keyframes: In use; move with their frames at the end of a rebuild.
-        fuse: Upsamples a frame of the history and integrates it into the map given.
+        fuse: Integrates a frame of the history and its rendered view (h, w) into the map given.
         on_move: Called when a correction begins, and when the map has moved.
 
     Attributes:
@@ -185,7 +169,7 @@ class MapCorrector:
         config: HistoryConfig,
         voxel_map: VoxelMap,
         keyframes: KeyframeStore,
-        fuse: Callable[[VoxelMap, FusedFrame], None],
+        fuse: Callable[[VoxelMap, PosedFrame, RenderedView], None],
         on_move: Callable[[], None],
     ) -> None:
         self.lock = threading.RLock()
@@ -279,13 +263,12 @@ class MapCorrector:
         self._older = len(self._entries)
         self._snapshots.append(self._map.snapshot())
 
-    def record(self, fused: FusedFrame) -> None:
-        """Keep a frame that the map was just given. Where the disk fails, mapping goes on and correcting ends."""
+    def record(self, frame: PosedFrame, view: RenderedView) -> None:
+        """Keep a frame that the map was just given, without the depth that was left out, and its view before it was
+        upsampled. Where the disk fails, mapping goes on and correcting ends."""
         if self._scratch is None:
             return
-        frame = fused.frame
-        arrays = fused.probabilities, fused.known, fused.rendered_depth_m, frame.rgb, frame.depth_m, frame.depth_sigma_m
-        blob = _pack(arrays)
+        blob = _pack((view.probabilities, view.known, view.depth_m, frame.rgb, frame.depth_m, frame.depth_sigma_m))
         try:
             self._scratch.put([self._left + len(self._entries)], [blob])
         except MapError as error:
@@ -303,17 +286,13 @@ class MapCorrector:
         begins it again, with this correction upon the one under way: the outcome is that of two in a row.
 
         Args:
-            poses: stamp_ns, or (camera_id, stamp_ns), -> T_world_camera (4, 4) float64, at least one, in the map's
-                world as it is right from now on. Frames between them in time move as the head of this file says. Frames
-                that have left the history stay where they are.
-            until_ns: By default frames later than the last given one are trusted as they come: who corrects poses
-                mostly gives the corrected world from then on. Frames up to this stamp have come in the old world and
-                move with the last given one; ``ALWAYS``: odometry goes on in the old world, and frames to come are
-                moved, too.
+            poses: In the map's world as it is right from now on, at least one. Frames between them in time move as the
+                head of this file says. Frames that have left the history stay where they are.
+            until_ns: Frames later than the last given one, up to this stamp, have come in the old world and move with
+                it. By default none have. ``ALWAYS``: odometry goes on in the old world, and frames to come move, too.
 
         Raises:
-            MapError: no history is kept, a stamp is of no frame, or all given frames have left the history. Nothing has
-                changed then.
+            MapError: no history is kept, a stamp is of no frame, or all given frames have left it. Nothing has changed.
             PoseError: a pose is not a rigid transform.
         """
         with self.lock:
@@ -331,9 +310,8 @@ class MapCorrector:
             return self.status
 
     def advance(self, max_frames: int = 1) -> bool:
-        """Continue a rebuild by this many frames, and exchange the maps where it has caught up; whether it still runs.
-
-        May be called from any thread.
+        """Continue a rebuild by this many frames, from any thread, and exchange the maps where it has caught up;
+        whether it still runs.
 
         Raises:
             MapError: the corrected map cannot be built (too large, or a frame out of reach of any voxel, say); the
@@ -356,28 +334,23 @@ class MapCorrector:
         return self._rebuild is not None
 
     def _fuse_next(self, rebuild: _Rebuild) -> None:
-        if rebuild.done < len(self._entries):
-            fused = self._read(rebuild.done, rebuild.place(self._entries[rebuild.done].frame))
-            if fused is not None:
-                self._fuse(rebuild.voxel_map, fused)
+        row = rebuild.done
+        if row < len(self._entries):
+            entry = self._entries[row].frame
+            assert self._scratch is not None
+            try:
+                (blob,) = self._scratch.get([self._left + row])
+            except MapError as error:
+                self._lost += 1
+                _log.error("history_frame_lost", seq=entry.seq, camera=entry.camera_id, reason=str(error))
+            else:
+                probabilities, known, rendered, rgb, depth, sigma = _unpack(blob)
+                pose = rebuild.place(entry)
+                frame = replace(entry, rgb=rgb, depth_m=depth, depth_sigma_m=sigma, T_world_camera=pose)
+                self._fuse(rebuild.voxel_map, frame, RenderedView(probabilities, known, rendered))
             rebuild.done += 1
         if rebuild.done == self._older and len(rebuild.snapshots) < len(self._snapshots):
             rebuild.snapshots.append(rebuild.voxel_map.snapshot())
-
-    def _read(self, row: int, T_world_camera: Float64) -> FusedFrame | None:
-        """A frame of the history; None, counted, where the disk has lost it."""
-        entry = self._entries[row].frame
-        assert self._scratch is not None
-        try:
-            (blob,) = self._scratch.get([self._left + row])
-        except MapError as error:
-            self._lost += 1
-            _log.error("history_frame_lost", seq=entry.seq, camera=entry.camera_id, reason=str(error))
-            return None
-        probabilities, known, rendered, rgb, depth, sigma = _unpack(blob)
-        assert probabilities is not None and known is not None and rendered is not None and rgb is not None
-        frame = replace(entry, rgb=rgb, depth_m=depth, depth_sigma_m=sigma, T_world_camera=T_world_camera)
-        return FusedFrame(frame, probabilities, known, rendered)
 
     def _exchange(self, rebuild: _Rebuild) -> None:
         moved = [e._replace(frame=replace(e.frame, T_world_camera=rebuild.place(e.frame))) for e in self._entries]
@@ -417,12 +390,7 @@ class MapCorrector:
         _log.error("history_ends", reason=reason)
 
     def _pair_poses(self, poses: CorrectedPoses) -> list[PosePair]:
-        """Old and new poses of the given frames that are in the history; the log counts those that have left it.
-
-        Raises:
-            MapError: a stamp is of no frame that was ever mapped, or no given frame is in the history.
-            PoseError: a pose is not a rigid transform.
-        """
+        """Old and new poses of the given frames that are in the history; raises as ``start`` does."""
         by_stamp: dict[int, list[PosedFrame]] = {}
         for entry in self._entries:
             by_stamp.setdefault(entry.frame.stamp_ns, []).append(entry.frame)
@@ -440,7 +408,11 @@ class MapCorrector:
                 old = frame.T_world_camera if self._rebuild is None else self._rebuild.place(frame)
                 pairs.append(PosePair(frame.camera_id, stamp_ns, old, new.copy(), frame.world))
             elif not (self._left and stamp_ns < min(by_stamp, default=0)):
-                raise MapError(f"{where}: no frame with this stamp was mapped{_nearest(stamp_ns, list(by_stamp))}")
+                nearest = min(by_stamp, key=lambda stamp: abs(stamp - stamp_ns), default=None)
+                what = (
+                    "the history is empty" if nearest is None else f"of those in the history the nearest is {nearest}"
+                )
+                raise MapError(f"{where}: no frame with this stamp was mapped; {what}")
         missing = len(poses) - len(pairs)
         if not pairs:
             reason = f"all {missing} frames given have left the history; raise history.max_frames or max_disk_mb"
@@ -453,13 +425,6 @@ class MapCorrector:
 def _close(snapshots: Sequence[FrozenMap]) -> None:
     for snapshot in snapshots:
         snapshot.close()
-
-
-def _nearest(stamp_ns: int, stamps: list[int]) -> str:
-    if not stamps:
-        return "; the history is empty"
-    nearest = min(stamps, key=lambda s: abs(s - stamp_ns))
-    return f"; of those in the history the nearest is {nearest}, {abs(nearest - stamp_ns) / 1e6:g} ms away"
 
 
 def _pack(arrays: Sequence[NDArray[np.generic] | None]) -> bytes:
@@ -475,9 +440,9 @@ def _pack(arrays: Sequence[NDArray[np.generic] | None]) -> bytes:
     return msgspec.msgpack.encode(packed)
 
 
-def _unpack(blob: bytes) -> list[NDArray[Any] | None]:
+def _unpack(blob: bytes) -> list[Any]:
     """The reverse of ``_pack``."""
-    arrays: list[NDArray[Any] | None] = []
+    arrays: list[Any] = []
     for packed in msgspec.msgpack.decode(blob, type=list[tuple[str, tuple[int, ...], bytes] | None]):
         if packed is None:
             arrays.append(None)

@@ -31,7 +31,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import MAX_FEATURES, make_place
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction import FusedFrame, MapCorrector
+from semantic_mapper.mapping.correction import MapCorrector
 from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust, rendered_trust
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.mapping.map_types import PoseInMap
@@ -66,32 +66,17 @@ class _FullSize(NamedTuple):
 class MappingPipeline:
     """Keyframes, view choice, rendering and fusion behind one ``step``.
 
-    Deterministic: same frames, config, field and thread count give the same map, bit for bit.
-
-    Args:
-        config: All settings.
-        field: Renders semantics; its classes must be those of ``label_set``.
-        label_set: Classes of the map.
-        anchors: Labelled keyframes that the field was finetuned on; they are source views from the first frame on.
-
-    Attributes:
-        corrector: Moves the map with corrected poses.
-        frame_depth: Gives frames their depth; knows how far poses and pictures disagree.
-        picture_check: What was wrong with pictures that depth was to be computed from, and between them and their
-            poses.
-        pose_in_map: Of the last frame of a session.
+    Deterministic: same frames, config, field and thread count give the same map, bit for bit. ``anchors`` are labelled
+    keyframes that the field was finetuned on: source views from the first frame on. ``corrector`` moves the map with
+    corrected poses, ``frame_depth`` gives frames their depth, ``picture_check`` says what was wrong with pictures,
+    ``pose_in_map`` where the last frame of a session was.
 
     Raises:
         WeightsError: the field renders other classes than the map holds.
     """
 
     def __init__(
-        self,
-        config: MapperConfig,
-        field: SemanticField,
-        label_set: LabelSet,
-        *,
-        anchors: Sequence[PosedFrame] = (),
+        self, config: MapperConfig, field: SemanticField, label_set: LabelSet, *, anchors: Sequence[PosedFrame] = ()
     ) -> None:
         check_classes(field, label_set)
         self.config = config = with_quality(config)
@@ -136,7 +121,7 @@ class MappingPipeline:
             full = self._timed("upsample", self._upsample_still, views, votes, moving)
             touched = self._timed("fuse", self._fuse, self.voxel_map, full, votes)
             if self.corrector.records:
-                self._timed("history", self._record, full, votes)
+                self._timed("history", self.corrector.record, full.views.frame, votes)
             is_keyframe = self._timed("keyframe", self._keep_view, full.views, current, sources)
             self._finish_step(views.frame)
             return self._update(views.frame, view, full, sources, is_keyframe, touched)
@@ -157,18 +142,12 @@ class MappingPipeline:
         return self.frame_depth.finish()
 
     def render_virtual_views(self, views: int = 1) -> tuple[VirtualView, ...]:
-        """Render the map from where no camera stood, at most so many views of most gain, and fuse what they say of
-        classes.
+        """Render the map from where no camera stood, at most so many views of most gain, fuse what they say of classes,
+        and return them; fewer where no more are worth their time.
 
         For when there is time to spare; every view takes about that of a frame. Nothing is measured: TSDF, colours and
         ``frames`` stay as they are. Deterministic, as part of the sequence of steps and virtual views. The history
-        keeps frames alone: a correction of poses rebuilds the map without the votes of these views, and all may be
-            looked at again.
-
-        Returns:
-            What was rendered, empty where no view is worth its time: no frame mapped yet, too few keyframes, or all
-                that they
-            see is clear or was looked at.
+        keeps frames alone: a correction of poses rebuilds the map without these votes, and all may be looked at again.
         """
         rendered: list[VirtualView] = []
         with self.corrector.lock:
@@ -186,9 +165,8 @@ class MappingPipeline:
         return self._make_keyframe(views, self._encode(views, channel), labelled=True)
 
     def exchange_field(self, field: SemanticField, anchors: Sequence[Keyframe]) -> None:
-        """Go on with other weights. What is in the map stays, with the weight that it has.
+        """Go on with other weights, which encode as the present ones do; what is in the map stays, with its weight.
 
-        The field encodes as the present one does (``fields.learned.encode_alike``): keyframes keep their features.
         Anchors of ``encode_anchor`` take the place of those of the weights before.
 
         Raises:
@@ -199,14 +177,8 @@ class MappingPipeline:
         self.keyframes.exchange_labelled(anchors)
 
     def agreement(self, frame: PosedFrame, renderer: ViewRenderer, keyframes: KeyframeStore) -> tuple[int, int]:
-        """How far another field, which encodes as the present one does, agrees with the map where that is sure of
-        itself.
-
-        Changes nothing. It renders a mapped frame from ``keyframes`` and, where the config says so, the frame itself.
-
-        Returns:
-            Pixels of the coarse view that it names as the map does, and those that are compared.
-        """
+        """Pixels of a mapped frame that another field, rendering from ``keyframes``, names as the map does, and pixels
+        compared: those that the map is sure of. Changes nothing; the field encodes as the present one does."""
         frame = self.corrector.place(frame)
         views = FrameViews(frame)
         current = self._encode(views)
@@ -238,24 +210,18 @@ class MappingPipeline:
         check_pose(frame.T_world_camera, where)
         if frame.camera_id not in self._intrinsics and len(self._intrinsics) >= MAX_CAMERAS:
             raise FrameError(
-                f"{where}: this map has frames of {MAX_CAMERAS} cameras already, the most it takes; give all frames of "
-                "one camera the same camera_id"
+                f"{where}: a map takes {MAX_CAMERAS} cameras; give frames of one camera the same camera_id"
             )
         size, scale = (frame.intrinsics.width, frame.intrinsics.height), self.config.render.scale
         if round(min(size) * scale) < 1:
             raise FrameError(
-                f"{where}: {size[0]}x{size[1]} pixels are too few: at render.scale {scale:g} no ray is left to render; "
-                "send larger images, or raise render.scale"
+                f"{where}: {size[0]}x{size[1]} pixels at render.scale {scale:g} leave no ray; raise either"
             )
         return frame
 
     def _encode(self, resized: FrameViews, channel: torch.Tensor | None = None) -> EncodedViews:
-        """Encode one frame at working width, where that is not larger than the frame.
-
-        Args:
-            resized: The frame.
-            channel: (1, h, w) labels of a keyframe that the field was finetuned on; never of other frames.
-        """
+        """Encode one frame at working width; ``channel`` (1, h, w) are labels of a keyframe that the field was
+        finetuned on."""
         frame = resized.frame
         intrinsics = working_intrinsics(frame.intrinsics, self.config.render.encode_width or frame.intrinsics.width)
         rgb, depth = resized.rgb(intrinsics), resized.depth(intrinsics)
@@ -369,13 +335,9 @@ class MappingPipeline:
         measured = is_measured(frame)
         return voxel_map.integrate(frame, full.depth_m, table, rows=full.rows, trust=full.trust, measured=measured)
 
-    def _record(self, full: _FullSize, votes: RenderedView) -> None:
-        self.corrector.record(FusedFrame(full.views.frame, votes.probabilities, votes.known, votes.depth_m))
-
-    def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame) -> None:
+    def _fuse_again(self, voxel_map: VoxelMap, frame: PosedFrame, view: RenderedView) -> None:
         """Integrate a frame of the history into a map."""
-        view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m)
-        self._fuse(voxel_map, self._upsample(FrameViews(fused.frame), view, voxel_map), view)
+        self._fuse(voxel_map, self._upsample(FrameViews(frame), view, voxel_map), view)
 
     def _keep_view(self, views: FrameViews, current: EncodedViews, sources: Sequence[Keyframe]) -> bool:
         """Keep a frame as a source view, and as a place that the map is found again by, where it shows something new;
@@ -477,16 +439,8 @@ class MappingPipeline:
         fraction = min(1.0, VIRTUAL_SIZE * self.config.render.scale)
         smaller = scale_intrinsics(intrinsics, round(intrinsics.width * fraction), round(intrinsics.height * fraction))
         cast = self.voxel_map.ray_cast(view.T_world_camera, smaller)
-        frame = PosedFrame(
-            stamp_ns=newest.stamp_ns,
-            seq=newest.seq,
-            camera_id=newest.camera_id,
-            rgb=cast.rgb,
-            depth_m=cast.depth_m,
-            label=None,
-            intrinsics=smaller,
-            T_world_camera=view.T_world_camera,
-        )
+        rgb, depth, pose = cast.rgb, cast.depth_m, view.T_world_camera
+        frame = PosedFrame(newest.stamp_ns, newest.seq, newest.camera_id, rgb, depth, None, smaller, pose)
         views = FrameViews(frame)
         sources = [k.encoded for k in self._choose_sources(views, newest.encoded, self.keyframes)]
         rendered = self._render(views, sources, self.config.render.scale / fraction, self._renderer)
@@ -500,7 +454,6 @@ class FieldTrial:
     """A field that may take the place of a pipeline's, which goes on mapping meanwhile: looked at in small pieces.
 
     Args:
-        pipeline: Changed by ``exchange`` alone.
         field: Encodes as the present one does, see ``fields.learned.encode_alike``.
         anchors: Labelled keyframes that it was finetuned on.
         frames: Mapped ones, in which it is compared with the map; none = it is not.

@@ -64,10 +64,6 @@ def true_poses(frames: tuple[PosedFrame, ...], stride: int) -> dict[int, Float64
     return {frames[i].stamp_ns: frames[i].T_world_camera for i in sorted(chosen)}
 
 
-def bits(voxel_map: VoxelMap) -> dict[str, bytes]:
-    return {name: values.tobytes() for name, values in voxel_map.block_state().items()}
-
-
 def same(a: VoxelMap, b: VoxelMap) -> bool:
     x, y = a.block_state(), b.block_state()
     return a.frames == b.frames and all(x[k].tobytes() == y[k].tobytes() for k in x)
@@ -237,7 +233,7 @@ def test_queries_and_steps_go_on_during_a_rebuild_in_another_thread():
 def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
     frames = tiny_frames(8)
     pipeline = mapped(frames[:6], max_frames=20, voxel_map={"voxel_size_m": 0.01})
-    before = bits(pipeline.voxel_map)
+    before = mapped(frames[:6], max_frames=0, voxel_map={"voxel_size_m": 0.01}).voxel_map
     far = frames[3].T_world_camera.copy()
     far[0, 3] = 1e7
     with pytest.raises(PoseError, match="nearer origin"):
@@ -247,7 +243,7 @@ def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
     with pytest.raises(MapError, match="given up, the map stays as it is"):
         finish(pipeline)
     status = pipeline.corrector.status
-    assert not status.running and "beyond" in status.failure and bits(pipeline.voxel_map) == before
+    assert not status.running and "beyond" in status.failure and same(pipeline.voxel_map, before)
     assert pipeline.step(frames[6]).fused
     pipeline.corrector.start({frames[3].stamp_ns: drift(0.5) @ frames[3].T_world_camera})
     finish(pipeline)
@@ -294,7 +290,7 @@ def test_poses_that_cannot_be_used_are_refused_and_change_nothing():
     refused = [
         ({}, MapError, "none was given"),
         ({frames[1].stamp_ns: bad}, PoseError, f"corrected pose of stamp {frames[1].stamp_ns}.*NaN"),
-        ({frames[1].stamp_ns + 2_000_000: pose}, MapError, rf"no frame.*nearest is {frames[1].stamp_ns}, 2 ms away"),
+        ({frames[1].stamp_ns + 2_000_000: pose}, MapError, rf"no frame.*nearest is {frames[1].stamp_ns}"),
         ({("side", frames[1].stamp_ns): pose}, MapError, "of camera 'side': no frame"),
         ({frames[5].stamp_ns: pose}, MapError, r"cameras rear, rooms have this stamp; give \(camera_id, stamp_ns\)"),
     ]
