@@ -85,28 +85,14 @@ def _point_to_plane(
 def compare(
     level: Level, target: Level, T_target_camera: Float64, outlier_m: float = OUTLIER_M, noise_m: float = np.inf
 ) -> Fit:
-    """How a view lies on another one, at one size.
+    """How a view lies on another one, at one size, from a pose ``T_target_camera`` (4, 4).
 
-    Args:
-        level, target: Of the view, and of what it is compared with.
-        T_target_camera: (4, 4).
-        outlier_m: Points further than this from the surface do not count.
-        noise_m: Of depth at 1 m: distances beyond count less in the normal matrix; infinite = all alike.
-    """
+    Points further than ``outlier_m`` from the surface do not count; distances beyond ``noise_m``, of depth at 1 m,
+    count less in the normal matrix (infinite = all alike)."""
     matrix, gradient, sums = np.empty((6, 6)), np.empty(6), np.empty(9)
-    lens = target.intrinsics
-    _point_to_plane(
-        level.points,
-        target.points,
-        target.normals,
-        np.ascontiguousarray(T_target_camera),
-        np.array((lens.fx, lens.fy, lens.cx, lens.cy)),
-        outlier_m,
-        noise_m,
-        matrix,
-        gradient,
-        sums,
-    )
+    lens = np.array((target.intrinsics.fx, target.intrinsics.fy, target.intrinsics.cx, target.intrinsics.cy))
+    pose, limits = np.ascontiguousarray(T_target_camera), (outlier_m, noise_m)
+    _point_to_plane(level.points, target.points, target.normals, pose, lens, *limits, matrix, gradient, sums)
     known, seen, flat, near, squares, cost, weight, weighted_squares, _ = sums.tolist()
     return Fit(
         overlap=seen / max(known, 1),
@@ -126,25 +112,18 @@ def fit(levels: Sequence[Level], target: Target, T_world_camera: Float64) -> Fit
 
 
 def align(levels: Sequence[Level], targets: Sequence[Target], T_world_camera: Float64) -> Float64 | None:
-    """Pose of a view, from a first guess: to the first target from coarse to fine, then to all at the finest level.
+    """Pose (4, 4) of a view, from a first guess: to the first target from coarse to fine, then to all at the finest
+    level.
 
-    Returns:
-        (4, 4), or None where hardly a point lies on a target.
-    """
+    None where hardly a point lies on a target."""
     pose = T_world_camera
     for number, count in zip(range(len(levels) - 1, -1, -1), ITERATIONS, strict=True):
         chosen = targets if number == 0 else targets[:1]
         level = levels[min(number + 1, len(levels) - 1)]
         for _ in range(count):
-            fits = [
-                compare(
-                    level,
-                    target.levels[number],
-                    invert_pose(target.T_world_camera) @ pose,
-                    noise_m=NOISE_M * _COARSER**number,
-                )
-                for target in chosen
-            ]
+            noise_m = NOISE_M * _COARSER**number
+            relative = [invert_pose(target.T_world_camera) @ pose for target in chosen]
+            fits = [compare(level, t.levels[number], T, noise_m=noise_m) for t, T in zip(chosen, relative, strict=True)]
             if sum(f.near for f in fits) < _LEAST_POINTS:
                 return None
             total = sum((f.normal_matrix for f in fits), np.zeros((6, 6)))
@@ -167,10 +146,7 @@ def flat_directions(normal_matrices: Sequence[Float64]) -> tuple[Float64, Float6
     """Projections (3, 3) on the turns and on the shifts of the camera, in its own axes, of which points say nothing.
 
     None where they say something of all, as usual. A wall that fills the picture leaves a turn and two shifts open.
-
-    Args:
-        normal_matrices: (6, 6) each, of ``fit``.
-    """
+    ``normal_matrices`` are (6, 6) each, of ``fit``."""
     total = sum(normal_matrices, np.zeros((6, 6)))
     flat: list[Float64] = []
     for part, least in ((total[:3, :3], _FLAT_TURN), (total[3:, 3:], FALSE)):

@@ -115,14 +115,8 @@ def pose_from_points(
     if not found or inliers is None or len(inliers) < min_inliers:
         return None
     chosen = np.ravel(inliers).astype(np.int64)
-    turn, shift = cv2.solvePnPRefineLM(
-        np.ascontiguousarray(points[chosen], np.float64),
-        np.ascontiguousarray(pixels[chosen], np.float64),
-        camera_matrix(intrinsics),
-        None,
-        turn,
-        shift,
-    )
+    fit, seen = (np.ascontiguousarray(values[chosen], np.float64) for values in (points, pixels))
+    turn, shift = cv2.solvePnPRefineLM(fit, seen, camera_matrix(intrinsics), None, turn, shift)
     T_camera_points = make_pose(turn, shift)
     if not np.isfinite(T_camera_points).all():
         return None

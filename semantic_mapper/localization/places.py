@@ -23,11 +23,7 @@ _SPACING_M, _SPACING_RAD = 0.2, np.deg2rad(12.0)  # a view this far from all pla
 def rank_places(features: Features, descriptors: Mapping[int, UInt8], count: int) -> list[tuple[int, int]]:
     """The places most like an image, best first, as (key, number of features that match); in their order if equal.
 
-    Args:
-        features: Of the image (``find_place_features``), as those of the places.
-        descriptors: (N, 128) of each place, by key.
-        count: At most this many, each with at least one match.
-    """
+    At most ``count``, each with at least one match; ``descriptors`` are (N, 128) of each place, by key."""
     scored = [(key, len(match_features(features.descriptors, theirs))) for key, theirs in descriptors.items()]
     scored.sort(key=lambda item: -item[1])
     return [(key, score) for key, score in scored[:count] if score > 0]
@@ -37,7 +33,6 @@ def rank_places(features: Features, descriptors: Mapping[int, UInt8], count: int
 class Place:
     """What a map keeps of a view to find itself by."""
 
-    # camera_id, stamp_ns: Of the frame.
     camera_id: str
     stamp_ns: int
     T_world_camera: Float64  # (4, 4) float64
@@ -67,12 +62,8 @@ def shared_places(ours: Iterable[Place], theirs: Iterable[Place]) -> int:
 
 
 class PlaceStore:
-    """The places of a map, oldest first; bounded.
-
-    Args:
-        places: To begin with.
-        capacity: Beyond it the younger of the two that are nearest to each other goes.
-    """
+    """The places of a map, oldest first; beyond ``capacity`` the younger of the two that are nearest to each other
+    goes."""
 
     def __init__(self, places: Iterable[Place] = (), capacity: int = MAX_PLACES) -> None:
         self._places = list(places)

@@ -135,13 +135,8 @@ class _Tried:
 
 
 class Relocalizer:
-    """Finds frames in a map. Deterministic; changes nothing.
-
-    Args:
-        places: What the map keeps to find itself by.
-        surface: The map.
-        ignore_id: Of its classes.
-    """
+    """Finds frames in a map, the ``surface``, by its ``places``; ``ignore_id`` is of its classes. Deterministic;
+    changes nothing."""
 
     def __init__(self, places: Sequence[Place], surface: MapSurface, ignore_id: int = 255) -> None:
         self._places = places
@@ -461,9 +456,7 @@ def find_consensus(seen: Sequence[Sighting]) -> Consensus:
 
 def agreed(agreeing: Sequence[Sighting]) -> Float64:
     """T_map_world (4, 4) that fits all of those that agree best: it takes what their cameras look at to where they say.
-
-    Those that are far from the others count for less.
-    """
+    Those that are far from the others count for less."""
     old = np.concatenate([transform(s.T_world_camera, _LOOKED_AT) for s in agreeing])
     new = np.concatenate([transform(s.T_map_world @ s.T_world_camera, _LOOKED_AT) for s in agreeing])
     weights = np.ones(len(agreeing))

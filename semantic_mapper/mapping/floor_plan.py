@@ -44,11 +44,7 @@ _UNKNOWN_RAW = 255  # mode raw: grey levels 0 to 100 are the costs themselves, a
 def find_up(points: MapPoints, label_set: LabelSet) -> Float64:
     """Up (3,) in the world: square to what is labelled floor, away from it, made exact as the overview picture does.
 
-    The picture starts from the camera's poses, which a saved map does not hold; here the floor takes their place.
-
-    Raises:
-        MapError: too little of the map is labelled floor, or what is lies in no plane.
-    """
+    ``MapError``: too little of the map is labelled floor, or what is lies in no plane."""
     named = [i for i, name in zip(label_set.ids, label_set.names, strict=True) if name == FLOOR]
     floor = points.xyz[np.isin(points.label, named)].astype(np.float64)
     if len(floor) < max(LEAST_SHARE * len(points.xyz), 10):
@@ -95,7 +91,7 @@ def _normal(xyz: Float64) -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
-    """A floor plan in the grid's frame: z up, the floor at z = 0; x and y are those of a world that has z up, too."""
+    """A floor plan in the grid's frame: z up, the floor at z = 0, x and y those of a world that has z up."""
 
     # (H, W) int8, ``FREE``, ``OCCUPIED`` or ``UNKNOWN``; row j, column i is the square from ``origin_m + (i, j) *
     # resolution_m`` on: rows run along +y
@@ -167,11 +163,7 @@ def occupancy_grid(
 
 
 def floor_height(height: Float64) -> float:
-    """Height of the floor: the middle of the lowest layer that holds a quarter of what the fullest one holds.
-
-    Raises:
-        MapError: no points.
-    """
+    """Height of the floor: the middle of the lowest layer that holds a quarter of what the fullest one holds."""
     if not len(height):
         raise MapError("a map without surface has no floor")
     layer = np.floor((height - height.min()) / LAYER_M).astype(np.int64)
@@ -187,13 +179,7 @@ def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
 
     The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
     pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.
-
-    Returns:
-        The YAML and the PGM; then those of the costs.
-
-    Raises:
-        MapError: a file cannot be written.
-    """
+    Returns the files; ``MapError`` where one cannot be written."""
     grey = np.full(grid.cells.shape, _UNKNOWN_GREY, np.uint8)
     grey[grid.cells == FREE] = _FREE_GREY
     grey[grid.cells == OCCUPIED] = _OCCUPIED_GREY

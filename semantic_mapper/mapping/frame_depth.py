@@ -36,13 +36,8 @@ CastMap = Callable[[PosedFrame, CameraIntrinsics], tuple[Float32, Bool]]
 class FrameDepth:
     """Gives frames the depth that the settings ask for.
 
-    Args:
-        config: Which depth, and how it is computed.
-        cast_map: Depth (h, w) of the map as a frame sees it, 0 = no surface, and whether it was measured (h, w) bool.
-
-    Attributes:
-        pictures: What was wrong with pictures that depth was to be computed from.
-    """
+    ``cast_map`` gives depth (h, w) of the map as a frame sees it, 0 = no surface, and whether it was measured (h, w)
+    bool. ``pictures`` knows what was wrong with pictures that depth was to be computed from."""
 
     def __init__(self, config: DepthConfig, cast_map: CastMap) -> None:
         self._config = config
@@ -64,11 +59,8 @@ class FrameDepth:
         return float(given), float(refined)
 
     def give(self, frame: PosedFrame) -> PosedFrame:
-        """A frame with its depth, where frames do not wait for later ones; see ``push``.
-
-        Raises:
-            ConfigError: they do, and this one does not come from ``push``.
-        """
+        """A frame with its depth, where frames do not wait for later ones; ``ConfigError`` where they do, and this one
+        does not come from ``push``."""
         if self._computer is None or self._config.from_motion.delay_frames == 0:
             (ready,) = self.push(frame)
             return ready
@@ -115,14 +107,9 @@ class FrameDepth:
             return frame
         assert frame.depth_m is not None
         sigma_m = np.hypot(frame.depth_sigma_m, np.float32(min(refiner.scale_spread, 1.0)) * frame.depth_m)
-        T_world_camera, scale = refiner.to_given(frame.T_world_camera)
-        factor = np.float32(scale)
-        return replace(
-            frame,
-            T_world_camera=T_world_camera,
-            depth_m=factor * frame.depth_m,
-            depth_sigma_m=factor * sigma_m.astype(np.float32),
-        )
+        pose, scale = refiner.to_given(frame.T_world_camera)
+        depth_m, sigma_m = np.float32(scale) * frame.depth_m, np.float32(scale) * sigma_m.astype(np.float32)
+        return replace(frame, T_world_camera=pose, depth_m=depth_m, depth_sigma_m=sigma_m)
 
     def _lens_changed(self, frame: PosedFrame) -> bool:
         intrinsics, _ = self._refiners.get(frame.camera_id, (frame.intrinsics, None))
@@ -159,12 +146,7 @@ class FrameDepth:
 
 def computed_trust(depth_m: Float32, sigma_m: Float32) -> Float32:
     """Fraction (H, W) of its full weight that computed depth has: the inverse variance, relative to that of
-    ``SURE_SPREAD``, and nothing where little is known.
-
-    Args:
-        depth_m: (H, W) float32, 0 = none.
-        sigma_m: (H, W) float32 one-sigma spread.
-    """
+    ``SURE_SPREAD``, and nothing where little is known. ``sigma_m`` is the one-sigma spread of ``depth_m``, 0 = none."""
     spread = sigma_m / np.maximum(depth_m, np.float32(1e-3))
     trust = np.minimum(1.0, (SURE_SPREAD / np.maximum(spread, np.float32(1e-6))) ** 2)
     return np.where((depth_m > 0) & (spread < MOST_SPREAD), trust, 0).astype(np.float32)
@@ -174,14 +156,9 @@ def rendered_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) 
     """Fraction (h, w) of its full weight that depth has which a field rendered; 0 where nothing is to be fused.
 
     It is a mean along each ray: where its samples disagree, at edges and where it guesses, it leaves the smooth surface
-    of its neighbours; and where the map has a surface, it has to lie near that. So trust falls with both differences.
-    Beyond the map a field mostly guesses: there many looks have to agree.
-
-    Args:
-        depth_m: (h, w) float32 rendered z, 0 = none.
-        map_depth_m: (h, w) float32 z of the map's surface in the same view, 0 = none.
-        truncation_m: Of the map; half of it away from its surface trust falls to 1 / e.
-    """
+    of its neighbours; and where the map has a surface, it has to lie near that. So trust falls with both differences:
+    to 1 / e half a truncation away from the map's surface. Beyond the map a field mostly guesses: there many looks have
+    to agree. Depths are 0 where there is none."""
     roughness = np.maximum(_bend(depth_m, 0), _bend(depth_m, 1)) / np.maximum(depth_m, np.float32(1e-3))
     cost = (roughness / ROUGHNESS) ** 2
     off = 2 * (depth_m - map_depth_m) / truncation_m

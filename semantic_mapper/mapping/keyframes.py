@@ -18,6 +18,7 @@ from semantic_mapper.geometry import (
     unproject,
     visible_points,
 )
+from semantic_mapper.localization.places import view_distances
 from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
@@ -32,7 +33,6 @@ HERE_M = 6.0  # from the newest keyframe: beyond, others are worth less, by the 
 class Keyframe:
     """A frame that later frames are rendered from."""
 
-    # seq, stamp_ns, camera_id: Of the frame.
     seq: int
     stamp_ns: int
     T_world_camera: Float64  # (4, 4) float64
@@ -59,10 +59,7 @@ class KeyframeStore:
         return tuple(self._keyframes)
 
     def wants(self, T_world_camera: Float64, size: EncodedSize | None = None) -> bool:
-        """Whether a frame at this pose has moved or turned enough, from every keyframe, to become one.
-
-        Keyframes whose encoded view is of another ``size`` are no source views for it; None = all count.
-        """
+        """Whether a frame at this pose is far enough from every keyframe of its ``size`` to become one."""
         own = np.array([size in (None, k.encoded.size) for k in self._keyframes], bool)
         moved, turned = pose_distances(self._poses()[own], T_world_camera)
         near = (moved < self._config.translation_m) & (turned < ROTATION_DEG)
@@ -81,10 +78,7 @@ class KeyframeStore:
             pass
 
     def move(self, poses: Mapping[tuple[str, int], Float64]) -> int:
-        """Give keyframes other poses; what was encoded of them stays. Returns how many have moved.
-
-        ``poses`` are by (camera_id, stamp_ns); keyframes that are not named stay where they are.
-        """
+        """Give keyframes other poses, by (camera_id, stamp_ns); what was encoded stays. Returns how many have moved."""
         moved = 0
         for i, keyframe in enumerate(self._keyframes):
             pose = poses.get((keyframe.camera_id, keyframe.stamp_ns))
@@ -107,16 +101,8 @@ class KeyframeStore:
         """Up to ``count`` keyframes that together cover the query frustum; none that see nothing of it.
 
         Greedy: each pick adds most not yet covered points of the query's own surface (its depth, or points at a few
-            depths where
-        it has none). Visibility is tested against the keyframes' depth.
-
-        Args:
-            T_world_camera: (4, 4) pose of the query.
-            intrinsics: Of ``depth_m``.
-            depth_m: (H, W) float32, 0 = none.
-            count: At most this many.
-            size: Only those whose encoded view is of this size; None = all.
-        """
+        depths where it has none). Visibility is tested against the keyframes' depth. ``size``: only those whose encoded
+        view is of it."""
         fitting = [k for k in self._keyframes if size in (None, k.encoded.size)]
         if not fitting or count <= 0:
             return []
@@ -134,11 +120,8 @@ class KeyframeStore:
         return np.array([k.T_world_camera for k in self._keyframes]).reshape(-1, 4, 4)
 
     def _drop_most_redundant(self) -> bool:
-        """Drop the one nearest to another; what the camera has left behind counts as nearer. False where all have to
-        stay.
-
-        Without that, a long walk would thin out its few keyframes evenly, and leave no source views where it is.
-        """
+        """Drop the one nearest to another; False where all have to stay. What the camera has left behind counts as
+        nearer: else a long walk would thin out its few keyframes evenly, and leave no source views where it is."""
         poses = self._poses()
         spacing = _separations(poses[:, None], poses[None])
         np.fill_diagonal(spacing, np.inf)
@@ -156,9 +139,8 @@ class KeyframeStore:
 
 def pose_distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:
     """Distances (metres) and angles (degrees) between poses (..., 4, 4); both broadcast."""
-    moved = np.linalg.norm(T_world_a[..., :3, 3] - T_world_b[..., :3, 3], axis=-1)
-    cosine = ((T_world_a[..., :3, :3] * T_world_b[..., :3, :3]).sum(axis=(-2, -1)) - 1) / 2
-    return moved, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    moved, turned = view_distances(T_world_a, T_world_b)
+    return moved, np.degrees(turned)
 
 
 def _separations(T_world_a: Float64, T_world_b: Float64) -> Float64:

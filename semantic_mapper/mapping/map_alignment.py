@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,9 +52,7 @@ class MapAlignment:
 def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
     """Refuse two saved maps without reading their blocks; ``find``: where the second lies in the first is to be found.
 
-    Raises:
-        MapError: only one is in metres, they are the same map, or what is to be found cannot be; or one cannot be read.
-    """
+    ``MapError``: only one is in metres, they are the same map, what is to be found cannot be; or one cannot be read."""
     with open_map(path) as one, open_map(other) as two:
         manifests = one.manifest, two.manifest
     require_same_scale(manifests[0].scale_known, manifests[1].scale_known, "merge")
@@ -68,17 +65,15 @@ def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
 
 def _nothing_to_find(which: str, way_out: str = _WAY_OUT) -> str:
     return (
-        f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without depth, by an "
-        f"older release, or with keyframes.save_places = false). {way_out}"
+        f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without depth, or "
+        f"with keyframes.save_places = false). {way_out}"
     )
 
 
 def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT) -> MapAlignment:
     """Where another map lies in this one; ``way_out`` is what errors advise where it cannot be found.
 
-    Raises:
-        MapError: the maps do not fit each other, nothing is found, or not for sure; says why.
-    """
+    ``MapError`` says why: the maps do not fit each other, nothing is found, or not for sure."""
     check_fit(voxel_map.config, voxel_map.label_set, other.config, other.label_set)
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
@@ -86,17 +81,11 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
             raise MapError(_nothing_to_find(which, way_out))
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
-    seen = []
-    reasons: Counter[str] = Counter()
-    for place in chosen:
-        found = _find(finder, other, place)
-        if isinstance(found, NotFound):
-            reasons[found.reason] += 1
-        else:
-            seen.append(sighting(found.T_map_camera, place.T_world_camera))
+    looks = [(place, _find(finder, other, place)) for place in chosen]
+    seen = [sighting(f.T_map_camera, p.T_world_camera) for p, f in looks if not isinstance(f, NotFound)]
     consensus = find_consensus(seen)
     if consensus.refusal:
-        refused = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        refused = ", ".join(sorted({found.reason for _, found in looks if isinstance(found, NotFound)}))
         raise MapError(
             f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
             f"first ({refused or 'none was refused'}), and {consensus.refusal}. {way_out}"

@@ -50,7 +50,6 @@ class CorrectionStatus:
 class CameraPose:
     """Where a frame was taken."""
 
-    # camera_id, stamp_ns: Of the frame.
     camera_id: str
     stamp_ns: int
     T_map_camera: Float64 | None  # (4, 4) float64; None while its place in the map is not known
@@ -112,21 +111,13 @@ def computed_fraction(surface: MapPoints | MapMesh) -> float:
 
 
 def require_metres(scale_known: bool, what: str) -> None:
-    """Refuse what takes or gives metres where the map, or log, has none; ``what`` begins the error.
-
-    Raises:
-        MapError: lengths are not metres.
-    """
+    """Refuse what takes or gives metres where the map, or log, has none: ``MapError`` that begins with ``what``."""
     if not scale_known:
         raise MapError(f"{what}: needs metres, but the scale is unknown; {SCALE_FIX}")
 
 
 def require_same_scale(one_known: bool, other_known: bool, what: str) -> None:
-    """Refuse what puts lengths of two maps side by side where only one of them is in metres.
-
-    Raises:
-        MapError: it is so.
-    """
+    """Refuse what puts lengths of two maps side by side where only one of them is in metres: ``MapError``."""
     if one_known != other_known:
         raise MapError(f"{what}: one map is in metres, the scale of the other is unknown; {SCALE_FIX}")
 

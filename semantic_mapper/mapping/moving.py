@@ -6,21 +6,18 @@ has come there. So a thing that stays becomes part of the map after this time, w
 
 A cell of ``CELLS`` across the image has the nearest depth of its pixels. It contradicts a view where all that the view
 measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things and depth edges
-say nothing. Poses that are off by a few centimetres would look like motion: a frame is first aligned with views of
-these seconds. Where that does not fit, or what it changes leaps from frame to frame, the poses
-are wrong and nothing is found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows,
-cell by cell, along its own surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside,
-which it hid itself.
+say nothing. A frame is first aligned with views of these seconds, as poses that are off by a few centimetres would look
+like motion. Where that does not fit, or what it changes leaps from frame to frame, the poses are wrong and nothing is
+found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows, cell by cell, along its own
+surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside, which it hid itself.
 
-Not found: what moves away along the line of sight (it hid the space where it is now), what had moved before it was seen
-for the first time, and what is slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through
-it (``mapping/clearing.py``).
+Not found: what moves away along the line of sight, what had moved before it was seen for the first time, and what is
+slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through it (``mapping/clearing.py``).
 
 Alignment is Gauss-Newton from point to plane on small depth images, with a prior that the given pose is right to within
 ``SIGMA_M`` and ``SIGMA_RAD``: a pose that jitters or drifts is corrected, one that jumps is not, and ``misfit`` tells.
 Most of what moves is no part of it: it is farther from what was there than residuals that count. Wider ``CUTS`` correct
-more, and people who walk pull at the pose.
-"""
+more, and people who walk pull at the pose."""
 
 from __future__ import annotations
 
@@ -67,10 +64,7 @@ EDGE_PX = 2  # around what moves, where depth may be between it and what is behi
 
 
 class MovingSpace:
-    """Where what is left out of the map was seen within the last ``KEPT_S`` seconds of frames.
-
-    Another thread may ask for ``points`` while frames are added.
-    """
+    """Where what is left out of the map was seen within the last ``KEPT_S`` seconds of frames; any thread may ask."""
 
     def __init__(self) -> None:
         self._parts: tuple[tuple[int, Float32], ...] = ()
@@ -100,11 +94,8 @@ class MovingSpace:
 
 
 class MovingFilter:
-    """Finds what moves, for one map.
-
-    Attributes:
-        pixels: Left out so far.
-        space: Where what moves was within the last second.
+    """Finds what moves, for one map; ``pixels`` were left out so far, ``space`` is where that was within the last
+    second.
 
     Raises:
         ConfigError: ``moving.classes``, and none of the classes does.
@@ -115,10 +106,9 @@ class MovingFilter:
         self._motion = MotionDetector(config.voxel_map.depth_max_m)
         self._ids = label_set.moving_ids() if config.moving.classes else ()
         if config.moving.classes and not self._ids:
-            names = ", ".join(sorted(MOVING_NAMES))
             raise ConfigError(
-                f"moving.classes: none of the classes of '{label_set.name}' moves by itself ({names} would); use "
-                "weights that know one (`rooms-people` ship), or moving.motion"
+                f"moving.classes: none of the classes of '{label_set.name}' moves ({', '.join(sorted(MOVING_NAMES))} "
+                "would); use weights that know one (`rooms-people` ship), or moving.motion"
             )
         self.pixels = 0
         self.space = MovingSpace()
@@ -183,9 +173,7 @@ class SeenView(NamedTuple):
 class MotionDetector:
     """Finds what moves by depth alone. Deterministic; the only clock is the frames' stamps.
 
-    Attributes:
-        poses_fit: Whether the pose of the last frame does, and those before it; else nothing is found.
-    """
+    ``poses_fit``: whether the pose of the last frame does, and those before it; else nothing is found."""
 
     def __init__(self, depth_max_m: float) -> None:
         self._depth_max_m = depth_max_m
@@ -293,7 +281,7 @@ def _seen_before(frame: PosedFrame, cells: _Cells, views: list[SeenView]) -> tup
     """Cells (h, w) where a view saw free space, and where one of some time ago saw a surface."""
     v, u = np.nonzero(cells.inside)
     points = np.ascontiguousarray(transform(frame.T_world_camera, _points(frame, cells, v, u)).T, np.float32)
-    free, seen = np.zeros(len(u), np.bool_), np.zeros(len(u), np.bool_)
+    free, seen = np.zeros(cells.near.shape, np.bool_), np.zeros(cells.near.shape, np.bool_)
     for view in views:
         T = view.T_camera_world.astype(np.float32)
         px, py, depth = T[:3, :3] @ points + T[:3, 3:]
@@ -302,14 +290,12 @@ def _seen_before(frame: PosedFrame, cells: _Cells, views: list[SeenView]) -> tup
             y = np.rint(py / depth * view.focal[1] + view.centre[1])
         h, w = view.near.shape
         at = np.flatnonzero((depth > 0) & (x >= 0) & (y >= 0) & (x < w) & (y < h))
-        cell, depth = y[at].astype(np.int64) * w + x[at].astype(np.int64), depth[at]
+        there, depth = (y[at].astype(np.int64), x[at].astype(np.int64)), depth[at]
         margin = MARGIN_M + MARGIN_PER_M * depth
-        free[at] |= view.around.ravel()[cell] > depth + margin
+        free[v[at], u[at]] |= view.around[there] > depth + margin
         if frame.stamp_ns - view.stamp_ns >= SURE_S * _SECOND:
-            seen[at] |= np.abs(view.near.ravel()[cell] - depth) <= margin
-    images = np.zeros((2, *cells.near.shape), np.bool_)
-    images[0, v, u], images[1, v, u] = free, seen
-    return images[0], images[1]
+            seen[v[at], u[at]] |= np.abs(view.near[there] - depth) <= margin
+    return free, seen
 
 
 def _without_specks(found: Bool) -> Bool:
@@ -323,7 +309,7 @@ def _grown(moving: Bool, depth: Float32, unknown: Bool) -> Bool:
     """What moves and cells along its surface that no view knows."""
     moving, unknown = moving.copy(), unknown & (depth > 0)
     step = STEP_M + STEP_PER_M * depth
-    for _ in range(GROWTH if moving.any() else 0):
+    for _ in range(GROWTH):
         more = np.zeros_like(moving)
         for to, of in _NEIGHBOURS:
             more[to] |= moving[of] & (np.abs(depth[to] - depth[of]) < step[to])
@@ -336,9 +322,7 @@ def _grown(moving: Bool, depth: Float32, unknown: Bool) -> Bool:
 
 def _filled(moving: Bool, depth: Float32) -> Bool:
     """Without holes: cells with what moves on most sides, and in one surface with it, move, too."""
-    if not moving.any():
-        return moving
-    for _ in range(HOLES):
+    for _ in range(HOLES if moving.any() else 0):
         near = np.asarray(cv2.boxFilter(np.where(moving, depth, 0), -1, (3, 3), normalize=False))
         count = np.asarray(cv2.boxFilter(moving.astype(np.float32), -1, (3, 3), normalize=False))
         mean = near / np.maximum(count, 1)
@@ -347,12 +331,8 @@ def _filled(moving: Bool, depth: Float32) -> Bool:
 
 
 _ALL, _LOW, _HIGH = slice(None), slice(None, -1), slice(1, None)
-_NEIGHBOURS = (
-    ((_HIGH, _ALL), (_LOW, _ALL)),
-    ((_LOW, _ALL), (_HIGH, _ALL)),
-    ((_ALL, _HIGH), (_ALL, _LOW)),
-    ((_ALL, _LOW), (_ALL, _HIGH)),
-)
+_DOWN, _RIGHT = ((_HIGH, _ALL), (_LOW, _ALL)), ((_ALL, _HIGH), (_ALL, _LOW))
+_NEIGHBOURS = (_DOWN, _DOWN[::-1], _RIGHT, _RIGHT[::-1])
 
 
 def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> Bool:
@@ -393,10 +373,8 @@ def depth_slopes(depth_m: Float32) -> Float32:
 
 
 def align_pose(points: Float32, T_world_camera: Float64, views: Sequence[SeenView]) -> Alignment:
-    """Correct a pose (4, 4) by what views of one size saw, given points (N, 3) that the frame measured, in its camera.
-
-    Residuals beyond ``CUTS`` of the margin are something else.
-    """
+    """Correct a pose (4, 4) by what views of one size saw, given points (N, 3) that the frame measured, in its
+    camera."""
     T, moved, misfit = T_world_camera, np.zeros(6), np.inf
     prior = np.repeat((SIGMA_M**-2, SIGMA_RAD**-2), 3)
     for cut in CUTS:

@@ -47,10 +47,9 @@ class Taken:
 class OdometrySessions:
     """Which odometry sessions are known in a map, and the search for those that are not.
 
-    Args:
-        pipeline: Its map, with its places; classes of a frame have to agree with it. ``pose_in_map`` is given the pose
-            of every frame. While the map is being corrected, no world is looked for.
-        own_first: The first world that comes is the map's own, as in a map that begins empty.
+    The map is that of ``pipeline``; classes of a frame have to agree with it, and its ``pose_in_map`` is given the pose
+    of every frame. While the map is being corrected, no world is looked for. With ``own_first`` the first world that
+    comes is the map's own, as in a map that begins empty.
 
     Attributes:
         known: T_map_world (4, 4) by world.
@@ -87,10 +86,7 @@ class OdometrySessions:
         return move(self._corrector.motion(world), self.known[world])
 
     def in_map(self, poses: CorrectedPoses) -> CorrectedPoses:
-        """Corrected poses, each in the world of its frame, in that of the map.
-
-        Of frames that are not known the pose stays as it is.
-        """
+        """Corrected poses, each in the world of its frame, in that of the map; as they are where it is not known."""
         world_by_frame = self._corrector.world_by_frame()
         by_stamp = {stamp_ns: world for (_, stamp_ns), world in world_by_frame.items()}
         moved: dict[Any, Float64] = {}

@@ -22,11 +22,7 @@ _log = get_logger(__name__)
 
 @functools.cache
 def load_open3d() -> Any:
-    """Import Open3D once and return the module, quiet (errors only).
-
-    Raises:
-        DependencyError: naming the library that is missing and how to get it.
-    """
+    """Import Open3D once and return the module, quiet; ``DependencyError`` says which library is missing."""
     notes = preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")
     try:
         open3d = importlib.import_module("open3d")
@@ -34,9 +30,9 @@ def load_open3d() -> Any:
         if is_out_of_memory(error):
             raise DependencyError(f"Open3D cannot be loaded: {memory_message(error)}") from error
         raise DependencyError(
-            f"Open3D cannot be loaded: {error}. Run `make setup`, which puts missing system libraries into "
-            f"{Path(sys.prefix) / 'syslibs'}, or install them yourself (Debian/Ubuntu: `apt-get install libusb-1.0-0 "
-            f"libgl1 libegl1 libx11-6 libgomp1`; glibc 2.35 or newer is needed)." + "".join(f" [{n}]" for n in notes)
+            f"Open3D cannot be loaded: {error}. Run `make setup`, or install what is missing (Debian/Ubuntu: `apt-get "
+            "install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1`; glibc 2.35 or newer is needed)."
+            + "".join(f" [{note}]" for note in notes)
         ) from error
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     _log.debug("open3d_loaded", version=open3d.__version__, preload_failures=notes)
@@ -44,11 +40,8 @@ def load_open3d() -> Any:
 
 
 def preload_folder(folder: Path) -> list[str]:
-    """Load every shared library below ``folder`` into the process, in whatever order their links ask for.
-
-    Returns:
-        One line for each library that could not be loaded; empty where all could, or there is no such folder.
-    """
+    """Load every shared library below ``folder`` into the process, in whatever order their links ask for; one line for
+    each that could not be."""
     waiting = sorted(p for p in folder.rglob("*.so*") if p.is_file()) if folder.is_dir() else []
     failures: dict[Path, str] = {}
     while waiting:

@@ -1,20 +1,15 @@
 """Whether poses, depth and intrinsics fit each other: overlapping keyframes have to measure the same surface.
 
 Each new keyframe's depth is carried into some earlier ones and theirs into it, and the two depths at a pixel are
-compared. Two figures come of it.
+compared. The disagreement is the lower quartile of the relative differences, so that it stays small where a quarter of
+the pixels agree, whatever moves before the camera or is hidden in one of two views: 0.2 to 0.5 % in good recordings, 1
+% with depth as noisy as a stereo camera's, 4 to 15 % with inverted poses or camera axes of another convention.
 
-The disagreement is the lower quartile of the relative differences, so that it stays small where a quarter of the pixels
-agree, whatever moves before the camera or is hidden in one of two views: 0.2 to 0.5 % in good recordings, 1 % with
-depth as noisy as a stereo camera's, 4 to 15 % with inverted poses or camera axes of another convention.
-
-A pair of keyframes contradicts itself where one sees through what the other measures: its points lie before the depth
-that the other has there, which nothing that is hidden can explain. In good recordings no pair does so in more than 8 %
-of the pixels. Where the poses jump or drift, only the pairs across the jump do: a new keyframe is compared with the
-oldest of its neighbourhood, too, and a tenth of the pairs is enough for a warning. What moves before the camera is seen
-through as well, but between neighbours in time just as much: what each keyframe has of it against the one before it is
-taken off. Smaller errors stay unnoticed: depth that is 20 % too large, a focal length that is 10 % too long, a drift of
-less than about 20 cm.
-"""
+A pair contradicts itself where one sees through what the other measures, which nothing that is hidden can explain; in
+good recordings in at most 8 % of the pixels. Where the poses jump or drift, only the pairs across the jump do: a new
+keyframe is compared with the oldest of its neighbourhood, too, and a tenth of the pairs is enough for a warning. What
+moves is seen through as well, but between neighbours in time just as much: that is taken off. Smaller errors stay
+unnoticed: depth that is 20 % too large, a focal length that is 10 % too long, a drift of less than about 20 cm."""
 
 from __future__ import annotations
 
@@ -52,14 +47,25 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _REP_103 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # T_body_camera
 ALIKE = 0.8  # of the overlap that keyframes have as they are; a cause that leaves less has but moved them apart
 
+
+def _in_metres(T: Float64) -> Float64:
+    scaled = T.copy()
+    scaled[:3, 3] *= 0.001
+    return scaled
+
+
 # What is often wrong with a recording, as the change that would fix it.
-_CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
-    ("poses inverted (they are T_camera_world; T_world_camera is needed)", invert_pose, 1.0),
-    ("camera axes turned from OpenGL's (y up, z backward) to OpenCV's", lambda T: T @ _OPENGL, 1.0),
-    ("camera axes turned from a robot's (REP 103: x forward, y left, z up) to OpenCV's", lambda T: T @ _REP_103, 1.0),
-    ("translations divided by 1000 (they are millimetres)", lambda T: _scaled(T, 0.001), 1.0),
-    ("depth divided by 5 (scale 5000, not 1000)", lambda T: T, 0.2),
-    ("depth multiplied by 5 (scale 1000, not 5000)", lambda T: T, 5.0),
+_CAUSES: tuple[tuple[str, Callable[[Float64], Float64], np.float32], ...] = (
+    ("poses inverted (they are T_camera_world; T_world_camera is needed)", invert_pose, np.float32(1.0)),
+    ("camera axes turned from OpenGL's (y up, z backward) to OpenCV's", lambda T: T @ _OPENGL, np.float32(1.0)),
+    (
+        "camera axes turned from a robot's (REP 103: x forward, y left, z up) to OpenCV's",
+        lambda T: T @ _REP_103,
+        np.float32(1.0),
+    ),
+    ("translations divided by 1000 (they are millimetres)", _in_metres, np.float32(1.0)),
+    ("depth divided by 5 (scale 5000, not 1000)", lambda T: T, np.float32(0.2)),
+    ("depth multiplied by 5 (scale 1000, not 5000)", lambda T: T, np.float32(5.0)),
 )
 
 
@@ -69,8 +75,7 @@ class PoseCheck:
     Attributes:
         compared: Keyframes that overlap with earlier ones and were compared.
         worst, worst_contradicting: Largest ``recent`` and ``contradicting`` so far; None before ``MIN_KEYFRAMES``.
-        warning: What is wrong and how to fix it, for people; empty where all is well. Stays once it is there, as the
-            map keeps what was fused.
+        warning: What is wrong and how to fix it; empty where all is well. Stays, as the map keeps what was fused.
     """
 
     def __init__(self, depth_max_m: float) -> None:
@@ -90,22 +95,15 @@ class PoseCheck:
 
     @property
     def contradicting(self) -> float | None:
-        """Fraction of the newest pairs of keyframes of which one sees through what the other measures.
-
-        None before ``MIN_KEYFRAMES`` were compared in pairs that overlap by ``MIN_OVERLAP``.
-        """
+        """Fraction of the newest pairs of keyframes of which one sees through what the other measures; None as long as
+        too few overlap."""
         if self.compared < MIN_KEYFRAMES or len(self._pairs) < MIN_PAIRS:
             return None
         return float(np.mean(np.array(self._pairs) > SEEN_THROUGH))
 
     def add(self, new: Keyframe, sources: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
-        """Compare a new keyframe with earlier ones.
-
-        Args:
-            new: Not yet among ``keyframes``.
-            sources: Of them, those that see most of what it sees, the best first.
-            keyframes: All, oldest first.
-        """
+        """Compare a new keyframe with earlier ones: those ``sources`` that see most of what it sees, the best first,
+        and others of all ``keyframes``, oldest first."""
         near = [k for k in sources if not k.labelled][:PARTNERS]
         if keyframes and not keyframes[-1].labelled and not any(keyframes[-1] is k for k in near):
             near.append(keyframes[-1])
@@ -116,8 +114,9 @@ class PoseCheck:
         self._newest.append(found)
         self._compare_pairs(new, [*near, *_oldest_neighbours(new, keyframes, near)], keyframes)
         recent, contradicting = self.recent, self.contradicting
-        self.worst = _largest(self.worst, recent)
-        self.worst_contradicting = _largest(self.worst_contradicting, contradicting)
+        self.worst = max((v for v in (self.worst, recent) if v is not None), default=None)
+        worst = (v for v in (self.worst_contradicting, contradicting) if v is not None)
+        self.worst_contradicting = max(worst, default=None)
         if self.warning or recent is None:
             return
         if recent > MAX_DISAGREEMENT or (contradicting or 0.0) > MAX_CONTRADICTING:
@@ -140,28 +139,16 @@ class PoseCheck:
 
     def _explain(self, recent: float, contradicting: float | None, keyframes: Sequence[Keyframe]) -> str:
         own = [k for k in keyframes if not k.labelled][-WINDOW:]
-        if recent > MAX_DISAGREEMENT:
-            what = (
-                f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (lower quartile; below 1 % "
-                "where poses and depth fit)"
-            )
-        else:
+        what = f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (below 1 % where all fits)"
+        if recent <= MAX_DISAGREEMENT:
             what = (
                 f"in {100 * (contradicting or 0.0):.0f} % of the pairs of overlapping keyframes, one sees through what "
-                "the other measures (none do where poses and depth fit): the poses jump or drift, or depth and "
-                "intrinsics do not fit"
+                "the other measures (none do where all fits)"
             )
-        text = (
-            f"{what}, found at frame seq={own[-1].seq}: the map cannot be trusted. Check the poses (T_world_camera, "
-            "OpenCV axes, metres, stamps), the depth scale and the intrinsics"
-        )
         needed = ALIKE * _overlap(own, self._limit_m)
         best, least = "", min(MAX_DISAGREEMENT, recent) / 2
-        for cause, change, depth_factor in _CAUSES:
-            changed = [
-                replace(k, T_world_camera=change(k.T_world_camera), depth_m=k.depth_m * np.float32(depth_factor))
-                for k in own
-            ]
+        for cause, change, factor in _CAUSES:
+            changed = [replace(k, T_world_camera=change(k.T_world_camera), depth_m=k.depth_m * factor) for k in own]
             pairs = [disagreement([pair], self._limit_m) for pair in pairwise(changed)]
             singles = [d for d in pairs if d is not None]
             if len(singles) < MIN_KEYFRAMES - 1 or _overlap(changed, self._limit_m) < needed:
@@ -169,14 +156,15 @@ class PoseCheck:
             then = float(np.median(singles))
             if then < least:
                 best, least = f". With {cause} they disagree by {100 * then:.1f} %", then
-        return text + best
+        return (
+            f"{what}, found at frame seq={own[-1].seq}: the map cannot be trusted. Check the poses (T_world_camera, "
+            f"OpenCV axes, metres, stamps), the depth scale and the intrinsics{best}"
+        )
 
 
 def disagreement(pairs: Sequence[tuple[Keyframe, Keyframe]], limit_m: float) -> float | None:
-    """Lower quartile of |z - depth| / depth over the pixels where a keyframe's points fall on depth of its partner.
-
-    Pairs are compared in both directions, depth beyond ``limit_m`` is not; None where fewer than ``MIN_PIXELS`` can be.
-    """
+    """Lower quartile of |z - depth| / depth over the pixels where a keyframe's points fall on depth of its partner, in
+    both directions; None where fewer than ``MIN_PIXELS`` can be compared."""
     parts = [part for a, b in pairs for part in (_differences(a, b, limit_m)[0], _differences(b, a, limit_m)[0])]
     if sum(map(len, parts)) < MIN_PIXELS:
         return None
@@ -190,10 +178,8 @@ def _overlap(keyframes: Sequence[Keyframe], limit_m: float) -> float:
 
 
 def fraction_seen_through(a: Keyframe, b: Keyframe, limit_m: float) -> float | None:
-    """Fraction of the pixels where points of one keyframe lie before the depth of the other by more than ``BEFORE``.
-
-    None where the two overlap in less than ``MIN_OVERLAP`` of their pixels with depth.
-    """
+    """Fraction of the pixels where points of one keyframe lie before the depth of the other by more than ``BEFORE``;
+    None where the two overlap in less than ``MIN_OVERLAP`` of their pixels with depth."""
     (there, of_a), (back, of_b) = _differences(a, b, limit_m), _differences(b, a, limit_m)
     compared = len(there) + len(back)
     if compared < max(MIN_PIXELS, MIN_OVERLAP * (of_a + of_b)):
@@ -228,14 +214,3 @@ def _differences(a: Keyframe, b: Keyframe, limit_m: float) -> tuple[Float64, int
 
 def _key(keyframe: Keyframe) -> tuple[str, int]:
     return keyframe.camera_id, keyframe.seq
-
-
-def _largest(a: float | None, b: float | None) -> float | None:
-    known = [value for value in (a, b) if value is not None]
-    return max(known) if known else None
-
-
-def _scaled(T: Float64, factor: float) -> Float64:
-    scaled = T.copy()
-    scaled[:3, 3] *= factor
-    return scaled

@@ -1,8 +1,7 @@
 """Refining a map: a network that has seen many maps corrects what the votes say, and labels surface without votes.
 
-The map is read in tiles, so that memory does not grow with it. The network sees 1.9 m far, and tiles overlap by that.
-What it answers is written back as evidence that reads as exactly that. TSDF, colour and weights stay as they are, bit
-for bit.
+The map is read in tiles, so that memory does not grow with it; they overlap by the 1.9 m that the network sees. What it
+answers is written back as evidence that reads as exactly that. TSDF, colour and weights stay as they are, bit for bit.
 """
 
 from __future__ import annotations
@@ -16,16 +15,7 @@ import numpy as np
 import torch
 
 from semantic_mapper.errors import MapError, WeightsError
-from semantic_mapper.fields.nesf import (
-    CELL_M,
-    SMOOTHED,
-    Near,
-    Nesf,
-    NesfWeights,
-    SurfacePoints,
-    near_cells,
-    pool,
-)
+from semantic_mapper.fields.nesf import CELL_M, SMOOTHED, Near, Nesf, NesfWeights, SurfacePoints, near_cells, pool
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
@@ -73,9 +63,7 @@ class SurfaceVoxels(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class RefineReport:
     """What became of the surface: its voxels by class name before and after ("unknown" last), and of them all, those
-    with another class than before, and those that had no votes and have a class now. ``voted``: whether anything had
-    votes.
-    """
+    with another class than before, and those that had no votes and have a class now; whether anything had votes."""
 
     before: dict[str, int]
     after: dict[str, int]
@@ -104,10 +92,9 @@ def refine(
     by_name: bool = False,
     on_tile: Callable[[int, int], object] = lambda done, total: None,
 ) -> RefineReport:
-    """Refine a map in place.
+    """Refine a map in place; others may read it meanwhile, but not integrate.
 
     Args:
-        voxel_map: Not refined yet; others may read it meanwhile, but not integrate.
         weights: Of the same classes.
         fill: Surface without votes gets a class where it is at least so likely; 1 = never.
         up: (3,) in the world; None = away from the floor.
@@ -141,11 +128,7 @@ def refine(
 
 
 def check_refinable(voxel_map: VoxelMap) -> None:
-    """Refuse maps that the network cannot refine.
-
-    Raises:
-        MapError: says why.
-    """
+    """Refuse maps that the network cannot refine: ``MapError`` says why."""
     size = voxel_map.config.voxel_size_m
     if not voxel_map.block_count:
         raise MapError("an empty map has nothing to refine; map a frame first")
@@ -179,11 +162,7 @@ def _shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple
 
 
 def up_frame(voxel_map: VoxelMap, up: Float64 | None = None) -> UpFrame:
-    """Which way is up, and where the floor is: nearly the lowest surface.
-
-    Raises:
-        MapError: the map has no surface, or ``up`` is None and cannot be found.
-    """
+    """Which way is up, and where the floor is: nearly the lowest surface. ``MapError`` where neither is to be found."""
     points = voxel_map.points()
     if not len(points.xyz):
         raise MapError("the map has no surface to refine")
@@ -204,7 +183,11 @@ def surface_voxels(voxel_map: VoxelMap, frame: UpFrame, low: Int64, high: Int64)
         core = near[row, at] & (sdf[row, at] * config.voxel_size_m <= max(CELL_M / 2, config.voxel_size_m))
         rise = _gradients(grid, keys, blocks, row, at) @ frame.R[2].astype(np.float32)
         color, votes = buffers.color[blocks[row], at], buffers.votes[blocks[row], at]
-        log_p = _log_probabilities(buffers.evidence[blocks[row], at], votes, config.vote_discount)
+        said = buffers.evidence[blocks[row], at]
+        said *= (_effective(votes, config.vote_discount) / np.maximum(votes, np.float32(1e-6)))[:, None]
+        said -= said.max(axis=1, keepdims=True)
+        said -= np.log(np.exp(said).sum(axis=1, keepdims=True))
+        log_p = np.where(votes[:, None] > 0, said, 0).astype(np.float32)
     xyz = _voxels(keys[row], at) * config.voxel_size_m @ frame.R.T
     cell_m = max(CELL_M, config.voxel_size_m)
     points = SurfacePoints(
@@ -344,11 +327,3 @@ def _gradients(grid: BlockGrid, keys: Int32, blocks: Int32, row: Int64, at: Int6
 
 def _effective(votes: Float32, vote_discount: float) -> Float32:
     return np.where(votes > 1, votes / (1 + vote_discount * (votes - 1)), 1).astype(np.float32)
-
-
-def _log_probabilities(evidence: Float32, votes: Float32, vote_discount: float) -> Float32:
-    """(N, L) that stored evidence reads as; zeros without votes."""
-    said = evidence * (_effective(votes, vote_discount) / np.maximum(votes, np.float32(1e-6)))[:, None]
-    said -= said.max(axis=1, keepdims=True)
-    said -= np.log(np.exp(said).sum(axis=1, keepdims=True))
-    return np.where(votes[:, None] > 0, said, 0).astype(np.float32)

@@ -10,14 +10,7 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import look_at, turn_onto
-from semantic_mapper.mapping.floor_plan import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    OccupancyGrid,
-    occupancy_grid,
-    write_map_server,
-)
+from semantic_mapper.mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy_grid, write_map_server
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from tests.mapping.rendered_views import frame, ray_directions, small_map

@@ -14,15 +14,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.floor_plan import find_up
-from semantic_mapper.mapping.formats import (
-    colored,
-    sure_faces,
-    sure_points,
-    write_glb,
-    write_npz,
-    write_obj,
-    write_ply,
-)
+from semantic_mapper.mapping.formats import colored, sure_faces, sure_points, write_glb, write_npz, write_obj, write_ply
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float64
@@ -78,7 +70,7 @@ def to_srgb(color: np.ndarray) -> np.ndarray:
     return np.rint(255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
 
 
-def test_glb_holds_every_value_and_what_labels_mean(tmp_path: Path) -> None:
+def test_glb_holds_every_value_and_what_labels_mean_and_open3d_reads_it_with_y_up(tmp_path: Path) -> None:
     write_glb(tmp_path / "map.glb", MESH, LABELS, UP_Z)
     document, read = read_glb(tmp_path / "map.glb")
     np.testing.assert_array_equal(read["POSITION"], MESH.vertices)
@@ -91,10 +83,6 @@ def test_glb_holds_every_value_and_what_labels_mean(tmp_path: Path) -> None:
     assert dict(zip(labels["ids"], labels["names"], strict=True)) == {5: "table", 9: "cup", 2: "wall"}
     assert labels["ignore_id"] == 0 and [tuple(c) for c in labels["colors"]] == list(LABELS.colors)
     assert list(tmp_path.iterdir()) == [tmp_path / "map.glb"]
-
-
-def test_open3d_reads_the_glb_with_y_up(tmp_path: Path) -> None:
-    write_glb(tmp_path / "map.glb", MESH, LABELS, UP_Z)
     model = load_open3d().io.read_triangle_model(str(tmp_path / "map.glb"))
     mesh = model.meshes[0].mesh
     x, y, z = MESH.vertices[MESH.faces].reshape(-1, 3).T

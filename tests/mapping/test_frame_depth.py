@@ -27,12 +27,7 @@ from semantic_mapper.mapping.frame_depth import (
     computed_trust,
     rendered_trust,
 )
-from semantic_mapper.mapping.fusion import (
-    COMPUTED_CAP,
-    COMPUTED_LOOK,
-    MEASURED,
-    SURFACE_WEIGHT,
-)
+from semantic_mapper.mapping.fusion import COMPUTED_CAP, COMPUTED_LOOK, MEASURED, SURFACE_WEIGHT
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.mapping.rendered_views import frame as posed
@@ -149,20 +144,15 @@ def test_nothing_is_computed_where_the_settings_say_so(source: str) -> None:
 def test_frames_that_wait_for_later_ones_come_once_and_in_order() -> None:
     pipeline = make_pipeline(depth={"from_motion": {"delay_frames": 2}})
     frames = without_depth(walk()[:7])
+    with pytest.raises(ConfigError, match="give step what prepare returns"):
+        pipeline.step(frames[0])
+    assert pipeline.voxel_map.block_count == 0
     ready = [[frame.seq for frame in pipeline.prepare(f)] for f in frames]
     assert ready == [[], [], [0], [1], [2], [3], [4]]
     rest = pipeline.prepare_rest()
     assert [frame.seq for frame in rest] == [5, 6] and not pipeline.prepare_rest()
     assert all(frame.depth_sigma_m is not None for frame in rest)
     assert pipeline.step(rest[0]).seq == 5
-
-
-def test_a_frame_that_has_to_wait_is_not_mapped_before_it_is_prepared() -> None:
-    pipeline = make_pipeline(depth={"from_motion": {"delay_frames": 2}})
-    with pytest.raises(ConfigError, match="give step what prepare returns"):
-        pipeline.step(without_depth(walk())[0])
-    assert pipeline.voxel_map.block_count == 0
-    assert pipeline.step(walk()[0]).fused, "depth of a sensor waits for nothing"
 
 
 def test_trust_is_the_inverse_variance_and_nothing_where_little_is_known() -> None:
@@ -173,22 +163,26 @@ def test_trust_is_the_inverse_variance_and_nothing_where_little_is_known() -> No
     assert not computed_trust(np.zeros_like(depth), spread).any()
 
 
+def test_rendered_depth_is_trusted_most_where_the_map_agrees_little_beyond_it_and_nowhere_at_edges() -> None:
+    depth = slanted()
+    known = depth.copy()
+    known[:, :80] = 0
+    trust = rendered_trust(depth, known, TRUNCATION_M)[2:-2, 2:-2]
+    np.testing.assert_allclose(trust[:, 90:], MOST_TRUST, rtol=0.02)
+    np.testing.assert_allclose(trust[:, :70], GUESS_TRUST, rtol=0.02)
+    depth[:, 100:] += 0.3
+    depth[50, 40] = 0
+    trust = rendered_trust(depth, depth, TRUNCATION_M)
+    assert not trust[:, 99:101].any() and not trust[49:52, 40].any() and not trust[50, 39:42].any()
+    assert (trust[10:40, 20:90] > 0.4).all()
+
+
 TRUNCATION_M = 0.08
 POSE = np.eye(4)
 
 
 def slanted() -> np.ndarray:
     return plane_depth(POSE, (0.2, 0.1, 1.0), 2.0)
-
-
-def test_a_smooth_surface_where_the_map_has_one_is_trusted_most_and_beyond_it_little() -> None:
-    depth = slanted()
-    known = depth.copy()
-    known[:, :80] = 0
-    trust = rendered_trust(depth, known, TRUNCATION_M)
-    inner = (slice(2, -2), slice(2, -2))
-    np.testing.assert_allclose(trust[inner][:, 90:], MOST_TRUST, rtol=0.02)
-    np.testing.assert_allclose(trust[inner][:, :70], GUESS_TRUST, rtol=0.02)
 
 
 def test_any_number_of_computed_looks_weighs_less_than_one_measurement() -> None:
@@ -218,12 +212,3 @@ def test_one_measurement_outweighs_all_that_was_computed_and_is_then_left_alone(
     assert old.any()
     for name in ("tsdf", "weight", "color"):
         assert before[name][old].tobytes() == after[name][old].tobytes(), name
-
-
-def test_depth_edges_and_pixels_beside_unknown_ones_are_not_fused() -> None:
-    depth = slanted()
-    depth[:, 100:] += 0.3
-    depth[50, 40] = 0
-    trust = rendered_trust(depth, depth, TRUNCATION_M)
-    assert (trust[:, 99:101] == 0).all() and (trust[49:52, 40] == 0).all() and (trust[50, 39:42] == 0).all()
-    assert (trust[10:40, 20:90] > 0.4).all()

@@ -1,5 +1,3 @@
-from dataclasses import fields, replace
-
 import numpy as np
 import torch
 
@@ -34,16 +32,6 @@ def test_a_frame_becomes_a_keyframe_after_moving_or_turning_enough():
     assert not store.wants(pose(0.1, 5))
     assert store.wants(pose(0.25))
     assert store.wants(pose(0.0, 20))
-
-
-def test_a_moved_keyframe_stays_on_the_device_that_encoded_it():
-    """The "meta" device holds no numbers, but, like a GPU, mixes with no other."""
-    store = KeyframeStore(KeyframeConfig())
-    on_device = replace(NOTHING, **{f.name: getattr(NOTHING, f.name).to("meta") for f in fields(NOTHING)})
-    store.add(replace(keyframe(3, pose()), encoded=on_device))
-    assert store.move({(store.keyframes[0].camera_id, 3): pose(1.0)}) == 1
-    moved = store.keyframes[0]
-    assert moved.encoded.T_camera_world.device.type == "meta" and moved.T_world_camera[0, 3] == 1.0
 
 
 def test_within_a_room_the_one_nearest_to_another_goes(rng: np.random.Generator):

@@ -10,19 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.streaming import StreamingSRay
-from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import KITTI360, ROOMS
 from semantic_mapper.mapping.moving import (
     SETTLED_S,
     MotionDetector,
     MovingFilter,
     MovingSpace,
-    SeenView,
-    align_pose,
-    depth_slopes,
 )
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.types import Bool, CameraIntrinsics, Float64, PosedFrame
 from tests.small import tiny_config, tiny_field
 
 CAMERA = CameraIntrinsics(130.0, 130.0, 79.5, 59.5, 160, 120)
@@ -176,39 +172,3 @@ def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPat
     ]
     assert len(shown) == 4 and all(np.array_equal(told, measured) for told, measured in shown)
     assert len(on.voxel_map.points().xyz) < 0.8 * len(off.voxel_map.points().xyz)
-
-
-def views(depth: Float32) -> list[SeenView]:
-    focal, centre = (CAMERA.fx, CAMERA.fy), (CAMERA.cx, CAMERA.cy)
-    return [SeenView("cam", 0, np.eye(4), focal, centre, depth, depth, depth_slopes(depth))]
-
-
-def points(depth: Float32) -> Float32:
-    v, u = (3 * i for i in np.nonzero(depth[::3, ::3]))
-    rays = np.stack(((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))), axis=1)
-    return (depth[v, u][:, None] * rays).astype(np.float32)
-
-
-def depth_at(T_world_camera: Float64) -> Float32:
-    depth = corner(0, T_world_camera).depth_m
-    assert depth is not None
-    return depth
-
-
-def test_a_pose_that_is_a_little_off_is_put_right() -> None:
-    rng = np.random.default_rng(0)
-    seen = views(depth_at(np.eye(4)))
-    for _ in range(5):
-        right, wrong = off_by(0.02, 0.5, rng), np.eye(4)
-        aligned = align_pose(points(depth_at(right)), wrong, seen)
-        left = invert_pose(right) @ aligned.T_world_camera
-        assert np.linalg.norm(left[:3, 3]) < 0.01 and np.linalg.norm(left[:3, :3] - np.eye(3)) < 0.005
-        assert aligned.misfit < 0.1
-        np.testing.assert_allclose(aligned.moved[:3], right[:3, 3], atol=0.01)
-
-
-def test_a_pose_that_is_far_off_stays_and_does_not_fit() -> None:
-    far = np.eye(4)
-    far[2, 3] = -1.0
-    aligned = align_pose(points(depth_at(np.eye(4))), far, views(depth_at(np.eye(4))))
-    assert aligned.misfit == np.inf and np.array_equal(aligned.T_world_camera, far) and not aligned.moved.any()

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from semantic_mapper.mapping.open3d_loader import load_open3d, preload_folder
+from semantic_mapper.mapping.open3d_loader import preload_folder
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -12,11 +12,6 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 def run_python(code: str, *path: Path) -> subprocess.CompletedProcess[str]:
     prelude = f"import sys; sys.path[:0] = {[str(p) for p in (*path, REPOSITORY)]!r}\n"
     return subprocess.run([sys.executable, "-I", "-c", prelude + code], capture_output=True, text=True, timeout=100)
-
-
-def test_open3d_loads_and_has_the_tensor_voxel_grid() -> None:
-    assert load_open3d().t.geometry.VoxelBlockGrid is not None
-    assert load_open3d() is load_open3d()
 
 
 def test_missing_system_library_is_named_with_the_mend(tmp_path: Path) -> None:
