@@ -45,7 +45,7 @@ from semantic_mapper.replay.log.sequence import (
 )
 from semantic_mapper.transport.codec import Envelope, decode_as, encode, with_computed_depth, with_label
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float32, MapUpdate, PosedFrame, UInt8
+from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 SCENE_RAYS = 36_000  # rendered at least for a frame by a field of the scene, or all: small images have no sharper views
 DEPTH_STEPS_PER_M = 1000.0  # computed depth and its spread are rounded to millimetres, which pack to a fifth
@@ -84,11 +84,11 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
 
     Source views of a frame are those that ``replay`` and ``eval`` choose: the frame itself and earlier keyframes, the
     frames that the weights were finetuned on among them. A label that is there stays, unless it is a pseudo label or
-    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Raises ConfigError: the new log
-    would lie among the parts of the old one. LabelError: labels stay whose classes are not those of the weights.
-    LogError: the log cannot be read, the new one is there already or cannot be written, or no frame could be rendered.
-    Nothing is left of the new one. WeightsError: there are no such weights, or they tell no classes apart.
-    KeyboardInterrupt: it was stopped; nothing is left of the new log, nor of images of things.
+    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Nothing is left of the new log, nor
+    of images of things, where this raises ConfigError: the new log would lie among the parts of the old one.
+    LabelError: labels stay whose classes are not those of the weights. LogError: the log cannot be read, the new one is
+    there already or cannot be written, or no frame could be rendered. WeightsError: there are no such weights, or they
+    tell no classes apart. KeyboardInterrupt: it was stopped.
     """
     monitor = monitor or JobMonitor()
     with open_log(request.logs) as log, ExitStack() as stack:
@@ -106,26 +106,26 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
         labeller = _Labeller(bundle, label_set, request)
         if labeller.instances is not None:
             stack.callback(labeller.instances.close)
-        digest = hashlib.sha256(bundle.weights_path.read_bytes()).hexdigest()
+        settings = f"{request.min_confidence} {request.overwrite_labels} {request.depth} {request.max_frames}"
+        name = hashlib.sha256(f"{labeller.digest} {settings}".encode()).hexdigest()[:8]
         monitor.start(min(len(log), request.max_frames or len(log)))
         writers: list[LogWriter] = []
         for number, reader in enumerate(readers):
-            if request.max_frames and labeller.frames >= request.max_frames:
+            if request.max_frames and labeller.count["frames"] >= request.max_frames:
                 break
-            name = hashlib.sha256(f"{digest} {_settings(request)}".encode()).hexdigest()[:8]
             writers.append(stack.enter_context(_writer(reader, part_path(request.out, number), label_set, name)))
             for envelope, parts in _messages(reader, label_set):
                 if envelope.topic == "frame":
                     if monitor.stopped_by:
                         raise KeyboardInterrupt
-                    if request.max_frames and labeller.frames >= request.max_frames:
+                    if request.max_frames and labeller.count["frames"] >= request.max_frames:
                         break
                 labeller.push(_Message(writers[-1], envelope, parts))
-                monitor.set(labeller.frames)
+                monitor.set(labeller.count["frames"])
         labeller.finish()
-        note = labeller.note(digest)
+        note = labeller.note()
         if not labeller.rendered:
-            why = labeller.unlabelled[0] if labeller.unlabelled else "none can be read"
+            why = labeller.refused[0] if labeller.refused else "none can be read"
             raise LogError(f"{log.path}: none of its {counted(note.frames, 'frame')} could be rendered: {why}")
         for writer in writers:
             writer.attach(note.attachment())
@@ -134,7 +134,7 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
         files = tuple(part_path(request.out, number) for number in range(len(writers)))
         if labeller.instances is not None:
             labeller.instances.finish()
-    return AutolabelReport(files, note, tuple(labeller.unlabelled), damage)
+    return AutolabelReport(files, note, tuple(labeller.refused), damage)
 
 
 def _load(request: AutolabelRequest, log: Log) -> Mapper:
@@ -175,20 +175,12 @@ def _label_set(log: Log, weights: LabelSet, request: AutolabelRequest) -> LabelS
     return there
 
 
-def _settings(request: AutolabelRequest) -> str:
-    return f"{request.min_confidence} {request.overwrite_labels} {request.depth} {request.max_frames}"
-
-
 def _writer(reader: LogReader, path: Path, label_set: LabelSet, name: str) -> AbstractContextManager[LogWriter]:
     """A new log, or part of one, with what the old one keeps next to its messages."""
     kept = [a for a in reader.attachments().values() if a.name not in (PART_ATTACHMENT, AUTOLABEL_ATTACHMENT)]
     if (part := read_part(reader)) is not None:
         kept.append(Part(f"{part.recording[:64]}-{name}", part.part).attachment())
-    return atomic_log(path, _labelled_info(reader.info, label_set), attachments=kept)
-
-
-def _labelled_info(info: StreamInfo, label_set: LabelSet) -> StreamInfo:
-    return msgspec.structs.replace(info, label_set=label_set)
+    return atomic_log(path, msgspec.structs.replace(reader.info, label_set=label_set), attachments=kept)
 
 
 def _messages(reader: LogReader, label_set: LabelSet) -> Iterator[tuple[Envelope, list[bytes]]]:
@@ -199,7 +191,7 @@ def _messages(reader: LogReader, label_set: LabelSet) -> Iterator[tuple[Envelope
             yield envelope, parts
             continue
         if not first:
-            info = _labelled_info(decode_as(StreamInfo, parts), label_set)
+            info = msgspec.structs.replace(decode_as(StreamInfo, parts), label_set=label_set)
             yield envelope, encode(info, sender=envelope.source)
         first = False
 
@@ -209,7 +201,6 @@ class _Message:
     """A message on its way to the new log."""
 
     writer: LogWriter  # of the part that it belongs to
-    # envelope, parts: Of the message.
     envelope: Envelope
     parts: list[bytes]
     waits: bool = False  # for its rendering, or that of a frame before it
@@ -217,26 +208,19 @@ class _Message:
 
 
 class _Labeller:
-    """Renders frames and writes messages in the order in which they came; frames may wait for later ones.
-
-    Args:
-        bundle: What renders.
-        label_set: Of the labels to write.
-        request: What is requested.
-    """
+    """Renders frames and writes messages in the order in which they came; frames may wait for later ones."""
 
     def __init__(self, bundle: Mapper, label_set: LabelSet, request: AutolabelRequest) -> None:
-        self._bundle = bundle
-        self._pipeline = bundle.pipeline
-        self._request = request
-        self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))
+        self._bundle, self._pipeline, self._request = bundle, bundle.pipeline, request
+        self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))  # of the labels to write
         self._ignore_id = np.uint8(label_set.ignore_id)
         self._queue: deque[_Message] = deque()
         self._waiting: dict[tuple[str, int, int], list[_Message]] = {}
         self._pixels, self._all_pixels, self._confidence = 0, 0, 0.0
-        self.frames = self.rendered = self.labelled = self.kept = self.replaced = self.depth_written = 0
-        self.without = 0
-        self.unlabelled: list[str] = []
+        self.digest = hashlib.sha256(bundle.weights_path.read_bytes()).hexdigest()
+        self.count = dict.fromkeys(("frames", "labelled", "kept", "replaced", "unlabelled", "depth_written"), 0)
+        self.rendered = 0
+        self.refused: list[str] = []  # why frames could not be rendered
         model, self.instances = bundle.checkpoint.model, None
         if request.instances is not None and isinstance(model, Panoptic):
             self.instances = InstanceImages(request.instances, model)
@@ -245,8 +229,8 @@ class _Labeller:
         """Take a message."""
         self._queue.append(message)
         if message.envelope.topic == "frame":
-            message.number = self.frames
-            self.frames += 1
+            message.number = self.count["frames"]
+            self.count["frames"] += 1
             self._push_frame(message)
         self._write_ready()
 
@@ -257,24 +241,19 @@ class _Labeller:
         self._write_ready()
         assert not self._queue, "a frame was lost on its way"
 
-    def note(self, digest: str) -> AutolabelNote:
+    def note(self) -> AutolabelNote:
         """Figures so far."""
         checkpoint, request = self._bundle.checkpoint, self._request
         return AutolabelNote(
             weights=self._bundle.weights_path.name,
-            digest=digest,
+            digest=self.digest,
             kind=checkpoint.model.kind,
             classes=checkpoint.label_set.names,
             min_confidence=request.min_confidence,
             overwrite_labels=request.overwrite_labels,
             depth=request.depth,
             max_frames=request.max_frames,
-            frames=self.frames,
-            labelled=self.labelled,
-            kept=self.kept,
-            replaced=self.replaced,
-            unlabelled=self.without,
-            depth_written=self.depth_written,
+            **self.count,
             mean_confidence=round(self._confidence / self._pixels, 4) if self._pixels else None,
             train_stamps_ns=tuple(sorted(checkpoint.train_stamps_ns)),
             labelled_pixels=round(self._pixels / self._all_pixels, 4) if self._all_pixels else None,
@@ -301,11 +280,19 @@ class _Labeller:
             self._refuse(message, error)
             return
         self.rendered += 1
-        self._label(message, update)
+        confident = update.confidence >= self._request.min_confidence
+        if self._keeps(message.envelope):
+            self.count["kept"] += 1
+        else:
+            label = self._ids[update.label]
+            sure = (label != self._ignore_id) & confident
+            self._set_label(message, np.where(sure, label, self._ignore_id) if sure.any() else None)
+            self._pixels += int(sure.sum())
+            self._all_pixels += sure.size
+            self._confidence += float(update.confidence[sure].sum(dtype=np.float64))
         if self.instances is not None:
             unknown = np.uint8(self._bundle.label_set.ignore_id)
-            sure = update.confidence >= self._request.min_confidence
-            self.instances.add(message.number, frame, np.where(sure, update.label, unknown))
+            self.instances.add(message.number, frame, np.where(confident, update.label, unknown))
         if self._request.depth and not message.envelope.has_depth and frame.depth_sigma_m is not None:
             self._add_depth(message, frame)
 
@@ -313,30 +300,18 @@ class _Labeller:
         """Whether a frame has a label that stays."""
         return envelope.has_label and not envelope.has_pseudo_label and not self._request.overwrite_labels
 
-    def _label(self, message: _Message, update: MapUpdate) -> None:
-        if self._keeps(message.envelope):
-            self.kept += 1
-            return
-        label = self._ids[update.label]
-        sure = (label != self._ignore_id) & (update.confidence >= self._request.min_confidence)
-        self._set_label(message, np.where(sure, label, self._ignore_id) if sure.any() else None)
-        self._pixels += int(sure.sum())
-        self._all_pixels += sure.size
-        self._confidence += float(update.confidence[sure].sum(dtype=np.float64))
-
     def _set_label(self, message: _Message, label: UInt8 | None) -> None:
         envelope = message.envelope
-        self.labelled += label is not None
-        self.without += label is None
-        self.replaced += envelope.has_label and not envelope.has_pseudo_label
+        self.count["unlabelled" if label is None else "labelled"] += 1
+        self.count["replaced"] += envelope.has_label and not envelope.has_pseudo_label
         if label is not None or envelope.has_label:
             message.parts = with_label(message.parts, label)
 
     def _refuse(self, message: _Message, error: Exception) -> None:
-        self.unlabelled.append(str(error))
+        self.refused.append(str(error))
         _log.warning("frame_not_rendered", seq=message.envelope.seq, reason=str(error))
         if self._keeps(message.envelope):
-            self.kept += 1
+            self.count["kept"] += 1
         else:
             self._set_label(message, None)
 
@@ -347,7 +322,7 @@ class _Labeller:
         if self._pipeline.voxel_map.scale_known:
             depth_m, sigma_m = _rounded(depth_m, np.rint), _rounded(sigma_m, np.ceil)
         if depth_m.any():
-            self.depth_written += 1
+            self.count["depth_written"] += 1
             sigma_m = np.where(depth_m > 0, sigma_m, 0).astype(np.float32)
             message.parts = with_computed_depth(message.parts, depth_m, sigma_m)
 

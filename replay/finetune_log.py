@@ -7,10 +7,10 @@ of a folder, of weights, or the log's own images.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -34,7 +34,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.frame_depth import FrameDepth
-from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.autolabel_note import AutolabelNote, read_note
 from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_classes, with_times
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
@@ -44,12 +44,13 @@ from semantic_mapper.training.config import FinetuneConfig
 from semantic_mapper.training.finetune import FITTERS, finetune
 from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.panoptic import boxes_in_view
-from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
+from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes
 from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
 from semantic_mapper.training.views import usable_frames
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 FrameKey = tuple[str, int]  # camera and stamp
+ItemT = TypeVar("ItemT")
 LEAST_KEYFRAMES = 2
 MAX_SCENE_FRAMES = 300  # that a field of one scene is fitted to
 OWN = "the log's own label images"
@@ -112,7 +113,8 @@ def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> FinetuneR
     nothing = request.from_scratch or request.kind is not None
     start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
     kind = request.kind or (SRay.kind if start is None else start.model.kind)
-    _check_options(request, kind)
+    if request.config.irt.variant is not None and kind != IRT.kind:
+        raise ConfigError(f"irt.variant: goes with weights of kind 'irt', not with '{kind}'; leave it out")
     with open_log(request.log) as log:
         folder = None if request.labels is None else open_label_folder(request.labels, log)
         label_set = log.info.label_set if folder is None else folder.label_set
@@ -139,9 +141,8 @@ def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> FinetuneR
             frames += source.unlabelled(frames, monitor)
         note = read_note(log.attachments())
     seen = frozenset[int]() if start is None else start.train_stamps_ns
-    if pseudo and note is not None:
-        seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
-    checkpoint = _fit(kind, frames, label_set, None if start is None else start.model, seen, request, monitor)
+    model = None if start is None else start.model
+    checkpoint = _fit(kind, frames, label_set, model, seen, note, request, monitor)
     if pseudo:
         checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
     if grown:
@@ -159,10 +160,7 @@ def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, path: Path, monito
         frames = source.pseudo_labelled(labels, monitor)
         note = read_note(log.attachments())
     start, unseen = boxed_field(boxes, usable_frames(frames), label_set, request.uncovered)
-    seen = labels.train_stamps_ns
-    if note is not None and any(f.label_is_pseudo for f in frames):
-        seen |= frozenset(note.train_stamps_ns)
-    checkpoint = _fit(Panoptic.kind, frames, label_set, start, seen, request, monitor)
+    checkpoint = _fit(Panoptic.kind, frames, label_set, start, labels.train_stamps_ns, note, request, monitor)
     figures = checkpoint.recipe["panoptic"]
     figures |= {"left_out": boxes.left_out, "unseen": unseen, "pseudo": labels.source}
     figures["lost"] += len(dropped)
@@ -175,11 +173,14 @@ def _fit(
     label_set: LabelSet,
     start: LearnedField | None,
     seen: frozenset[int],
+    note: AutolabelNote | None,
     request: FinetuneRequest,
     monitor: JobMonitor,
 ) -> Checkpoint:
     """Fit, with progress."""
     monitor.start(100)
+    if note is not None and any(f.label_is_pseudo for f in frames):
+        seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
 
     def on_progress(progress: FitProgress) -> None:
         note = f"step {progress.step}"
@@ -189,21 +190,12 @@ def _fit(
             note += f" accuracy {progress.held_out_accuracy * 100:.1f} %"
         monitor.set(int(progress.fraction * 100), note)
 
-    def stopped() -> bool:
-        return monitor.stopped_by != ""
-
-    checkpoint = finetune(frames, label_set, start, request.config, on_progress, stopped, seen, kind)
+    checkpoint = finetune(frames, label_set, start, request.config, on_progress, lambda: monitor.stopped_by, seen, kind)
     learned = "grid_steps" if kind == Panoptic.kind else "steps"  # boxes need no more than geometry
     if monitor.stopped_by and not checkpoint.recipe[learned]:
         raise KeyboardInterrupt
     checkpoint.recipe["source"] = request.log.name
     return checkpoint
-
-
-def _check_options(request: FinetuneRequest, kind: str) -> None:
-    """Refuse options that go with other weights."""
-    if request.config.irt.variant is not None and kind != IRT.kind:
-        raise ConfigError(f"irt.variant: goes with weights of kind 'irt', not with '{kind}'; leave it out")
 
 
 def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[FrameKey, ComputedFrame]:
@@ -240,13 +232,8 @@ def compute_depths(
     """What was computed of each frame without a sensor's depth, by its camera and stamp.
 
     Frames whose pictures nothing can be computed from (dark, blurred, standing still) are left out, with a line in the
-    log. No map gives hints, so depth is a little less exact than in ``replay``.
-
-    Args:
-        frames: In order.
-        config: Its ``source`` is "auto" or "computed".
-        on_frame: Called with the number of frames that are read.
-    """
+    log. No map gives hints, so depth is a little less exact than in ``replay``. ``config.source`` is "auto" or
+    "computed"; ``on_frame`` is called with the number of frames that are read."""
     computer, found = FrameDepth(config, _no_hint), dict[FrameKey, ComputedFrame]()
 
     def keep(ready: Iterable[PosedFrame]) -> None:
@@ -292,12 +279,11 @@ class FrameSource:
         Raises LogError: the log has no such frame, or it has no label image."""
         frames: dict[int, PosedFrame] = {}
         for number in sorted(set(self.request.frames)):
-            if number >= len(self.log):
-                raise LogError(f"{self.request.log}: has no frame {number}; it has {len(self.log)}")
-            frame = self._read(number)
-            if frame.label is None:
+            frame = self._labelled(number) if number < len(self.log) else None
+            if frame is None or frame.label is None:
                 raise LogError(
-                    f"{self.request.log}: frame {number} has no label image; give one in a folder with --labels"
+                    f"{self.request.log}: has no frame {number} with a label image; it has {len(self.log)}. Give "
+                    "labels in a folder with --labels"
                 )
             frames[number] = self._with_depth(frame)
         return frames
@@ -306,79 +292,57 @@ class FrameSource:
         """The labelled frames that show most of what the log shows, by number in it.
 
         Of a log whose depth is computed, frames that it could be computed for. Without a number of keyframes, all.
-        Raises LogError: fewer usable labelled frames than requested. KeyboardInterrupt: a stop request came.
-        """
-        candidates, numbers = [], []
-        size: tuple[int, int] | None = None
-        readable = range(len(self.log)) if self.folder is None else self.folder.numbers()
-        monitor.start(len(readable))
-        for done, number in enumerate(readable, 1):
-            _go_on(monitor, done, "choosing keyframes")
-            try:
-                frame = self._read(number)
-                if frame.label is None or (self.computed and (frame.camera_id, frame.stamp_ns) not in self.computed):
-                    continue
-                check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
-                label_set.to_channels(frame.label, f"frame seq={frame.seq}")
-                k = frame.intrinsics
-                size = size or (k.width, k.height)
-                if (k.width, k.height) != size:  # one finetuning takes views of one size
-                    raise FrameError(f"{k.width}x{k.height}, but the first one is {size[0]}x{size[1]}")
-            except (LogError, FrameError, LabelError) as error:
-                _log.warning("frame_left_out", frame=number, reason=str(error))
-                continue
+        Raises LogError: fewer usable labelled frames than requested. KeyboardInterrupt: a stop request came."""
+        sizes: set[tuple[int, int]] = set()
+
+        def read(number: int) -> Candidate | None:
+            frame = self._labelled(number)
+            if frame.label is None or (self.computed and (frame.camera_id, frame.stamp_ns) not in self.computed):
+                return None
+            check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
+            label_set.to_channels(frame.label, f"frame seq={frame.seq}")
+            size = frame.intrinsics.width, frame.intrinsics.height
+            if sizes and size not in sizes:  # one finetuning takes views of one size
+                raise FrameError(f"{size[0]}x{size[1]} pixels, but those before have another size")
+            sizes.add(size)
             candidate = candidate_from_frame(self._with_depth(frame))
-            if self.computed and len(candidate.cells) == 0:  # the camera had not moved yet
-                continue
-            candidates.append(candidate)
-            numbers.append(number)
-        count = self.request.keyframes
-        if len(candidates) < (count or LEAST_KEYFRAMES):
+            return None if self.computed and len(candidate.cells) == 0 else candidate  # the camera had not moved yet
+
+        readable = range(len(self.log)) if self.folder is None else self.folder.numbers()
+        candidates = dict(self._each(readable, read, monitor, "choosing keyframes"))
+        count, numbers = self.request.keyframes, list(candidates)
+        if len(numbers) < (count or LEAST_KEYFRAMES):
             more = f"--keyframes {count} is more than that" if count else "finetuning needs two"
             where = self.request.log if self.folder is None else self.folder.path
-            raise LogError(f"{where}: {len(candidates)} of the {len(self.log)} frames have usable labels; {more}")
-        chosen = choose_keyframes(candidates, count, self.request.config.seed) if count else range(len(candidates))
-        return {numbers[i]: self._with_depth(self._read(numbers[i])) for i in chosen}
+            raise LogError(f"{where}: {len(numbers)} of the {len(self.log)} frames have usable labels; {more}")
+        if count:
+            chosen = choose_keyframes(list(candidates.values()), count, self.request.config.seed)
+            numbers = [numbers[i] for i in chosen]
+        return {number: self._with_depth(self._labelled(number)) for number in numbers}
 
     def unlabelled(self, labelled: list[PosedFrame], monitor: JobMonitor) -> list[PosedFrame]:
         """The other frames of the log at working width, without labels: as many as requested, evenly spread.
-
-        Frames that cannot be read are left out and counted. Raises KeyboardInterrupt: a stop request came.
-        """
+        Raises KeyboardInterrupt: a stop request came."""
         known = {(f.camera_id, f.stamp_ns) for f in labelled}
-        frames: list[PosedFrame] = []
-        damaged = 0
-        monitor.start(len(self.log))
-        for number in sorted(set(_evenly(range(len(self.log)), MAX_SCENE_FRAMES))):
-            _go_on(monitor, number + 1, "reading frames")
-            try:
-                frame = self.log.frame(number)
-            except (LogError, FrameError):
-                damaged += 1
-                continue
-            if (frame.camera_id, frame.stamp_ns) not in known:
-                given = replace(self._with_depth(frame), label=None)
-                frames.append(anchor_from_frame(given, self.request.config.width))
-        if damaged:
-            _log.warning("frames_left_out", count=damaged, reason="they cannot be read; `import` may save some")
-        return frames
+
+        def read(number: int) -> PosedFrame | None:
+            frame = self.log.frame(number)
+            if (frame.camera_id, frame.stamp_ns) in known:
+                return None
+            return anchor_from_frame(replace(self._with_depth(frame), label=None), self.request.config.width)
+
+        numbers = sorted(set(_evenly(range(len(self.log)), MAX_SCENE_FRAMES)))
+        return [frame for _, frame in self._each(numbers, read, monitor, "reading frames")]
 
     def pseudo_labelled(self, labels: PseudoLabels, monitor: JobMonitor) -> list[PosedFrame]:
         """Frames at working width with their pseudo labels, as many as requested; see ``choose_frames``.
 
-        A frame whose label image is missing or cannot be used gives its colours alone; these are counted. Raises
-        LogError: no frame has a pseudo label. KeyboardInterrupt: a stop request came.
-        """
-        frames: list[PosedFrame] = []
+        A frame whose label image is missing or cannot be used gives its colours alone; these are counted.
+        Raises LogError: no frame has a pseudo label. KeyboardInterrupt: a stop request came."""
         reasons: list[str] = []
-        monitor.start(len(self.log))
-        for number in choose_frames(len(self.log), MAX_SCENE_FRAMES, labels.numbers):
-            _go_on(monitor, number + 1, "reading frames and pseudo labels")
-            try:
-                frame = self._with_depth(self.log.frame(number))
-            except (LogError, FrameError) as error:
-                reasons.append(str(error))
-                continue
+
+        def read(number: int) -> PosedFrame:
+            frame = self._with_depth(self.log.frame(number))
             try:
                 labelled = labels.of(frame, number)
                 if labelled.label is not None:
@@ -387,14 +351,35 @@ class FrameSource:
                 reasons.append(str(error))
                 labelled = replace(frame, label=None)
             small = anchor_from_frame(labelled, self.request.config.width)
-            frames.append(replace(small, label_is_pseudo=labelled.label_is_pseudo and labelled.label is not None))
+            return replace(small, label_is_pseudo=labelled.label_is_pseudo and labelled.label is not None)
+
+        numbers = choose_frames(len(self.log), MAX_SCENE_FRAMES, labels.numbers)
+        frames = [frame for _, frame in self._each(numbers, read, monitor, "reading frames and pseudo labels")]
         if not any(f.label is not None for f in frames):
             raise LogError(f"{self.log.path}: no frame has a pseudo label ({reasons[0] if reasons else labels.source})")
         if reasons:
             _log.warning("frames_without_pseudo_label", count=len(reasons), reason=reasons[0])
         return [labels.once_all_are_seen(frame) for frame in frames]
 
-    def _read(self, number: int) -> PosedFrame:
+    def _each(
+        self, numbers: Sequence[int], read: Callable[[int], ItemT | None], monitor: JobMonitor, note: str
+    ) -> Iterator[tuple[int, ItemT]]:
+        """What is read of frames; those that cannot be used are left out, with a warning that counts them."""
+        reasons: list[str] = []
+        monitor.start(len(numbers))
+        for done, number in enumerate(numbers, 1):
+            _go_on(monitor, done, note)
+            try:
+                found = read(number)
+            except (LogError, FrameError, LabelError) as error:
+                reasons.append(f"frame {number}: {error}")
+                continue
+            if found is not None:
+                yield number, found
+        if reasons:
+            _log.warning("frames_left_out", count=len(reasons), reason=reasons[0])
+
+    def _labelled(self, number: int) -> PosedFrame:
         frame = self.log.frame(number)
         return frame if self.folder is None else self.folder.labelled(frame, number)
 
@@ -431,7 +416,9 @@ def open_pseudo_labels(log: Log, pseudo: str | None) -> PseudoLabels:
     if pseudo is not None and Path(pseudo).is_dir():
         folder = open_label_folder(Path(pseudo), log)
         source, numbers = f"the folder {pseudo}", frozenset(folder.numbers())
-        return PseudoLabels(folder.label_set, lambda f, n: _of_folder(folder, f, n), source, numbers)
+        return PseudoLabels(
+            folder.label_set, lambda f, n: replace(folder.labelled(f, n), label_is_pseudo=True), source, numbers
+        )
     if pseudo is None and log.info.label_set is not None:
         numbers = frozenset(n for n, (envelope, _) in enumerate(log.frame_parts()) if envelope.has_label)
         if numbers:
@@ -486,10 +473,6 @@ def boxed_field(
 def _evenly(numbers: Sequence[int], count: int) -> list[int]:
     count = min(count, len(numbers))
     return [numbers[round(i * (len(numbers) - 1) / max(count - 1, 1))] for i in range(count)]
-
-
-def _of_folder(folder: LabelFolder, frame: PosedFrame, number: int) -> PosedFrame:
-    return replace(folder.labelled(frame, number), label_is_pseudo=True)
 
 
 def _rendered(mapper: Mapper, frame: PosedFrame) -> PosedFrame:

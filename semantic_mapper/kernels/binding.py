@@ -31,7 +31,6 @@ R = TypeVar("R")
 LIBRARY_FOLDER = Path(__file__).resolve().parent / "lib"
 MAX_DIMENSIONS = 4
 MAX_POOL_THREADS = 64  # enough for every caller to have its own; threads start only when they are needed
-_OTHER_VERSION = "the library is of another version: run `make setup`, or install the package again"
 _NO_SHAPE = (1,) * MAX_DIMENSIONS
 _Words = list[Any]
 _Pack = Callable[[Any, _Words], None]
@@ -50,22 +49,20 @@ class Kernel(Generic[P, R]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Run it once, over no range."""
         result = self.function(0, 0, self.pack(*args, **kwargs))
-        return None if self._returns_nothing else result  # pyright: ignore[reportReturnType]
+        return None if self._hints["return"] is type(None) else result  # pyright: ignore[reportReturnType]
 
     @functools.cached_property
     def function(self) -> Callable[[int, int, bytes], int]:
         """The C function: start and stop of its loop, and the packed arguments."""
-        library = load_library(self._folder)
-        try:
-            function = getattr(library, self.name)
-        except AttributeError:
-            raise DependencyError(f"the compiled kernels have no kernel {self.name}; {_OTHER_VERSION}") from None
-        function.argtypes, function.restype = (ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p), ctypes.c_int64
-        size = ctypes.c_int64.in_dll(library, f"{self.name}_size").value
-        if size != self._struct.size:
+        library, size = load_library(self._folder), -1
+        function = getattr(library, self.name, None)
+        if function is not None:
+            function.argtypes, function.restype = (ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p), ctypes.c_int64
+            size = ctypes.c_int64.in_dll(library, f"{self.name}_size").value
+        if function is None or size != self._struct.size:
             raise DependencyError(
-                f"kernel {self.name} takes {size} bytes of arguments, its declaration says {self._struct.size}; "
-                f"{_OTHER_VERSION}"
+                f"the compiled kernels have no kernel {self.name} that takes {self._struct.size} bytes of arguments: "
+                "the library is of another version: run `make setup`, or install the package again"
             )
         return function
 
@@ -75,7 +72,7 @@ class Kernel(Generic[P, R]):
         if kwargs:
             args = self._signature.bind(*(None,) * self._skip, *args, **kwargs).args[self._skip :]
         words: _Words = []
-        for (name, add), value in zip(self._parameters, args, strict=True):
+        for (name, (_, add)), value in zip(self._parameters.items(), args, strict=True):
             try:
                 add(value, words)
             except ShapeError as error:
@@ -87,22 +84,16 @@ class Kernel(Generic[P, R]):
         return inspect.signature(self._declaration)
 
     @functools.cached_property
-    def _returns_nothing(self) -> bool:
-        return self._hints["return"] is type(None)
-
-    @functools.cached_property
     def _hints(self) -> dict[str, Any]:
         return typing.get_type_hints(self._declaration)
 
     @functools.cached_property
-    def _parameters(self) -> list[tuple[str, _Pack]]:
-        names = list(self._signature.parameters)[self._skip :]
-        return [(name, _packer(self._hints[name])[1]) for name in names]
+    def _parameters(self) -> dict[str, tuple[str, _Pack]]:
+        return {name: _packer(self._hints[name]) for name in list(self._signature.parameters)[self._skip :]}
 
     @functools.cached_property
     def _struct(self) -> struct.Struct:
-        names = list(self._signature.parameters)[self._skip :]
-        return struct.Struct("@" + "".join(_packer(self._hints[name])[0] for name in names))
+        return struct.Struct("@" + "".join(code for code, _ in self._parameters.values()))
 
 
 def kernel(declaration: Callable[P, R]) -> Kernel[P, R]:
@@ -119,25 +110,18 @@ def kernel(declaration: Callable[P, R]) -> Kernel[P, R]:
 def load_library(folder: Path = LIBRARY_FOLDER) -> ctypes.CDLL:
     """The kernels of a folder, compiled for the best of the processors that they are there for and this one is.
     Raises DependencyError: they are not there, or not for this machine."""
-    for name in _variants():
-        path = folder / f"{name}.so"
+    machine = platform.machine()
+    names = ["kernels-x86_64-avx2"] if machine == "x86_64" and has_avx2() else []
+    for path in (folder / f"{name}.so" for name in (*names, f"kernels-{machine}")):
         if path.exists():
             try:
                 return ctypes.CDLL(str(path))
             except OSError as error:
                 raise DependencyError(f"cannot load the compiled kernels {path}: {error}") from error
     raise DependencyError(
-        f"no compiled kernels for {platform.machine()} in {folder}; in a checkout run `make setup`, otherwise "
-        "install the package with pip, which compiles them"
+        f"no compiled kernels for {machine} in {folder}; in a checkout run `make setup`, otherwise install the package "
+        "with pip, which compiles them"
     )
-
-
-def _variants() -> list[str]:
-    machine = platform.machine()
-    names = [f"kernels-{machine}"]
-    if machine == "x86_64" and has_avx2():
-        names.insert(0, "kernels-x86_64-avx2")
-    return names
 
 
 def has_avx2() -> bool:
@@ -152,12 +136,10 @@ def has_avx2() -> bool:
 
 def _packer(hint: Any) -> tuple[str, _Pack]:
     """Format of one argument and how to add its words."""
-    if hint is float:
-        return "d", _add_number
-    if hint is int:
-        return "q", _add_number
+    if hint in (int, float):
+        return "q" if hint is int else "d", lambda value, words: words.append(value)
     if hint is bool:
-        return "q", _add_flag
+        return "q", lambda value, words: words.append(int(value))  # numpy's bool is no integer
     parts = typing.get_args(hint)
     if typing.get_origin(hint) is np.ndarray:  # what NDArray[scalar] stands for, before numpy 2.5
         parts = typing.get_args(parts[1])
@@ -174,14 +156,6 @@ def _packer(hint: Any) -> tuple[str, _Pack]:
 
         return "".join(code for code, _ in fields), add_fields
     raise TypeError(f"a kernel cannot take a {hint}")
-
-
-def _add_number(value: Any, words: _Words) -> None:
-    words.append(value)
-
-
-def _add_flag(value: Any, words: _Words) -> None:
-    words.append(1 if value else 0)  # numpy's bool is no integer
 
 
 def _add_array(dtype: np.dtype[Any] | None, value: Any, words: _Words) -> None:

@@ -34,6 +34,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import FinetuneConfig, StepConfig
 from semantic_mapper.training.fit import (
     Budget,
+    FitTask,
     Fitted,
     HeldOut,
     OnProgress,
@@ -90,10 +91,12 @@ PROBE_RATE = 0.03  # of Adam: rows of classes that are new to the weights start 
 PROBE_STEPS = 40  # of the classifier alone, on features as they are, before the first ray
 PROBE_BALANCE = 0.5  # see ``image_loss``
 
-Fitter = Callable[[Sequence[PosedFrame], LabelSet, LearnedField | None, FinetuneConfig, Budget], Fitted]
-
 # Kinds that are fitted to a scene in a way of their own. Kinds that build on GridField add a row.
-FITTERS: dict[str, Fitter] = {GridField.kind: fit_scene, IRT.kind: fit_irt, Panoptic.kind: fit_panoptic}
+FITTERS: dict[str, Callable[[FitTask], Fitted]] = {
+    GridField.kind: fit_scene,
+    IRT.kind: fit_irt,
+    Panoptic.kind: fit_panoptic,
+}
 
 
 def finetune(
@@ -126,7 +129,7 @@ def finetune(
     """
     budget = Budget(config.seconds, config.steps, config.evaluations, on_progress, stopped)
     fitter = FITTERS.get(kind or (SRay.kind if start is None else start.kind), _fit_keyframes)
-    made = fitter(usable_frames(frames), label_set, start, config, budget)
+    made = fitter(FitTask(usable_frames(frames), label_set, start, config, budget))
     recipe = {
         "kind": "scene fit" if made.model.holds_scene else "finetune",
         "width": config.width,
@@ -150,10 +153,9 @@ class _Scene:
 
 
 def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator: torch.Generator) -> _Scene:
-    sizes = [(view.intrinsics.height, view.intrinsics.width) for view in views]
     pairs = [
-        (view, held_out_blocks(height, width, config.held_out_fraction, generator))
-        for view, (height, width) in zip(views, sizes, strict=True)
+        (view, held_out_blocks(view.intrinsics.height, view.intrinsics.width, config.held_out_fraction, generator))
+        for view in views
     ]
     train = [replace(view, channel=torch.where(mask, IGNORE, view.channel)) for view, mask in pairs]
     held_out = [replace(view, channel=torch.where(mask, view.channel, IGNORE)) for view, mask in pairs]
@@ -161,15 +163,10 @@ def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator
     return _Scene(train, held_out, queries or range(len(views)), view_overlap(views))
 
 
-def _fit_keyframes(
-    frames: Sequence[PosedFrame],
-    label_set: LabelSet,
-    start: LearnedField | None,
-    config: FinetuneConfig,
-    budget: Budget,
-) -> Fitted:
+def _fit_keyframes(task: FitTask) -> Fitted:
     """Fit S-Ray, or another field that encodes images, to labelled keyframes."""
-    labelled = [f for f in frames if f.label is not None]
+    frames, label_set, start, config, budget = task
+    labelled = task.labelled
     if len(frames) < 2 or not labelled:
         raise FrameError(
             f"finetuning needs at least 2 frames, one of them labelled, got {len(frames)} with {len(labelled)} "
@@ -184,14 +181,7 @@ def _fit_keyframes(
     with encoder_in_bfloat16(model, device):
         held_out, steps, own_view = _run(model, scene, config, budget, generator)
     model.load_state_dict(held_out.best)
-    figures = {
-        "steps": steps,
-        "best_step": held_out.step,
-        "held_out_loss": held_out.loss,
-        "held_out_accuracy": held_out.accuracy,
-        "own_view": own_view,
-    }
-    return Fitted(model, figures, labelled)
+    return Fitted(model, held_out.figures(steps) | {"own_view": own_view}, labelled)
 
 
 def _run(
@@ -214,8 +204,17 @@ def _run(
     def state() -> State:
         return copy.deepcopy(model.state_dict())
 
-    images_from, images_until = config.frozen_encoder_fraction, _end_of_images(model, config)
-    own_view = _weigh_own_view(model, scene, images_from < images_until)
+    # No steps on images where a kind says nothing of them, or the encoder is to stay what it is.
+    images_from, images_until = config.frozen_encoder_fraction, 0.0
+    if config.encoder_rate > 0 and model.classifies_images:
+        images_until = images_from + (1 - images_from) * config.image_fraction
+    # Steps on images fit the own image to this scene: it counts more than one view among others, unless no view has
+    # depth, where every ray needs the others.
+    own_view: dict[str, float] = {}
+    has_depth = any(bool((view.depth_m > 0).any()) for view in scene.train)
+    factors = (OWN_VIEW_FACTOR, OWN_VIEW_FACTOR_WITHOUT_DEPTH)
+    if images_from < images_until and has_depth and model.weigh_own_view(*factors):
+        own_view = dict(zip(("factor", "factor_without_depth"), factors, strict=True))
     # Random weights get worse before they get better.
     held_out = HeldOut(look, state, 0 if alive else config.patience, images_until)
     with budget.looking():
@@ -243,25 +242,6 @@ def _run(
             "few_steps", steps=steps, reason="the budget was used up before anything could be learned; raise it"
         )
     return held_out, steps, own_view
-
-
-def _end_of_images(model: LearnedField, config: FinetuneConfig) -> float:
-    """Fraction of the budget until which steps are on images; 0 where a kind says nothing of them, or the encoder is to
-    stay what it is."""
-    if config.encoder_rate == 0 or not model.classifies_images:
-        return 0.0
-    return config.frozen_encoder_fraction + (1 - config.frozen_encoder_fraction) * config.image_fraction
-
-
-def _weigh_own_view(model: LearnedField, scene: _Scene, learns_images: bool) -> dict[str, float]:
-    """Let the own image, which steps on images fit to this scene, count more than one view among others.
-
-    No factors where the encoder learns nothing of the scene, or where no view has depth: every ray needs the others.
-    """
-    has_depth = any(bool((view.depth_m > 0).any()) for view in scene.train)
-    if not (learns_images and has_depth and model.weigh_own_view(OWN_VIEW_FACTOR, OWN_VIEW_FACTOR_WITHOUT_DEPTH)):
-        return {}
-    return {"factor": OWN_VIEW_FACTOR, "factor_without_depth": OWN_VIEW_FACTOR_WITHOUT_DEPTH}
 
 
 def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:

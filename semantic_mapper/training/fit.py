@@ -13,6 +13,8 @@ import torch
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.config import FinetuneConfig
 from semantic_mapper.types import PosedFrame
 
 BACKBONE, ENCODER, REST = "backbone", "encoder", "rest"  # groups of parameters
@@ -34,6 +36,21 @@ class FitProgress:
 
 
 OnProgress = Callable[[FitProgress], None]
+
+
+class FitTask(NamedTuple):
+    """What to fit to which frames, within which budget."""
+
+    frames: Sequence[PosedFrame]  # with rigid poses; those with label images say the classes
+    label_set: LabelSet  # of their labels, and of the result
+    start: LearnedField | None  # a field of one scene takes its config and its box, if it is fitted; None = nothing
+    config: FinetuneConfig
+    budget: Budget
+
+    @property
+    def labelled(self) -> list[PosedFrame]:
+        """The frames with label images."""
+        return [f for f in self.frames if f.label is not None]
 
 
 class Fitted(NamedTuple):
@@ -125,6 +142,11 @@ class HeldOut:
     accuracy: float = math.nan
     step: int = 0
     best: State = field(default_factory=dict[str, torch.Tensor])
+
+    def figures(self, steps: int) -> dict[str, Any]:
+        """What a recipe says of a fit of so many steps."""
+        best = {"best_step": self.step, "held_out_loss": self.loss, "held_out_accuracy": self.accuracy}
+        return {"steps": steps} | best
 
     def judge(self, step: int) -> tuple[float, float, bool]:
         """Look, and keep the weights where they are better or nothing is held out: loss, accuracy, and whether."""

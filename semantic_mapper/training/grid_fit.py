@@ -20,10 +20,11 @@ from torch import nn
 
 from semantic_mapper.config import GridConfig, GridFieldConfig
 from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.learned import LearnedField, build_field
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.scene.grid import (
     HAZE,
     NOTHING,
+    OPAQUE,
     GridField,
     SceneGrid,
     Trunk,
@@ -45,12 +46,11 @@ from semantic_mapper.fields.scene.march import (
     scatter_grid,
 )
 from semantic_mapper.geometry import invert_pose
-from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import FinetuneConfig
-from semantic_mapper.training.fit import Budget, Fitted, descend, fit
+from semantic_mapper.training.fit import Budget, FitTask, Fitted, descend, fit
 from semantic_mapper.training.scene_box import check_parallax, scene_box
 from semantic_mapper.training.views import FrameRays, frame_rays
-from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
+from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame
 
 BETA1, BETA2 = 0.9, 0.99
 LEARNING_RATE, FINAL_FRACTION = 0.2, 0.3  # of density and colour at the start, and what is left of it in the end
@@ -131,33 +131,27 @@ def fit_grid(
 def grid_of_depth(rays: FrameRays, config: GridConfig, unseen: float = HAZE) -> SceneGrid:
     """A grid whose density is that of the measured surface; colours are grey.
 
-    Density is Laplace-CDF(-distance) / beta with beta = half a voxel. What was not observed (``distance_to_surface``
-    says where that is) has the raw density ``unseen``: haze, for images to clear or fill.
+    Density is Laplace-CDF(-distance) / beta with beta = half a voxel, of the distance in voxels, positive before the
+    surface. What was not observed has the raw density ``unseen``: haze, for images to clear or fill.
     """
-    distance, observed = distance_to_surface(rays, config)
-    grid = SceneGrid(config)
-    density = np.where(distance > 0, 0.5 * np.exp(-np.abs(distance) / BETA), 1 - 0.5 * np.exp(-np.abs(distance) / BETA))
-    per_voxel = density / BETA
-    raw = np.log(np.expm1(np.maximum(per_voxel, 1e-9))) - BIAS
-    values = np.where(observed, np.maximum(raw, NOTHING), unseen).astype(np.float32)
-    with torch.no_grad():
-        grid.values[..., 0] = torch.from_numpy(values)
-    grid.update_occupied()
-    return grid
-
-
-def distance_to_surface(rays: FrameRays, config: GridConfig) -> tuple[Float32, Bool]:
-    """Distance (X, Y, Z) in voxels, positive before the surface, at most ``TRUNCATION``; and where it was observed."""
     distance, weight = np.zeros(config.shape, np.float32), np.zeros(config.shape, np.float32)
     T_world_grid = np.diag((config.voxel_m, config.voxel_m, config.voxel_m, 1.0))
     T_world_grid[:3, 3] = config.origin_m
     for i, k in enumerate(rays.intrinsics):
         depth = rays.depth_m[rays.pixels_of(i)].reshape(rays.image_size(i))
         T_camera_grid = invert_pose(rays.T_world_camera[i].astype(np.float64)) @ T_world_grid
-        pinhole = (k.fx, k.fy, k.cx, k.cy)
         arrays = (distance, weight, depth, np.ascontiguousarray(T_camera_grid[:3]))
-        fuse_grid_depth(len(distance), *arrays, *pinhole, TRUNCATION * config.voxel_m)
-    return distance * np.float32(TRUNCATION), weight > 0
+        fuse_grid_depth(len(distance), *arrays, k.fx, k.fy, k.cx, k.cy, TRUNCATION * config.voxel_m)
+    distance *= np.float32(TRUNCATION)
+    grid = SceneGrid(config)
+    density = np.where(distance > 0, 0.5 * np.exp(-np.abs(distance) / BETA), 1 - 0.5 * np.exp(-np.abs(distance) / BETA))
+    per_voxel = density / BETA
+    raw = np.log(np.expm1(np.maximum(per_voxel, 1e-9))) - BIAS
+    values = np.where(weight > 0, np.maximum(raw, NOTHING), unseen).astype(np.float32)
+    with torch.no_grad():
+        grid.values[..., 0] = torch.from_numpy(values)
+    grid.update_occupied()
+    return grid
 
 
 def render_frame(grid: SceneGrid, rays: FrameRays, frame: int, near_m: float) -> tuple[Float32, Float32]:
@@ -338,48 +332,38 @@ def view_fraction(rays: FrameRays, config: GridConfig, near_m: float) -> Float32
 
 
 def fit_geometry(
-    frames: Sequence[PosedFrame],
-    label_set: LabelSet,
-    start: LearnedField | None,
-    shape: GridFieldConfig,
-    kind: str,
-    config: FinetuneConfig,
-    budget: Budget,
-    leave_out: LeaveOut | None = None,
+    task: FitTask, shape: GridFieldConfig, kind: str, until: float, leave_out: LeaveOut | None = None
 ) -> tuple[GridField, GridFit]:
     """A field of a kind that stands on a grid, which shows the frames, and how well it does.
 
-    Args:
-        start: Gives its box if it is fitted, unless ``config.grid`` names one; its weights are not looked at.
-        shape: Config of the kind, but for the box.
-        budget: Of this part; see ``fit_grid``.
-
-    Raises FrameError, ConfigError: of ``fit_grid``.
-    """
+    ``shape`` is the config of the kind, but for the box: that is the one of ``task.start`` if it is fitted, unless
+    ``config.grid`` names one. ``until`` is a fraction of the budget. Raises what ``fit_grid`` raises."""
+    start, config = task.start, task.config
+    part = task.budget.part(until, steps=config.steps or config.grid.steps)
     box = start.config.grid if isinstance(start, GridField) and start.fitted and config.grid.box_m is None else None
-    found = fit_grid(frames, config, budget, box, leave_out)
+    found = fit_grid(task.frames, config, part, box, leave_out)
     torch.manual_seed(config.seed)  # of what the kind draws
-    field = build_field(kind, msgspec.structs.replace(shape, grid=found.grid.config), label_set)
+    field = build_field(kind, msgspec.structs.replace(shape, grid=found.grid.config), task.label_set)
     assert isinstance(field, GridField)
     field.grid = found.grid
     field.fitted_steps += found.steps
     return field, found
 
 
-def fit_scene(
-    frames: Sequence[PosedFrame],
-    label_set: LabelSet,
-    start: LearnedField | None,
-    config: FinetuneConfig,
-    budget: Budget,
-) -> Fitted:
-    """Fit a plain ``GridField``: geometry and colour, no classes. ``start`` gives its config, and its box if fitted."""
-    shape = start.config if isinstance(start, GridField) else GridFieldConfig()
-    part = budget.part(GRID_UNTIL if shape.features else 1.0, steps=config.steps or config.grid.steps)
-    field, geometry = fit_geometry(frames, label_set, start, shape, GridField.kind, config, part)
+def fit_scene(task: FitTask) -> Fitted:
+    """Fit a plain ``GridField``: geometry and colour, no classes."""
+    shape = task.start.config if isinstance(task.start, GridField) else GridFieldConfig()
+    field, geometry = fit_geometry(task, shape, GridField.kind, GRID_UNTIL if shape.features else 1.0)
     if field.trunk is not None:
-        fit_trunk(field, geometry, config, budget.part(1.0, steps=trunk_steps(config)))
+        fit_trunk(field, geometry, task.config, task.budget.part(1.0, steps=trunk_steps(task.config)))
     return Fitted(field, grid_figures(geometry))
+
+
+def surface_depth(field: GridField, rays: FrameRays, pixels: Int64, near_m: float) -> torch.Tensor:
+    """z (R,) of what pixels (R,) see, 0 where that is nothing."""
+    with torch.no_grad():
+        samples = field.march(rays.rays(pixels, near_m))
+    return torch.where(samples.opacity > OPAQUE, samples.depth_m, 0.0)
 
 
 def grid_figures(geometry: GridFit) -> dict[str, Any]:

@@ -19,14 +19,23 @@ from torch.nn import functional
 
 from semantic_mapper.config import IRTConfig
 from semantic_mapper.errors import FrameError, WeightsError
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.scene.grid import OPAQUE, RaySamples
+from semantic_mapper.fields.scene.grid import RaySamples
 from semantic_mapper.fields.scene.irt import IRT, RayTexture, at_measured, no_texture, surface
 from semantic_mapper.geometry import camera_matrix, invert_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import FinetuneConfig
-from semantic_mapper.training.fit import Budget, Fitted, HeldOut, State, cosine_rate, descend, fit, held_out_blocks
-from semantic_mapper.training.grid_fit import fit_geometry, fit_trunk, grid_figures, trunk_steps
+from semantic_mapper.training.fit import (
+    Budget,
+    FitTask,
+    Fitted,
+    HeldOut,
+    State,
+    cosine_rate,
+    descend,
+    fit,
+    held_out_blocks,
+)
+from semantic_mapper.training.grid_fit import fit_geometry, fit_trunk, grid_figures, surface_depth, trunk_steps
 from semantic_mapper.training.losses import IGNORE, RAREST, semantic_loss
 from semantic_mapper.training.views import FrameRays, frame_rays, jittered, pixel_channels
 from semantic_mapper.types import PosedFrame
@@ -64,29 +73,17 @@ class LabelledRays:
         return self.rgb[frame[:, None, None], :, row, column].permute(0, 3, 1, 2).float() / 255
 
 
-def fit_irt(
-    frames: Sequence[PosedFrame],
-    label_set: LabelSet,
-    start: LearnedField | None,
-    config: FinetuneConfig,
-    budget: Budget,
-) -> Fitted:
+def fit_irt(task: FitTask) -> Fitted:
     """Fit an ``IRT``: geometry and texture from all frames, classes from those with labels.
 
-    Args:
-        frames: With poses; one of them labelled, at least.
-        start: Gives config and box; its weights are not looked at.
-        budget: ``steps``, if not 0, is the number of steps of each of its three parts.
-
-    Raises FrameError: no labelled frame, one class only, or what ``fit_grid`` refuses. WeightsError: ``start`` has
-    other classes.
-    """
-    if start is not None and start.label_set != label_set:
+    ``budget.steps``, if not 0, is the number of steps of each of its three parts. Raises FrameError: no labelled frame,
+    one class only, or what ``fit_grid`` refuses. WeightsError: ``start`` has other classes."""
+    start, config, budget, labelled = task.start, task.config, task.budget, task.labelled
+    if start is not None and start.label_set != task.label_set:
         raise WeightsError(
-            f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit without them"
+            f"the weights have label set '{start.label_set.name}', the labels '{task.label_set.name}'; fit without them"
         )
-    labelled = [f for f in frames if f.label is not None]
-    rays = labelled_rays(labelled, label_set, config)
+    rays = labelled_rays(labelled, task.label_set, config)
     shape = start.shape if isinstance(start, IRT) else IRTConfig()
     shape = msgspec.structs.replace(
         shape,
@@ -94,19 +91,12 @@ def fit_irt(
         carried=len(labelled) if config.irt.carry_labels else 0,
         carried_size=rays.rays.image_size(0),
     )
-    part = budget.part(GRID_UNTIL, steps=config.steps or config.grid.steps)
     known = start if isinstance(start, IRT) else None
-    field, geometry = fit_geometry(frames, label_set, known, shape, IRT.kind, config, part)
+    field, geometry = fit_geometry(task._replace(start=known), shape, IRT.kind, GRID_UNTIL)
     assert isinstance(field, IRT)
     fit_trunk(field, geometry, config, budget.part(TRUNK_UNTIL, steps=trunk_steps(config)))
     held_out, steps = ClassFit(field, rays, config).run(budget.part(1.0))
-    figures = grid_figures(geometry) | {
-        "steps": steps,
-        "best_step": held_out.step,
-        "held_out_loss": held_out.loss,
-        "held_out_accuracy": held_out.accuracy,
-        "grid_steps": geometry.steps,
-    }
+    figures = grid_figures(geometry) | {"grid_steps": geometry.steps} | held_out.figures(steps)
     return Fitted(field, figures, labelled)
 
 
@@ -270,10 +260,8 @@ def carry_labels(field: IRT, rays: FrameRays, channel: torch.Tensor, near_m: flo
         pixels = rays.pixels_of(i)
         depth = torch.from_numpy(rays.depth_m[pixels])
         blank = (depth == 0).nonzero()[:, 0]
-        with torch.no_grad():
-            for part in blank.split(4096):
-                samples = field.march(rays.rays(pixels[part.numpy()], near_m))
-                depth[part] = torch.where(samples.opacity > OPAQUE, samples.depth_m, 0.0)
+        for part in blank.split(4096):
+            depth[part] = surface_depth(field, rays, pixels[part.numpy()], near_m)
         carried.depth_m[i] = depth.view(size)
         carried.channel[i] = channel[torch.from_numpy(pixels)].view(size).to(torch.int16)
         carried.K[i] = torch.from_numpy(camera_matrix(k))

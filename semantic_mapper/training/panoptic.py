@@ -15,19 +15,24 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from semantic_mapper.config import BoxConfig
 from semantic_mapper.errors import ConfigError, FrameError, WeightsError
-from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.boxes import MovingBoxes, RaysInBox
-from semantic_mapper.fields.scene.grid import NOTHING, OPAQUE, RaySamples, SceneGrid, ray_fraction
+from semantic_mapper.fields.scene.grid import NOTHING, RaySamples, SceneGrid, ray_fraction
 from semantic_mapper.fields.scene.panoptic import CORE, LOOSE_M, BoxesOnRays, Panoptic, merged_classes
-from semantic_mapper.fields.scene.primitives import ALONE_NS, Primitive
+from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import FinetuneConfig, PanopticFitConfig
-from semantic_mapper.training.fit import Budget, Fitted, descend, fit
-from semantic_mapper.training.grid_fit import GridAdam, fit_geometry, grid_figures, grid_of_depth, trunk_optimiser
+from semantic_mapper.training.fit import Budget, FitTask, Fitted, descend, fit
+from semantic_mapper.training.grid_fit import (
+    GridAdam,
+    fit_geometry,
+    grid_figures,
+    grid_of_depth,
+    surface_depth,
+    trunk_optimiser,
+)
 from semantic_mapper.training.views import FrameRays, frame_rays, pixel_channels
 from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame
 
@@ -44,7 +49,6 @@ FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is
 FEW_MATCHED = 0.5  # fraction of the pseudo labels that are possible on their ray, below which the log is warned about
 LEARNED = 10  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
 EMPTY_EVERY = 50  # steps between two looks at which cells are empty
-PAIRS = 1 << 20  # of boxes and cameras that are looked at together
 ELSEWHERE = 0.05  # of z, by which measured depth lies before a box or behind it where a pixel shows something else
 LEAST_PIXELS = 50  # measured inside of a box in all frames, below which nothing is known of its inside
 OPAQUE_RAW = 9.0  # raw density of a box of whose inside nothing is known
@@ -63,53 +67,39 @@ class PseudoRays:
     still: Int64  # numbers of the pixels that show what stands still
 
 
-def fit_panoptic(
-    frames: Sequence[PosedFrame],
-    label_set: LabelSet,
-    start: LearnedField | None,
-    config: FinetuneConfig,
-    budget: Budget,
-) -> Fitted:
+def fit_panoptic(task: FitTask) -> Fitted:
     """Fit a ``Panoptic``; stopped before its classes are learned, these are those of the boxes alone.
 
-    Args:
-        frames: With poses; their label images are the pseudo labels.
-        label_set: Of these and of the boxes.
-        start: A ``Panoptic`` with the boxes; its weights are not looked at. Without boxes pseudo labels alone teach,
-            where ``config`` leaves out the losses that need some.
-        budget: ``steps``, if not 0, is the number of steps of each of its two parts.
-
+    The label images of the frames are the pseudo labels. ``start`` is a ``Panoptic`` with the boxes, whose weights are
+    not looked at; without boxes pseudo labels alone teach, where ``config`` leaves out the losses that need some.
+    ``budget.steps``, if not 0, is the number of steps of each of its two parts.
     Raises ConfigError: no boxes, none of them in view, or no class in common with the pseudo labels. FrameError: no
     pseudo label, or what ``fit_grid`` refuses. WeightsError: ``start`` has other classes.
     """
+    _, label_set, start, config, budget = task
     by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
     if not isinstance(start, Panoptic) or (by_boxes and not start.shape.boxes):
         raise ConfigError("a field of kind 'panoptic' needs boxes; give a file of them (--boxes)")
     if start.label_set != label_set:
         raise WeightsError(f"the boxes are of label set '{start.label_set.name}', the labels of '{label_set.name}'")
-    frames = held_out_unlabelled(frames, config.grid.held_out)
+    frames = held_out_unlabelled(task.frames, config.grid.held_out)
     everything = pseudo_rays(frames, label_set, config.width)
-    boxes, lost = _followed(start, frames, everything.rays)
+    _, shown = shown_boxes(start.moving, frames, everything.rays)
+    gone = {box.id for box, count in zip(start.moving.primitives, shown, strict=True) if not count}
+    lost, boxes = len(gone), tuple(box for box in start.shape.boxes if box.id not in gone)
+    if lost:
+        _log.warning("moving_boxes_left_out", count=lost, reason="no frame shows them at their times")
     if by_boxes and not boxes:
-        raise ConfigError(
-            f"no box is in view of any frame: {lost} move, and no frame shows them at the times of their stamps. Are "
-            "the stamps the log's, in nanoseconds?"
-        )
+        places = np.array([box.T_world_box[:3, 3] for box in start.moving.primitives])
+        raise nothing_in_view(places, places, everything.rays.T_world_camera[:, :3, 3])
     survey = survey_boxes(start, everything, config)
 
     def shows_movers(seen: Sequence[PosedFrame], rays: FrameRays) -> Bool:
         return shown_boxes(start.moving, seen, rays)[0]
 
-    field, grid = fit_geometry(
-        frames,
-        label_set,
-        start,
-        msgspec.structs.replace(start.shape, boxes=boxes),
-        Panoptic.kind,
-        config,
-        budget.part(GRID_UNTIL, steps=config.steps or config.grid.steps),
-        shows_movers if len(start.moving) else None,
-    )
+    shape = msgspec.structs.replace(start.shape, boxes=boxes)
+    leave_out = shows_movers if len(start.moving) else None
+    field, grid = fit_geometry(task._replace(frames=frames), shape, Panoptic.kind, GRID_UNTIL, leave_out)
     assert isinstance(field, Panoptic)
     data = pseudo_rays(grid.frames, label_set, config.width)
     still = np.flatnonzero(~shows_movers(grid.frames, data.rays))
@@ -204,13 +194,8 @@ def semantic_losses(
     group: torch.Tensor,
     weights: PanopticFitConfig,
 ) -> torch.Tensor:
-    """Eq. 5 and 6: the pseudo labels against the fixed field and the learned one, and this one against the boxes.
-
-    Args:
-        boxes: What holds the samples.
-        learned: (R, K, L) the learned field.
-        channel: (R,) pseudo labels, -1 = none; ``group`` (L, L) says what they may stand for.
-    """
+    """Eq. 5 and 6: the pseudo labels (R,) ``channel`` against the fixed field and the learned one (R, K, L), and this
+    one against the boxes. ``group`` (L, L) says what the pseudo labels, -1 = none, may stand for."""
     there = channel >= 0
     stands_for = group[channel.clamp_min(0)]
     count = there.sum().clamp_min(1)
@@ -243,14 +228,13 @@ class JointFit:
 
     def run(self, budget: Budget) -> int:
         """Learn until the budget is used; returns the number of steps."""
-        steps = fit(self.learn, budget)
+        steps = fit(self._learn, budget)
         self._empty_cells()
         self.field.grid.values.requires_grad_(False)
         self.field.eval()
         return steps
 
-    def learn(self, fraction: float) -> float:
-        """One step at a fraction of the budget; returns the loss."""
+    def _learn(self, fraction: float) -> float:
         field, config = self.field, self.config
         left = FINAL_RATE**fraction
         for group, rate in zip(self.optimiser.param_groups, self.rates, strict=True):
@@ -269,11 +253,16 @@ class JointFit:
         channel = self.data.channel[torch.from_numpy(pixels)]
         boxes = field.boxes_on(samples)
         learned = field.learned(samples, r)
-        semantics = semantic_losses(field, samples, boxes, learned, channel, self.group, config.panoptic)
-        loss = loss + SEMANTICS * semantics
+        losses = semantic_losses(field, samples, boxes, learned, channel, self.group, config.panoptic)
+        loss = loss + SEMANTICS * losses
         field.grid.values.grad = None
         total = descend(self.optimiser, loss)
-        self._step_density(DENSITY_RATE * left)
+        gradient = field.grid.values.grad
+        assert gradient is not None
+        self.adam.step(gradient.contiguous().numpy(), DENSITY_RATE * left, 0.0)
+        self.step += 1
+        if self.step % EMPTY_EVERY == 0:
+            self._empty_cells()
         return total
 
     def _depth_loss(self, samples: RaySamples, share: torch.Tensor, pixels: np.ndarray) -> torch.Tensor:
@@ -284,14 +273,6 @@ class JointFit:
         error = (1 / z.clamp_min(1e-3) - 1 / measured.clamp_min(1e-3)) / DEPTH_REACH
         return (functional.huber_loss(error, torch.zeros_like(error), reduction="none") * known).mean()
 
-    def _step_density(self, rate: float) -> None:
-        self.step += 1
-        gradient = self.field.grid.values.grad
-        assert gradient is not None
-        self.adam.step(gradient.contiguous().numpy(), rate, 0.0)
-        if self.step % EMPTY_EVERY == 0:
-            self._empty_cells()
-
     def _empty_cells(self) -> None:
         """Empty what lies outside of all boxes, where nothing may be there, and find the cells that rays may skip."""
         with torch.no_grad():
@@ -300,46 +281,40 @@ class JointFit:
             self.field.grid.update_occupied()
 
 
-def _followed(start: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays) -> tuple[tuple[BoxConfig, ...], int]:
-    """The boxes without those that move and that no frame shows at their times, and how many those are."""
-    _, shown = shown_boxes(start.moving, frames, rays)
-    lost = {box.id for box, count in zip(start.moving.primitives, shown, strict=True) if not count}
-    if lost:
-        _log.warning("moving_boxes_left_out", count=len(lost), reason="no frame shows them at their times")
-    return tuple(box for box in start.shape.boxes if box.id not in lost), len(lost)
-
-
 def boxes_in_view(boxes: Sequence[Primitive], frames: Sequence[PosedFrame]) -> Bool:
     """Which boxes (P,) may be in the image of a frame, none of those that are for certain (what hides them is ignored).
 
-    A box is taken as the ball round it, and an image as the cone through its corners. Boxes that move are looked at
-    where they are at the time of each frame. Raises ConfigError: no box may be in any image.
-    """
-    balls = [_ball(box) for box in boxes]
-    centre = np.array([c for c, _ in balls]).reshape(-1, 3)
-    radius = np.array([r for _, r in balls])
-    still = np.array([not box.moves for box in boxes], np.bool_)
-    cone = np.array([_half_angle(frame) for frame in frames])
+    A box is taken as the ball round it, at the time of each frame, and an image as the cone through its corners.
+    Raises ConfigError: no box may be in any image."""
     pose = np.array([frame.T_world_camera for frame in frames]).reshape(-1, 4, 4)
+    cone = np.array([_half_angle(frame) for frame in frames])
     seen = np.zeros(len(boxes), np.bool_)
-    at = np.array([box.T_world_box for box in boxes]).reshape(-1, 4, 4)
-    world = np.einsum("pij,pj->pi", at[:, :3, :3], centre) + at[:, :3, 3]
-    part = max(PAIRS // max(len(frames), 1), 1)
-    for chosen in np.split(np.flatnonzero(still), range(part, int(still.sum()), part)):
-        seen[chosen] = _meets(world[chosen], radius[chosen, None], pose, cone).any(1)
-    for number in np.flatnonzero(~still).tolist():
-        seen[number] = _moving_meets(boxes[number], centre[number], radius[number], frames, cone)
+    for number, box in enumerate(boxes):
+        centre, radius = _ball(box)
+        there = [box.T_world_box if box.stamps is None else box.pose_at(frame.stamp_ns) for frame in frames]
+        shown = np.array([place is not None for place in there], np.bool_)
+        if not shown.any():
+            continue
+        away = np.array([p[:3, :3] @ centre + p[:3, 3] for p in there if p is not None]) - pose[shown, :3, 3]
+        z, distance = (away * pose[shown, :3, 2]).sum(1), np.linalg.norm(away, axis=1)
+        angle = np.arccos(np.clip(z / np.maximum(distance, 1e-9), -1, 1))
+        wide = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
+        seen[number] = ((distance <= radius) | (angle <= cone[shown] + wide)).any()
     if len(boxes) and not seen.any():
-        raise nothing_in_view(world, world, pose[:, :3, 3], moving=not still.all())
+        places = np.array([box.T_world_box[:3, 3] for box in boxes])
+        raise nothing_in_view(places, places, pose[:, :3, 3])
     return seen
 
 
-def nothing_in_view(low: Float64, high: Float64, cameras: Float64 | Float32, moving: bool = False) -> ConfigError:
+def nothing_in_view(low: Float64, high: Float64, cameras: Float64 | Float32) -> ConfigError:
     """That no box is in view of any frame, with where boxes (P, 3) and cameras (F, 3) are."""
-    times = ", and the stamps of those that move the log's, in nanoseconds" if moving else ""
+    lowest, highest, first, last = (
+        "(" + ", ".join(f"{x:.2f}" for x in xyz) + ") m"
+        for xyz in (low.min(0), high.max(0), cameras.min(0), cameras.max(0))
+    )
     return ConfigError(
-        f"no box is in view of any frame: boxes lie from {_metres(low.min(0))} to {_metres(high.max(0))}, cameras from "
-        f"{_metres(cameras.min(0))} to {_metres(cameras.max(0))}. Are the boxes in the log's world frame{times}?"
+        f"no box is in view of any frame: boxes lie from {lowest} to {highest}, cameras from {first} to {last}. Are "
+        "the boxes in the log's world frame, and the stamps of those that move the log's, in nanoseconds?"
     )
 
 
@@ -361,44 +336,14 @@ def _half_angle(frame: PosedFrame) -> float:
     return float(np.arctan(np.hypot(x, y)))
 
 
-def _meets(centre: Float64, radius: Float64, pose: Float64, cone: Float64) -> Bool:
-    """Which balls (P,) meet the cones of which cameras (F,): (P, F). ``radius`` (P, 1)."""
-    away = centre[:, None] - pose[None, :, :3, 3]
-    z = np.einsum("pfi,fi->pf", away, pose[:, :3, 2])
-    distance = np.linalg.norm(away, axis=-1)
-    angle = np.arccos(np.clip(z / np.maximum(distance, 1e-9), -1, 1))
-    wide = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
-    return (distance <= radius) | (angle <= cone + wide)
-
-
-def _moving_meets(box: Primitive, centre: Float64, radius: float, frames: Sequence[PosedFrame], cone: Float64) -> bool:
-    assert box.stamps is not None
-    times = [t for t, _ in box.stamps]
-    margin = max((max(times) - min(times)) // 2, ALONE_NS)
-    for frame, angle in zip(frames, cone, strict=True):
-        if not min(times) - margin <= frame.stamp_ns <= max(times) + margin:
-            continue
-        pose = box.pose_at(frame.stamp_ns)
-        if pose is None:
-            continue
-        world = pose[:3, :3] @ centre + pose[:3, 3]
-        camera = np.asarray(frame.T_world_camera, np.float64)[None]
-        if _meets(world[None], np.array([[radius]]), camera, np.array([angle])).any():
-            return True
-    return False
-
-
-def _metres(xyz: Float64 | Float32) -> str:
-    return "(" + ", ".join(f"{x:.2f}" for x in xyz) + ") m"
-
-
 def shown_boxes(boxes: MovingBoxes, frames: Sequence[PosedFrame], rays: FrameRays) -> tuple[Bool, Int64]:
     """Which pixels (P,) of frames may show a box that moves, and how many may show each box (M,)."""
     shown, count = np.zeros(len(rays), np.bool_), np.zeros(len(boxes), np.int64)
     for number, frame in enumerate(frames):
         for met, pixels in _met(boxes, frame, rays, number):
             depth = torch.from_numpy(rays.depth_m[pixels])
-            enter, leave = _ends(met)
+            enter = met.found.enter.amin(1)
+            leave = met.found.leave.masked_fill(met.found.index < 0, -torch.inf).amax(1)
             known = depth > 0
             elsewhere = known & ((depth < (1 - ELSEWHERE) * enter) | (depth > (1 + ELSEWHERE) * leave))
             shown[pixels[~elsewhere.numpy()]] = True
@@ -418,7 +363,7 @@ def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, g
     for number, frame in enumerate(frames):
         for met, pixels in _met(boxes, frame, rays, number):
             depth = rays.depth_m[pixels].copy()
-            surface = _scene_depth(field, rays, pixels, near_m)
+            surface = surface_depth(field, rays, pixels, near_m).numpy()
             depth[(depth > 0) & (surface > 0) & (depth > (1 - ELSEWHERE) * surface)] = FAR_M
             depths[met.number][pixels] = depth
             measured[met.number] += int(met.found.inside(torch.from_numpy(depth)[:, None]).any(-1).sum())
@@ -462,19 +407,6 @@ def _paint(grid: SceneGrid, rays: FrameRays, gains: Float32) -> None:
     painted = torch.logit((mean[:3] / mean[3].clamp_min(1e-9)).clamp(0.01, 0.99)).permute(1, 2, 3, 0)
     with torch.no_grad():
         grid.values[..., 1:] = torch.where(known[..., None], painted, torch.zeros(()))
-
-
-def _scene_depth(field: Panoptic, rays: FrameRays, pixels: Int64, near_m: float) -> Float32:
-    """z (R,) of the scene that stands still at pixels, 0 where nothing is."""
-    with torch.no_grad():
-        samples = field.march(rays.rays(pixels, near_m))
-    return torch.where(samples.opacity > OPAQUE, samples.depth_m, 0.0).numpy()
-
-
-def _ends(met: RaysInBox) -> tuple[torch.Tensor, torch.Tensor]:
-    """z (N,) of the first entry and the last exit."""
-    there = met.found.index >= 0
-    return met.found.enter.amin(1), met.found.leave.masked_fill(~there, -torch.inf).amax(1)
 
 
 def _met(boxes: MovingBoxes, frame: PosedFrame, rays: FrameRays, number: int) -> list[tuple[RaysInBox, Int64]]:
