@@ -163,9 +163,7 @@ def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
     # A block that is turned reaches into at most 8 others.
     blocks = min(8 * sum(manifest.blocks for manifest in manifests.values()), _MAX_BLOCKS)
     config = msgspec.structs.replace(
-        first.config,
-        memory_mb=_memory_mb(first),
-        max_blocks=max(first.config.max_blocks, blocks),
+        first.config, memory_mb=_memory_mb(first), max_blocks=max(first.config.max_blocks, blocks)
     )
     return VoxelMap(config, first.label_set)
 

@@ -27,10 +27,7 @@ _COLUMNS = {
     "logs": {**dict.fromkeys(_LOG_TEXTS, "VARCHAR"), "seconds": "DOUBLE", "finished": "TIMESTAMP"},
     "classes": {**dict.fromkeys(("key", "method", "name"), "VARCHAR"), "iou": "DOUBLE"},
     "events": dict.fromkeys(("key", "kind", "text"), "VARCHAR"),
-    "failures": {
-        **dict.fromkeys(("operation", "log", "tags", "version", "error"), "VARCHAR"),
-        "finished": "TIMESTAMP",
-    },
+    "failures": {**dict.fromkeys(("operation", "log", "tags", "version", "error"), "VARCHAR"), "finished": "TIMESTAMP"},
 }
 
 

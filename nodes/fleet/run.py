@@ -126,11 +126,7 @@ class RunReport:
 
 
 def make_task(
-    operation: str,
-    out: str,
-    weights: str | None = None,
-    assignments: Sequence[str] = (),
-    config: Path | None = None,
+    operation: str, out: str, weights: str | None = None, assignments: Sequence[str] = (), config: Path | None = None
 ) -> Task:
     """What to do with each log.
 
@@ -218,15 +214,8 @@ def run_fleet(
             if error:
                 error = without_secrets(" ".join(error.split()))[:_MAX_ERROR]
                 shown, version = without_secrets(log.url), code_version()
-                failure = Failure(
-                    key=key,
-                    operation=task.operation,
-                    log=shown,
-                    tags=log.tags,
-                    version=version,
-                    error=error,
-                    finished_ns=time.time_ns(),
-                )
+                about = {"operation": task.operation, "tags": log.tags, "version": version}
+                failure = Failure(key=key, log=shown, error=error, finished_ns=time.time_ns(), **about)
                 _log.error("log_failed", log=shown, error=error)
                 store.note_failure(failure)
                 report.failures.append(failure)

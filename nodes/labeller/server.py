@@ -18,20 +18,19 @@ from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
 import structlog
 
-from semantic_mapper.errors import FrameError, LabelError, LogError, TransportError
-from semantic_mapper.nodes.local_server import LocalServer
+from semantic_mapper.errors import FrameError, LabelError, LogError
+from semantic_mapper.nodes.local_server import HOST, LocalServer
 from semantic_mapper.replay.label_folder import LabelFolder
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.training.strokes import grow_strokes
 from semantic_mapper.types import PosedFrame
 
-HOST = "127.0.0.1"
 PORT = 9092
 JPEG_QUALITY = 95
 TIMEOUT_S = 10.0  # of one read or write of a request
@@ -156,40 +155,13 @@ class LabelSession:
         return frame
 
 
-class LabelServer:
-    """Serves one session, in threads of its own; a context manager.
-
-    Args:
-        session: What is labelled.
-        port: Of the page; 0 = any that is free.
-
-    Raises:
-        TransportError: the port is taken.
-    """
+class LabelServer(LocalServer):
+    """Serves one session at ``url``; 0 for any port that is free."""
 
     def __init__(self, session: LabelSession, port: int = PORT) -> None:
-        self._token = secrets.token_urlsafe(24)
-        try:
-            self._server = LocalServer((HOST, port), _make_handler(session, self._token))
-        except OSError as error:
-            raise TransportError(
-                f"port {port} cannot be had ({error.strerror}); give another one with --port, or 0 for any"
-            ) from error
-        self._thread = threading.Thread(target=self._server.serve_forever, name="labelling page", daemon=True)
-
-    @property
-    def url(self) -> str:
-        """What to open in a browser."""
-        return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
+        token = secrets.token_urlsafe(24)
+        super().__init__(port, _make_handler(session, token))
+        self.url = f"http://{HOST}:{self.port}/{token}/"
 
 
 class _RefusedError(Exception):

@@ -41,11 +41,7 @@ def show_log(
         log = RerunLog(begin(), pipeline.label_set, voxel_map.config.voxel_size_m)
         show, mirror = MapShow(log), MapMirror.of(voxel_map)
         session = MapSession(
-            bundle,
-            stream_labels=None,
-            source=reader.info.source,
-            scale_known=reader.info.scale_known,
-            rerun=log,
+            bundle, stream_labels=None, source=reader.info.source, scale_known=reader.info.scale_known, rerun=log
         )
         total = min(len(reader), frames or len(reader))
         monitor.start(total)

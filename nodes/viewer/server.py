@@ -2,7 +2,8 @@
 
 The SDK could serve it from within this process, but on all interfaces; the program that comes with it listens where it
 is instructed to. It never calls home: analytics are switched off in a folder of settings that it alone uses, and the
-browser gets its pages through ``QuietPage``.
+browser gets its pages through ``quiet_page``. What is seen has neither keys nor passwords: other machines come in by
+`ssh -L`.
 """
 
 from __future__ import annotations
@@ -13,10 +14,9 @@ import os
 import shutil
 import socket
 import subprocess
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -27,10 +27,9 @@ import structlog
 
 from semantic_mapper.errors import DependencyError, TransportError
 from semantic_mapper.nodes.launcher.liveness import end_with_launcher
-from semantic_mapper.nodes.local_server import LocalServer
+from semantic_mapper.nodes.local_server import HOST, LocalServer
 from semantic_mapper.nodes.process_folder import OwnFolder
 
-HOST = "127.0.0.1"  # what is seen has neither keys nor passwords: other machines come in by `ssh -L`
 WEB_PORT, DATA_PORT = 9090, 9876
 START_S = 120.0  # on a machine that has too much to do
 STOP_S = 3.0
@@ -41,7 +40,7 @@ _KEPT = ("Content-Type", "Content-Length", "rerun-final-length")  # headers that
 _log = structlog.get_logger(__name__)
 
 
-class WebViewer:
+class WebViewer(ExitStack):
     """A web server with the viewer, and a data server that keeps what browsers are shown; a context manager.
 
     Args:
@@ -50,11 +49,12 @@ class WebViewer:
     """
 
     def __init__(self, web_port: int = WEB_PORT, data_port: int = DATA_PORT, memory_mb: int = 512) -> None:
-        self._ports = web_port, data_port
+        super().__init__()
+        self._asked = web_port, data_port
         self._memory_mb = memory_mb
+        self.data_url = ""  # where to send what is to be shown
+        self.page_url = ""  # what to open in a browser
         self._process: subprocess.Popen[bytes] | None = None
-        self._page: QuietPage | None = None
-        self._folder = OwnFolder("view-")  # where we are killed, `up` removes it
 
     def __enter__(self) -> Self:
         """Start the servers and wait until they answer: ``DependencyError``, ``TransportError`` where they do not."""
@@ -64,20 +64,6 @@ class WebViewer:
             self.close()
             raise
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @property
-    def data_url(self) -> str:
-        """Where to send what is to be shown."""
-        return f"rerun+http://{HOST}:{self._ports[1]}/proxy"
-
-    @property
-    def page_url(self) -> str:
-        """What to open in a browser."""
-        shown = f"url={quote(self.data_url, safe='')}&hide_welcome_screen=1&persist=0&theme=dark"
-        return f"http://{HOST}:{self._ports[0]}/?{shown}"
 
     @property
     def pid(self) -> int:
@@ -90,40 +76,24 @@ class WebViewer:
         """Whether it still serves."""
         return self._process is not None and self._process.poll() is None
 
-    def close(self) -> None:
-        """End the servers. Harmless when repeated."""
-        if self._process is not None:
-            self._process.terminate()
-            try:
-                self._process.wait(STOP_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        if self._page is not None:
-            self._page.close()
-            self._page = None
-        self._folder.close()
-
     def _start(self) -> None:
         program = _find_program()
-        settings = {f"XDG_{kind}_HOME": f"{self._folder.path}/{kind.lower()}" for kind in ("CONFIG", "DATA", "CACHE")}
+        folder = self.enter_context(closing(OwnFolder("view-"))).path  # where we are killed, `up` removes it
+        settings = {f"XDG_{kind}_HOME": f"{folder}/{kind.lower()}" for kind in ("CONFIG", "DATA", "CACHE")}
         environment = {**os.environ, **settings}
         result = subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)
         if result.returncode != 0:  # then it would call home
             raise DependencyError(f"{program}: analytics cannot be switched off: {result.stderr.decode().strip()}")
-        # All three are held until all are chosen: a port that was let go may be given out again.
-        with (
-            _hold_port(self._ports[0], "--port") as page,
-            _hold_port(self._ports[1], "--port") as data,
-            _hold_port(0, "") as web,
-        ):
-            pass
-        # It answers before there is anything to show, and so keeps its port.
-        self._page = QuietPage((HOST, page), (HOST, web), (f"http://{HOST}:{data}",))
-        self._ports = page, data
+        # Ports are held until all are chosen: one that was let go may be given out again. The page answers before there
+        # is anything to show, and so keeps its own.
+        with _hold_port(self._asked[1]) as data, _hold_port(0) as web:
+            page = self.enter_context(quiet_page(self._asked[0], web, f"http://{HOST}:{data}"))
+        self.data_url = f"rerun+http://{HOST}:{data}/proxy"
+        shown = f"url={quote(self.data_url, safe='')}&hide_welcome_screen=1&persist=0&theme=dark"
+        self.page_url = f"http://{HOST}:{page.port}/?{shown}"
         command = [program, "--serve-web", "--bind", HOST, "--port", str(data), "--web-viewer-port", str(web)]
         command += ["--server-memory-limit", f"{self._memory_mb}MB"]
-        log = self._folder.path / "log"
+        log = folder / "log"
         with log.open("wb") as file:
             self._process = subprocess.Popen(
                 command,
@@ -134,12 +104,22 @@ class WebViewer:
                 process_group=0,  # Ctrl-C is for us; we end it
                 preexec_fn=end_with_launcher,  # and where we are killed, the kernel does
             )
+        self.callback(_end, self._process)
         deadline = time.monotonic() + START_S
         while not (_answers(web) and _answers(data)):
             if not self.alive or time.monotonic() > deadline:
                 words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-3:]
                 raise TransportError(f"the web viewer has not started; its last words: {' | '.join(words) or 'none'}")
             time.sleep(_POLL_S)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _find_program() -> str:
@@ -151,7 +131,7 @@ def _find_program() -> str:
 
 
 @contextmanager
-def _hold_port(port: int, option: str) -> Iterator[int]:
+def _hold_port(port: int) -> Iterator[int]:
     """The port itself where it is free, a free one for 0; nobody else gets it meanwhile."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -159,7 +139,7 @@ def _hold_port(port: int, option: str) -> Iterator[int]:
             probe.bind((HOST, port))
         except OSError as error:
             raise TransportError(
-                f"port {port} cannot be had ({error.strerror}); give another one with {option}, or 0 for any"
+                f"port {port} cannot be had ({error.strerror}); give another one with --port, or 0 for any"
             ) from error
         yield probe.getsockname()[1]
 
@@ -170,36 +150,22 @@ def _answers(port: int) -> bool:
         return client.connect_ex((HOST, port)) == 0
 
 
-class QuietPage:
-    """Serves another server's pages with the order to speak to nobody else, in threads of its own.
+def quiet_page(port: int, source: int, allowed: str) -> LocalServer:
+    """Serve the pages of another server of this machine with the order to speak to nobody else.
 
     Rerun's viewer reports its use, looks for newer releases and loads a font, whatever its settings. A content security
     policy is what a browser obeys.
 
     Args:
-        address: Where; port 0 = any that is free.
-        source: Host and port of the other server.
-        allowed: Origins that the page may fetch from, in addition to this server.
+        port: See ``LocalServer``.
+        source: Port of the other server.
+        allowed: Origin that the page may fetch from, in addition to this server.
     """
+    policy = (
+        "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
+        f"connect-src 'self' data: blob: {allowed}; form-action 'none'; base-uri 'self'"
+    )
 
-    def __init__(self, address: tuple[str, int], source: tuple[str, int], allowed: tuple[str, ...]) -> None:
-        policy = (
-            "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
-            f"connect-src 'self' data: blob: {' '.join(allowed)}; form-action 'none'; base-uri 'self'"
-        )
-        self._server = LocalServer(address, _make_handler(source, policy))
-        self.port = int(self._server.server_address[1])
-        self._thread = threading.Thread(target=self._server.serve_forever, name="web page", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop serving."""
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
-
-
-def _make_handler(source: tuple[str, int], policy: str) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         """One request."""
 
@@ -210,7 +176,7 @@ def _make_handler(source: tuple[str, int], policy: str) -> type[BaseHTTPRequestH
             if not path.isascii():
                 self.send_error(HTTPStatus.BAD_REQUEST, "addresses are ASCII")
                 return
-            with closing(http.client.HTTPConnection(*source, timeout=TIMEOUT_S)) as connection:
+            with closing(http.client.HTTPConnection(HOST, source, timeout=TIMEOUT_S)) as connection:
                 try:
                     connection.request("GET", path)
                     answer = connection.getresponse()
@@ -230,4 +196,4 @@ def _make_handler(source: tuple[str, int], policy: str) -> type[BaseHTTPRequestH
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002 (its name there)
             _log.debug("page_served", request=format % args)
 
-    return Handler
+    return LocalServer(port, Handler)

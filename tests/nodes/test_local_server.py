@@ -5,13 +5,12 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
-from threading import Thread
 
 import pytest
 from structlog.testing import capture_logs
 
 from semantic_mapper.nodes.local_server import LocalServer
-from semantic_mapper.nodes.viewer.server import QuietPage
+from semantic_mapper.nodes.viewer.server import quiet_page
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -29,11 +28,8 @@ class Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    server = LocalServer(("127.0.0.1", 0), Handler)
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield server.server_address[1]
-    server.shutdown()
-    server.server_close()
+    with LocalServer(0, Handler) as server:
+        yield server.port
 
 
 def status(port: int, request: bytes) -> bytes:
@@ -57,13 +53,9 @@ def test_a_request_that_fails_is_one_line_and_the_next_one_is_served(
 def test_odd_addresses_are_refused_by_the_page_of_the_viewer(
     port: int, path: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    page = QuietPage(("127.0.0.1", 0), ("127.0.0.1", port), ())
-    try:
-        with capture_logs() as told:
-            answer = status(page.port, b"GET " + path + b" HTTP/1.1")
-            assert status(page.port, b"GET / HTTP/1.1").split()[1] == b"204"
-    finally:
-        page.close()
+    with quiet_page(0, port, "") as page, capture_logs() as told:
+        answer = status(page.port, b"GET " + path + b" HTTP/1.1")
+        assert status(page.port, b"GET / HTTP/1.1").split()[1] == b"204"
     assert not answer or answer.split()[1] in (b"204", b"400")
     assert not [entry for entry in told if entry["event"] == "request_not_served"]
     assert "Traceback" not in capfd.readouterr().err

@@ -80,35 +80,22 @@ def test_poses_without_a_frame_are_left_out_and_told_of(tmp_path: Path) -> None:
         correct_session(session, read_corrections(write(tmp_path / "b.txt", [], far)))
 
 
-def test_files_that_are_no_trajectory_are_named(tmp_path: Path) -> None:
-    frames = tiny_frames()
+def test_what_cannot_correct_a_map_is_refused_by_name(tmp_path: Path) -> None:
+    frames = tiny_frames(12)
     with pytest.raises(ImportSourceError, match=r"gone\.txt: cannot be read"):
         read_corrections(tmp_path / "gone.txt")
     with pytest.raises(ImportSourceError, match=r"a\.txt, line 4: .*1 lines"):
         read_corrections(write(tmp_path / "a.txt", frames[:2], "1.0 2 3"))
-
-
-def test_a_log_of_several_cameras_is_refused(tmp_path: Path) -> None:
-    frames = tiny_frames()
+    trajectory = read_corrections(write(tmp_path / "a.txt", frames[:1]))
     session = session_of(tmp_path, [frames[0], replace(frames[1], camera_id="rear")])
     with pytest.raises(ImportSourceError, match="this log has rear, rooms"):
-        correct_session(session, read_corrections(write(tmp_path / "a.txt", frames)))
+        correct_session(session, trajectory)
+    session = session_of(tmp_path, list(frames), history={"max_frames": 4})
+    with pytest.raises(ImportSourceError, match=r"; [1-9]\d* frames have left the history \(history\.max_frames"):
+        correct_session(session, trajectory)
 
 
 def test_the_history_holds_the_log_unless_the_config_says_otherwise() -> None:
     assert keeping_frames(MapperConfig(), 500).history.max_frames > 500
     given = convert_config({"history": {"max_frames": 20}}, MapperConfig, "test")
     assert keeping_frames(given, 500) is given
-
-
-def test_frames_that_have_left_cannot_be_corrected(tmp_path: Path) -> None:
-    frames = tiny_frames(12)
-    session = session_of(tmp_path, list(frames), history={"max_frames": 4})
-    with pytest.raises(ImportSourceError, match=r"; [1-9]\d* frames have left the history \(history\.max_frames"):
-        correct_session(session, read_corrections(write(tmp_path / "a.txt", frames[:1])))
-
-
-def test_a_second_pose_of_one_stamp_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "poses.txt").write_text("1.0 0 0 0 0 0 0 1\n1.0 1 0 0 0 0 0 1")
-    with pytest.raises(ImportSourceError, match="second pose of this stamp"):
-        read_corrections(tmp_path / "poses.txt")

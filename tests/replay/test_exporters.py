@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 from base64 import b64decode
 from pathlib import Path
@@ -17,8 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError, ImportSourceError, LogError, MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.cli.export import export_recording
-from semantic_mapper.nodes.console import Output
 from semantic_mapper.replay.exporters import LogExportReport, export_log, log_format_of
 from semantic_mapper.replay.importers import import_recording
 from semantic_mapper.replay.importers.tum import read_trajectory
@@ -31,10 +28,7 @@ from semantic_mapper.types import PosedFrame
 from tests.transport import samples
 
 LABELS = LabelSet(
-    "Lab 7",
-    tuple(range(1, 41)),
-    tuple(f"thing {i}" for i in range(40)),
-    tuple((9, i, 200) for i in range(40)),
+    "Lab 7", tuple(range(1, 41)), tuple(f"thing {i}" for i in range(40)), tuple((9, i, 200) for i in range(40))
 )
 PACKING = (CodecOptions(), CodecOptions(rgb="raw"), CodecOptions(rgb="jpeg"))
 
@@ -233,19 +227,8 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(log: Path, tmp_pa
 
 
 def test_damaged_frames_are_left_out(log: Path, tmp_path: Path) -> None:
+    assert is_log(log) and is_log(tmp_path) and not is_log(tmp_path / "map.npz")
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
     assert exported(log, tmp_path / "sequence").frames == 6
-
-
-def test_the_verb_takes_logs_and_tells_them_from_maps(log: Path, tmp_path: Path) -> None:
-    assert is_log(log) and is_log(tmp_path) and not is_log(tmp_path / "map.npz")
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "recorded.mcap").touch()
-    assert is_log(tmp_path / "run")
-    (tmp_path / "run" / "map.npz").touch()
-    assert not is_log(tmp_path / "run")
-    told = io.StringIO()
-    export_recording(Output(told), log, tmp_path / "poses.txt", "trajectory", "", 2)
-    assert f"{tmp_path / 'poses.txt'}: 2 frames (trajectory)" in told.getvalue()

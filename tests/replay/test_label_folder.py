@@ -13,12 +13,7 @@ import pytest
 
 from semantic_mapper.errors import ConfigError, ImportSourceError, LabelError, LogError
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
-from semantic_mapper.replay.label_folder import (
-    log_identity,
-    make_label_folder,
-    open_label_folder,
-    read_classes,
-)
+from semantic_mapper.replay.label_folder import log_identity, make_label_folder, open_label_folder, read_classes
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame

@@ -18,10 +18,7 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
-from semantic_mapper.replay.page import (
-    Section,
-    write_page,
-)
+from semantic_mapper.replay.page import Section, write_page
 from semantic_mapper.replay.session import MapSession
 from tests.nodes.support import write_weights
 from tests.small import tiny_config, tiny_frames

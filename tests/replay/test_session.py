@@ -20,13 +20,7 @@ from semantic_mapper.replay import artifacts
 from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.evaluate.methods import MAP, Opinion, baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.replay.session import (
-    LONGEST_MS,
-    SHORTEST_MS,
-    LatencyHistogram,
-    MapSession,
-    open_recording,
-)
+from semantic_mapper.replay.session import LONGEST_MS, SHORTEST_MS, LatencyHistogram, MapSession, open_recording
 from semantic_mapper.replay.summary import notes, summary_table
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.small import tiny_config, tiny_field, tiny_frames

@@ -84,32 +84,22 @@ def test_a_signal_ends_the_cluster_of_this_machine(signum: signal.Signals) -> No
         assert not folder.exists()
 
 
-@pytest.mark.parametrize(
-    ("address", "said"),
-    [
+def test_what_is_no_safe_address_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
+    monkeypatch.delenv("RAY_AUTH_TOKEN", raising=False)
+    for address, said in (
         ("localhost", "not the address of a Ray cluster"),
         ("ray://10.0.0.1:10001", "not the address of a Ray cluster"),
         ("127.0.0.1:99999", "not the address of a Ray cluster"),
         ("no-such-host.invalid:6379", "not the address of a Ray cluster"),
         ("192.0.2.1:6379", "RAY_AUTH_MODE=token is not set, so that anybody there can run code"),
-    ],
-)
-def test_what_is_no_safe_address_is_refused(address: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
-    with pytest.raises(FleetError, match=said), connected(address):
-        pass
-
-
-def test_a_cluster_that_is_not_there_is_an_error_at_once() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    with pytest.raises(FleetError, match="no Ray cluster answers"), connected(f"127.0.0.1:{port}"):
-        pass
-
-
-def test_a_token_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        (f"127.0.0.1:{port}", "no Ray cluster answers"),
+    ):
+        with pytest.raises(FleetError, match=said), connected(address):
+            pass
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
-    monkeypatch.delenv("RAY_AUTH_TOKEN", raising=False)
     monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(tmp_path / "nothing"))
     with pytest.raises(FleetError, match="nothing: there is no token"), connected("127.0.0.1:6379"):
         pass

@@ -72,13 +72,10 @@ def test_logs_that_failed_or_are_missing_are_worse_and_say_why(tmp_path: Path) -
     assert [(log.status, log.reason) for log in found.logs[:2]] == [("failed", "LogError: cut off"), ("missing", "")]
     assert found.reasons == ("1 log failed in B", "1 log missing in B")
     assert not compare_stores(b, a).reasons
+    unscored = store_of(tmp_path / "d", [*results[:3], with_findings(results[3], metrics={"miou": None})])
+    assert compare_stores(a, unscored).reasons == ("1 log without a score in B",)
     nothing = compare_stores(a, store_of(tmp_path / "c"))
     assert nothing.reasons == ("4 logs missing in B",) and nothing.mean.a is None
-
-
-def test_a_log_without_a_score_in_b_is_worse(compared: Any) -> None:
-    found = compared(logs(3), [*logs(2), with_findings(made_up(2), metrics={"miou": None})])
-    assert found.reasons == ("1 log without a score in B",)
 
 
 def test_the_latest_result_of_a_log_counts(compared: Any) -> None:

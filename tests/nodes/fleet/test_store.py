@@ -81,20 +81,16 @@ def test_a_manifest_and_globs_are_read_from_a_bucket(bucket: str) -> None:
     assert "secret-of-the-test" not in str(caught.value)
 
 
-def test_a_damaged_result_is_named(tmp_path: Path) -> None:
-    store = store_of(tmp_path, [RESULT])
-    store.write("results/x.json", b"{")
-    with pytest.raises(ConfigError, match=r"x\.json: is damaged .*delete it, and `fleet run` does the task again"):
-        list(store.results())
-
-
-def test_tasks_in_other_folders_find_a_store_of_a_relative_path(
+def test_a_store_of_a_relative_path_is_found_from_elsewhere_and_names_a_damaged_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     store = store_of("runs/fleet", [RESULT])
     monkeypatch.chdir("/")
     assert list(Store(store.url).results()) == [RESULT] and store.shown == "runs/fleet"
+    store.write("results/x.json", b"{")
+    with pytest.raises(ConfigError, match=r"x\.json: is damaged .*delete it, and `fleet run` does the task again"):
+        list(store.results())
 
 
 def test_what_is_no_store_is_refused(tmp_path: Path) -> None:

@@ -7,8 +7,7 @@ import struct
 import time
 from collections.abc import Collection
 from contextlib import ExitStack
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -24,20 +23,15 @@ class Received(NamedTuple):
     data: bytes
 
 
-class FoxgloveClient:
-    """Subscribes to topics as soon as a server has them; a context manager.
-
-    Args:
-        url: Of the server, ``ws://127.0.0.1:8765``.
-        topics: By name; None = all.
-    """
+class FoxgloveClient(ExitStack):
+    """Subscribes to topics (None = all) as soon as a server has them; a context manager."""
 
     def __init__(self, url: str, topics: Collection[str] | None = None) -> None:
+        super().__init__()
         self._topics = topics
-        self._topic_of: dict[int, str] = {}  # by subscription
-        self._end = ExitStack()
+        self._topic_of: list[str] = []  # by subscription
         opened = connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None, compression=None)
-        self._socket = self._end.enter_context(opened)
+        self._socket = self.enter_context(opened)
 
     def receive(self, timeout_s: float) -> Received | None:
         """The next message; None where none came in time."""
@@ -55,23 +49,8 @@ class FoxgloveClient:
                 subscription, log_time_ns = struct.unpack_from("<IQ", message, 1)
                 return Received(self._topic_of[subscription], log_time_ns, message[13:])
 
-    def close(self) -> None:
-        """Disconnect."""
-        self._end.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _subscribe(self, channels: list[dict[str, str]]) -> None:
         wanted = [c for c in channels if self._topics is None or c["topic"] in self._topics]
-        subscriptions: list[dict[str, object]] = []
-        for channel in wanted:
-            number = len(self._topic_of)
-            self._topic_of[number] = channel["topic"]
-            subscriptions.append({"id": number, "channelId": channel["id"]})
-        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+        new = [{"id": n, "channelId": c["id"]} for n, c in enumerate(wanted, len(self._topic_of))]
+        self._topic_of += [channel["topic"] for channel in wanted]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": new}))

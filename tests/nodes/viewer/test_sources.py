@@ -187,7 +187,11 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
     assert rows["/world/map/class"] == rows["/world/map/age"] == 1, "a map that has not changed is not sent again"
 
 
-def test_a_map_on_another_machine_is_shown_to_who_has_a_key(tmp_path: Path) -> None:
+def test_a_map_on_another_machine_is_shown_to_who_has_a_key_and_a_saved_one_without_ages(tmp_path: Path) -> None:
+    whole_map().save(tmp_path / "map.npz")
+    show_saved(tmp_path / "map.npz", lambda: recording_file(tmp_path / "map.rrd"))
+    rows = logged(tmp_path / "map.rrd")
+    assert rows["/world/map/class"] == rows["/legend"] == 1 and "/world/map/age" not in rows
     robot, desk = make_keys(tmp_path / "robot"), make_keys(tmp_path / "desk")
     allow(robot.folder, "desk", desk.public.decode())
     allow(desk.folder, "robot", robot.public.decode())
@@ -197,13 +201,6 @@ def test_a_map_on_another_machine_is_shown_to_who_has_a_key(tmp_path: Path) -> N
             assert eventually(lambda: service.answered >= 4, WARM_S)
             stop.signum = signal.SIGTERM
     assert logged(tmp_path / "live.rrd")["/world/map/age"] == 1
-
-
-def test_a_saved_map_has_no_ages(tmp_path: Path) -> None:
-    whole_map().save(tmp_path / "map.npz")
-    show_saved(tmp_path / "map.npz", lambda: recording_file(tmp_path / "map.rrd"))
-    rows = logged(tmp_path / "map.rrd")
-    assert rows["/world/map/class"] == rows["/legend"] == 1 and "/world/map/age" not in rows
 
 
 def test_blocks_age_until_they_change() -> None:
