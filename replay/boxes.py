@@ -247,7 +247,7 @@ def _read_json(text: bytes, path: Path) -> BoxFile:
     try:
         data: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} is neither JSON nor XML: {str(error):.200}") from error
+        raise ConfigError(f"{path} is neither JSON nor XML: {error!s:.200}") from error
     table = cast("dict[str, Any]", data) if isinstance(data, dict) else {}
     of_query = table.get("question") == "instances"
     if of_query:
