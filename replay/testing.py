@@ -18,7 +18,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.nearest import NearestSurface, at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.replay.compare import Run, Tolerances, compare_runs, read_run
+from semantic_mapper.replay.compare import Comparison, Run, Tolerances, compare_runs, read_run
 from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.run_folder import MAP_NAME
 from semantic_mapper.replay.summary import SUMMARY_FILE
@@ -83,6 +83,11 @@ class ReplayedMap:
         """Of the map's surface against the labels of the log, 0..1; ``LogError`` without labels that count."""
         return self._score("map_miou")
 
+    def compare(self, stored: Path | str, **tolerances: float) -> Comparison:
+        """Compare with an earlier run, as ``assert_like`` does."""
+        allowed = convert_config(tolerances, Tolerances, "tolerances")
+        return compare_runs(read_run(self.root / stored), Run(str(self.folder), self.voxel_map, self.summary), allowed)
+
     def store(self, target: Path | str) -> None:
         """Write what ``assert_like`` needs of this run to a folder, made if missing."""
         folder = self.root / target
@@ -107,8 +112,7 @@ class ReplayedMap:
             return
         if not target.exists():
             raise AssertionError(f"no run is stored at {target}; look at {self.folder}, then `pytest --update-runs`")
-        run = Run(str(self.folder), self.voxel_map, self.summary)
-        comparison = compare_runs(read_run(target), run, convert_config(tolerances, Tolerances, "tolerances"))
+        comparison = self.compare(stored, **tolerances)
         if not comparison.equal:
             lines = [f"the map is not as {target}; see {self.folder}", *map(str, comparison.differences)]
             raise AssertionError("\n  ".join([*lines, *comparison.notes]))
