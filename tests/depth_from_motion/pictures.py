@@ -34,14 +34,5 @@ def plane_frame(
     at = (p[..., :2] * 50 + 256).astype(np.float32)
     gray = cv2.remap(_TEXTURE, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     rgb = np.repeat(np.clip(gray * gain, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-    frame = PosedFrame(
-        stamp_ns=(seq + 1) * 100_000_000,
-        seq=seq,
-        camera_id=camera_id,
-        rgb=rgb,
-        depth_m=None,
-        label=None,
-        intrinsics=camera,
-        T_world_camera=pose,
-    )
+    frame = PosedFrame((seq + 1) * 100_000_000, seq, camera_id, rgb, None, None, camera, pose)
     return frame, depth.astype(np.float32)

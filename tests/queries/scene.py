@@ -56,11 +56,13 @@ def seen(T_world_camera: Float64) -> tuple[Float32, UInt8]:
     return depth, np.where(depth > 0, np.array([FLOOR, TABLE, CUP], np.uint8)[first], 0).astype(np.uint8)
 
 
-def integrate(voxel_map: VoxelMap, pose: Float64, seq: int) -> None:
+def integrate(voxel_map: VoxelMap, pose: Float64, seq: int, *, measured: bool = True, only: int = 0) -> None:
     depth, label = seen(pose)
     probabilities = np.full((*depth.shape, len(LABELS)), 0.1, np.float32)
     np.put_along_axis(probabilities, np.maximum(LABELS.to_channels(label), 0)[..., None], 0.7, axis=2)
-    voxel_map.integrate(frame(pose, seq=seq), depth, probabilities, label > 0)
+    shown = label == only if only else label > 0
+    depth = np.where(shown, depth, 0).astype(np.float32) if only else depth
+    voxel_map.integrate(frame(pose, seq=seq), depth, probabilities, shown, measured=measured)
 
 
 @cache

@@ -12,28 +12,20 @@ from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.queries.surface import cast_rays, points_in_box
-from tests.mapping.rendered_views import frame, small_map
-from tests.queries.scene import BALL, BOX, CUP, HALF, LABELS, TABLE, poses, seen, whole
+from tests.mapping.rendered_views import small_map
+from tests.queries.scene import BALL, BOX, CUP, HALF, LABELS, TABLE, integrate, poses, whole
 
 LOW, HIGH = (-1.0, -1.0, -1.0), (2.0, 1.0, 1.0)
 TABLE_TOP = BOX + np.array([0.0, 0.0, HALF[2]])
 
 
+@cache
 def part_measured() -> VoxelMap:
     """The known scene by computed depth, and by a sensor that saw nothing but the cup."""
-    return _part_measured()
-
-
-@cache
-def _part_measured() -> VoxelMap:
     voxel_map = small_map(LABELS)
     for seq, pose in enumerate(poses(14)):
-        depth, label = seen(pose)
-        votes = np.full((*depth.shape, len(LABELS)), 0.1, np.float32)
-        np.put_along_axis(votes, np.maximum(LABELS.to_channels(label), 0)[..., None], 0.7, axis=2)
-        voxel_map.integrate(frame(pose, seq=seq), depth, votes, label > 0, measured=False)
-        cup = np.where(label == CUP, depth, 0).astype(np.float32)
-        voxel_map.integrate(frame(pose, seq=seq), cup, votes, label == CUP)
+        integrate(voxel_map, pose, seq, measured=False)
+        integrate(voxel_map, pose, seq, only=CUP)
     return voxel_map
 
 
