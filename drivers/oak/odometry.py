@@ -108,17 +108,12 @@ class Odometry:
         self._poses.tryGetAll()  # a late answer to a pair that was given up
         for name, port in self._inputs.items():
             port.send(pair[name])
-        deadline = time.monotonic() + ANSWER_S
-        while not self._closed.is_set():
+        deadline, pose = time.monotonic() + ANSWER_S, None
+        while pose is None and not self._closed.is_set() and time.monotonic() < deadline:
             pose = take(self._poses, SLICE_S)
-            if pose is not None:
-                self._add(stamp_ns, pose)
-                return
-            if time.monotonic() > deadline:
-                self.trouble = f"odometry has not answered for {ANSWER_S:g} s: too few features, or a busy processor"
-                return
-
-    def _add(self, stamp_ns: int, pose: Any) -> None:
+        if pose is None:
+            self.trouble = f"odometry has not answered for {ANSWER_S:g} s: too few features, or a busy processor"
+            return
         t, q = pose.getTranslation(), pose.getQuaternion()
         try:
             T_world_left = basalt_pose((t.x, t.y, t.z), (q.qx, q.qy, q.qz, q.qw))

@@ -169,12 +169,9 @@ def test_a_camera_that_stands_before_a_blank_wall_stays_but_is_not_sure() -> Non
     assert np.allclose(found[-1].T_world_camera, found[0].T_world_camera, atol=1e-3)
 
 
-def test_a_camera_without_depth_is_refused_with_the_ways_out() -> None:
+def test_a_camera_without_depth_and_another_in_between_are_refused() -> None:
     with pytest.raises(CameraError, match=r"has no depth.*scale.*kind = \"topic\".*kind = \"device\""):
         OdometryPoseSource(CONFIG).pose(images.image(5, depth=False))
-
-
-def test_another_camera_or_size_in_between_is_refused() -> None:
     source = OdometryPoseSource(CONFIG)
     first = as_image(walk()[0])
     source.pose(first)

@@ -9,7 +9,7 @@ from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import VisualPoses, begins_world
 from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 from semantic_mapper.drivers.poses.visual import VisualPoseSource, two_views
-from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import look_at, project
 from semantic_mapper.nodes.camera.live import with_poses
@@ -142,13 +142,6 @@ def test_a_camera_that_only_turns_or_sees_one_plane_begins_no_world(rng: np.rand
     points[:, 2] = 2 + 0.3 * points[:, 0]
     wall = project(points, INTRINSICS), project(points - (0.3, 0.0, 0.0), INTRINSICS)
     assert two_views(*wall, INTRINSICS) is None
-
-
-def test_another_camera_in_between_is_refused() -> None:
-    source = VisualPoseSource(CONFIG)
-    source.pose(as_image(walk()[0]))
-    with pytest.raises(CameraError, match="a pose source of its own"):
-        source.pose(replace(as_image(walk()[1]), camera_id="other"))
 
 
 def test_settings_make_the_source_and_what_its_scale_comes_from() -> None:
