@@ -54,8 +54,7 @@ def find_features(rgb: UInt8, depth_m: Float32, count: int) -> Features:
 def find_place_features(rgb: UInt8, depth_m: Float32, count: int, width: int = 320) -> Features:
     """The strongest ``count`` SIFT features of an image, made ``width`` pixels wide where it is wider, and their depth.
 
-    Descriptors are RootSIFT in bytes. Pixels are those of ``rgb``, as big as ``depth_m``.
-    """
+    Descriptors are RootSIFT in bytes. Pixels are those of ``rgb``, as big as ``depth_m``."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, width / gray.shape[1])
     if scale < 1:
@@ -72,8 +71,7 @@ def find_place_features(rgb: UInt8, depth_m: Float32, count: int, width: int = 3
 def match_features(ours: UInt8, theirs: UInt8) -> Matches:
     """Pairs of alike descriptors (M, 2) int64, as (number of ours, number of theirs), each in one pair at most.
 
-    Of ORB the mutually nearest ones; of SIFT those whose second nearest is clearly further off.
-    """
+    Of ORB the mutually nearest ones; of SIFT those whose second nearest is clearly further off."""
     if len(ours) < 2 or len(theirs) < 2:
         return np.zeros((0, 2), np.int64)
     if ours.shape[1] != _SIFT_LENGTH:
@@ -98,8 +96,7 @@ def pose_from_points(
 ) -> tuple[Float64, Matches] | None:
     """Pose of a camera that sees points (M, 3) at pixels (M, 2): ``T_points_camera`` (4, 4), and which ones agree (K,).
 
-    None where fewer than ``min_inliers`` do.
-    """
+    None where fewer than ``min_inliers`` do."""
     if len(points) < max(min_inliers, _LEAST):
         return None
     found, turn, shift, inliers = cv2.solvePnPRansac(
@@ -128,8 +125,7 @@ def pose_from_features(
 ) -> tuple[Float64, int] | None:
     """Where the camera was in the axes of another image, ``T_other_camera`` (4, 4), and how many features say so.
 
-    The depth of the other image alone is used. None where fewer than ``min_matches`` features agree.
-    """
+    The depth of the other image alone is used. None where fewer than ``min_matches`` features agree."""
     deep = np.flatnonzero(other.depth_m > 0)
     if len(deep) < min_matches or len(image.pixels) < min_matches:
         return None

@@ -202,10 +202,8 @@ class Relocalizer:
         measured = depth > 0
         both = measured & (view.depth_m > 0)
         agreeing = both & _depth_agrees(depth, view.depth_m)
-        gray, theirs = (
-            np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
-            for image in (cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), view.rgb)
-        )
+        small_rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        gray, theirs = (np.asarray(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), np.uint8) for i in (small_rgb, view.rgb))
         return _Tried(
             guess,
             landmarks,
@@ -223,8 +221,7 @@ class Relocalizer:
     ) -> Float64 | None:
         """The pose near a guess at which the depth fits the map's ray cast best, point to plane, (4, 4).
 
-        Landmarks hold it where surfaces leave it free to slide. None where that leads away from the guess.
-        """
+        Landmarks hold it where surfaces leave it free to slide. None where that leads away from the guess."""
         points = unproject(depth_m, small).reshape(-1, 3)
         points = points[points[:, 2] > 0]
         points = points[:: max(1, len(points) // _POINTS)]

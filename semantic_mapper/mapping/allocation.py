@@ -57,10 +57,8 @@ def blocks_in_band(
 ) -> Int64:
     """Packed keys (B,) of the blocks that rays cross within ``truncation_m`` of their depth, sorted, each once.
 
-    Raises:
-        FrameError: the camera stands so far from the origin that block coordinates overflow, a ray would cross more
-            than ``MAX_CROSSINGS`` blocks, or all rays together more than ``budget``.
-    """
+    ``FrameError``: the camera stands so far from the origin that block coordinates overflow, a ray would cross more
+    than ``MAX_CROSSINGS`` blocks, or all rays together more than ``budget``."""
     block_m = voxel_size_m * BLOCK_SIDE
     slope = _steepest(camera, depth_m.shape)
     reach = float(np.abs(camera.t).max()) + slope * (depth_max_m + truncation_m)
@@ -107,8 +105,7 @@ def blocks_in_view(camera: Camera, size: tuple[int, int], keys: Int32, voxel_siz
 
     ``size`` is (height, width) of the image, which may be a small part of one far from the optical axis. A block counts
     whose bounding sphere touches the frustum; the sphere is that of the block and a voxel more on each side, for a
-    point between two blocks is interpolated from both.
-    """
+    point between two blocks is interpolated from both."""
     side, radius = voxel_size_m * BLOCK_SIDE, _block_radius_m(voxel_size_m)
     p = ((keys + 0.5) * side - camera.t) @ camera.R
     z = p[:, 2]
@@ -153,6 +150,5 @@ def _collect_block_keys(
     """Packed keys of the blocks of each of the ``bands`` that an image is cut into.
 
     ``slots`` (bands, 2 * capacity) of -1 is scratch, a hash set; ``keys`` (bands, capacity) are filled in no order,
-    each once; ``counts`` (bands,) are more than the capacity, a power of two, where there is no room for all.
-    """
+    each once; ``counts`` (bands,) are more than the capacity, a power of two, where there is no room for all."""
     ...

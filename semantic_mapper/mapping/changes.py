@@ -121,12 +121,8 @@ def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, Packed
 
 
 def oldest_first(versions: Int64, limit: int, newest: int) -> tuple[Int64, int]:
-    """Which of the changed blocks (B,) come first: whole versions, at least one, and else at most ``limit`` blocks (0 =
-    all).
-
-    Returns:
-        Their positions, ascending, and the version that they complete; ``newest`` is the map's.
-    """
+    """Which of the changed blocks (B,) come first: positions, ascending, of whole versions, at least one, and else at
+    most ``limit`` blocks (0 = all); and the version that they complete. ``newest`` is the map's."""
     if not limit or len(versions) <= limit:
         return np.arange(len(versions)), newest
     distinct, counts = np.unique(versions, return_counts=True)

@@ -62,8 +62,7 @@ class DepthBounds(NamedTuple):
     """Least and greatest depth of parts of an image that is cut into square cells, for any square at once.
 
     The least depth of a square of pixels is the least of four entries, whatever its size: those of the largest square
-    of 2^level cells a side that fits, put into each of its corners.
-    """
+    of 2^level cells a side that fits, put into each of its corners."""
 
     # (levels, h, w) float32 metres: of the 2^level x 2^level cells from each one on; inf where there is no depth. No
     # levels: nothing is to be cleared.

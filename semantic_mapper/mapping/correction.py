@@ -2,20 +2,17 @@
 
 A pose graph gives new poses for its keyframes alone. A frame between two of them in time moves with both: with C_a and
 C_b the motions ``T_new @ T_old^-1`` of its neighbours and s the part of the time between them, its rotation is turned
-by the rotation s of the way from R_a to R_b (slerp), and its position p goes to ``(1 - s) C_a p + s C_b p``. Blending
-where the two motions take the camera, not their translations, makes the result the same wherever the world's origin is:
-blended translations would be off by (turn)^2 / 8 times the distance to the origin. A frame before the first given one
+by the rotation s of the way from R_a to R_b (slerp), and its position p goes to ``(1 - s) C_a p + s C_b p``: blended
+translations would be off by (turn)^2 / 8 times the distance to the world's origin. A frame before the first given one
 moves with the first. A frame after the last moves with it only where the caller says so (``until_ns``).
 
 The map is built again from a snapshot of itself and the frames that were fused since, which are kept on disk, lossless:
 with the same poses it is the same map, bit for bit. The rebuild goes on in batches, between steps or from another
-thread, next to the map in use, which it replaces once it has caught up. Class probabilities are not rendered again:
-they came from source views near the frame in time, and a correction changes where these are relative to each other far
-less than where all of them are in the world.
+thread, next to the map in use, which it replaces once it has caught up. Class probabilities are not rendered again: a
+correction changes where frames near in time are relative to each other far less than where all are in the world.
 
 Frames are kept in two halves of ``history.max_frames`` each. When the newer one is full, the older one leaves, and the
-snapshot that was made between them is the one that rebuilds begin with. So corrections reach at least one half back.
-"""
+snapshot that was made between them is the one that rebuilds begin with. So corrections reach at least one half back."""
 
 from __future__ import annotations
 
@@ -151,17 +148,13 @@ class _Rebuild:
 class MapCorrector:
     """The history of a map, and the rebuild that is under way, if one is. Safe to call from several threads.
 
+    ``lock`` is held by a step, by a frame of a rebuild, and where the maps are exchanged: one at a time.
+
     Args:
         config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
         voxel_map, keyframes: In use; move with their frames at the end of a rebuild.
         fuse: Integrates a frame of the history and its rendered view (h, w) into the map given.
         on_move: Called when a correction begins, and when the map has moved.
-
-    Attributes:
-        lock: Held by a step, by a frame of a rebuild, and where the maps are exchanged: one at a time.
-
-    Raises:
-        MapError: no file can be made in the system's folder for temporary files.
     """
 
     def __init__(
@@ -231,8 +224,7 @@ class MapCorrector:
     def make_room(self) -> None:
         """Make a snapshot where a half of the history is full, before a step.
 
-        During a rebuild, which may still need all frames, none leaves, but the step continues it, so that it ends.
-        """
+        During a rebuild, which may still need all frames, none leaves, but the step continues it, so that it ends."""
         if self._scratch is None:
             return
         try:
@@ -311,12 +303,8 @@ class MapCorrector:
 
     def advance(self, max_frames: int = 1) -> bool:
         """Continue a rebuild by this many frames, from any thread, and exchange the maps where it has caught up;
-        whether it still runs.
-
-        Raises:
-            MapError: the corrected map cannot be built (too large, or a frame out of reach of any voxel, say); the
-                correction is given up, the map in use stays as it is.
-        """
+        whether it still runs. ``MapError``: the corrected map cannot be built (too large, or a frame out of reach of
+        any voxel, say); the correction is given up, the map in use stays as it is."""
         for _ in range(max_frames):
             with self.lock:  # let go after every frame: a step may wait for it
                 rebuild = self._rebuild

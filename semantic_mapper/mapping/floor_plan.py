@@ -114,7 +114,6 @@ def occupancy_grid(
     """Make the plan of a map's surface points; see the head of this file for what its values mean.
 
     Args:
-        points: Of the map.
         up: (3,) unit vector, up in the world.
         resolution_m: Side of a cell; below the map's voxel size, walls would have holes.
         height_m: LOW and HIGH above the floor, 0 < LOW < HIGH.

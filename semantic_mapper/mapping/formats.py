@@ -1,15 +1,14 @@
 """A map as files of other programs: PLY, OBJ and GLB (surface), NPZ (points), PGM and YAML (floor plan).
 
-Files hold the world frame, in metres unless they say "scale: unknown". Of PLY, ``comment label 3 chair`` says what the
-id 3 of the property ``label`` means; names are ASCII with Python's escapes, which
-``name.encode().decode("unicode_escape")`` reads. Where depth was computed somewhere, PLY and NPZ have ``measured``: 0
-there, 1 where a sensor measured the surface.
+Files hold the world frame, in metres unless they say "scale: unknown"; one that cannot be written is a ``MapError``. Of
+PLY, ``comment label 3 chair`` says what the id 3 of the property ``label`` means; names are ASCII with Python's
+escapes, which ``name.encode().decode("unicode_escape")`` reads. Where depth was computed somewhere, PLY and NPZ have
+``measured``: 0 there, 1 where a sensor measured the surface.
 
 GLB (glTF 2.0) is right-handed with y up. Vertices keep the coordinates of the world; the mesh's node holds the rotation
-that takes the world's up to +y, so that viewers show the map upright and programs find world coordinates. Vertex
-attributes: POSITION; COLOR_0 (linear light, as glTF asks, 16 bits so that sRGB's 8 survive); _LABEL (uint8 class id,
-each padded to four bytes as glTF asks); _CONFIDENCE (float). ``extras.label_set`` of the mesh says what the ids mean.
-"""
+that takes the world's up to +y. Vertex attributes: POSITION; COLOR_0 (linear light, as glTF asks, 16 bits so that
+sRGB's 8 survive); _LABEL (uint8 class id, each padded to four bytes as glTF asks); _CONFIDENCE (float).
+``extras.label_set`` of the mesh says what the ids mean."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ from semantic_mapper.files import atomic_write
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
-from semantic_mapper.types import Float32, Float64, UInt8
+from semantic_mapper.types import Float64, UInt8
 
 ColorBy = Literal["rgb", "class", "confidence"]
 SurfaceT = TypeVar("SurfaceT", MapPoints, MapMesh)
@@ -57,13 +56,11 @@ def colored(surface: SurfaceT, label_set: LabelSet, by: ColorBy) -> SurfaceT:
     """The surface with other colours: the camera's, those of the classes, or dark (0) to bright (1) for confidence."""
     if by == "rgb":
         return surface
-    rgb = label_set.colorize(surface.label) if by == "class" else _confidence_colors(surface.confidence)
-    return dataclasses.replace(surface, rgb=rgb)
-
-
-def _confidence_colors(confidence: Float32) -> UInt8:
+    if by == "class":
+        return dataclasses.replace(surface, rgb=label_set.colorize(surface.label))
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
-    return np.asarray(table, np.uint8)[np.rint(confidence * 255).astype(np.uint8)]
+    rgb = np.asarray(table, np.uint8)[np.rint(surface.confidence * 255).astype(np.uint8)]
+    return dataclasses.replace(surface, rgb=rgb)
 
 
 MAX_NAME = 200  # characters of a class name in a comment
@@ -72,11 +69,7 @@ _PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 
 
 def write_ply(path: Path, surface: MapPoints | MapMesh, label_set: LabelSet, *, scale_known: bool = True) -> None:
-    """Write points or a mesh as binary little-endian PLY: x y z red green blue label confidence, lists of vertices.
-
-    Raises:
-        MapError: the file cannot be written.
-    """
+    """Write points or a mesh as binary little-endian PLY: x y z red green blue label confidence, lists of vertices."""
     mesh = surface if isinstance(surface, MapMesh) else None
     xyz = surface.xyz if isinstance(surface, MapPoints) else surface.vertices
     columns = dict(zip(("x", "y", "z"), xyz.astype("<f4").T, strict=True))
@@ -116,17 +109,13 @@ def write_obj(
 
     OBJ knows neither units nor an up axis: vertices are in the world frame, metres, to the micrometre. Each has its
     colour behind its position (``v x y z r g b``), as most programs read it. A face is of the class that most of its
-    corners are of (the first one's where all differ); material ``ID_NAME`` stands for a class, ``ID_unknown`` for none.
-    Materials have the colours of their classes with ``class_materials``; else they are white, so that programs which
-    multiply both show the colours of the vertices.
-
-    Raises:
-        MapError: a file cannot be written.
-    """
+    corners are of; material ``ID_NAME`` stands for a class, ``ID_unknown`` for none. Materials have the colours of
+    their classes with ``class_materials``; else they are white, for programs which multiply both."""
     library = path.with_suffix(".mtl")
     names = {i: _material(i, name) for i, name in zip(label_set.ids, label_set.names, strict=True)}
     names[label_set.ignore_id] = _material(label_set.ignore_id, "unknown")
-    label = _face_labels(mesh)
+    a, b, c = mesh.label[mesh.faces].T
+    label = np.where(b == c, b, a).astype(np.uint8)  # the first one where all three differ
     used = np.unique(label)
     with atomic_write(library, raises=MapError) as file:
         for class_id in used.tolist():
@@ -145,12 +134,6 @@ def write_obj(
     return path, library
 
 
-def _face_labels(mesh: MapMesh) -> UInt8:
-    """Class id of each face, (F,) uint8: that of most corners, of the first one where all three differ."""
-    a, b, c = mesh.label[mesh.faces].T
-    return np.where(b == c, b, a).astype(np.uint8)
-
-
 def _material(class_id: int, name: str) -> str:
     """Names of materials end at white space, and programs differ in which letters they know."""
     return f"{class_id}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}"
@@ -161,14 +144,10 @@ _VERTICES, _INDICES = {"target": 34962}, {"target": 34963}  # what a part of the
 
 
 def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, scale_known: bool = True) -> None:
-    """Write a mesh with at least one face (glTF has no empty ones) as GLB: a header, a chunk of JSON, a chunk of
-    numbers.
+    """Write a mesh with at least one face (glTF has no empty ones) as GLB; ``up`` (3,) is a unit vector, up in the
+    world.
 
-    ``up`` (3,) is a unit vector, up in the world.
-
-    Raises:
-        MapError: no faces, more than 4 GiB, or the file cannot be written.
-    """
+    ``MapError``: no faces, more than 4 GiB, or the file cannot be written."""
     if not len(mesh.faces):
         raise MapError(f"{path}: glTF cannot hold a mesh without faces")
     labels = np.zeros((len(mesh.label), 4), np.uint8)
@@ -212,9 +191,7 @@ def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, sc
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + starts[-1]
     if total > 2**32 - 1:
-        raise MapError(
-            f"{path}: {total / 2**30:.1f} GiB are more than a GLB can hold; choose ply-mesh or larger voxels"
-        )
+        raise MapError(f"{path}: {total / 2**30:.1f} GiB are too many for a GLB; choose ply-mesh or larger voxels")
     with atomic_write(path, raises=MapError) as file:
         file.write(struct.pack("<4sII", b"glTF", 2, total))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
@@ -235,13 +212,9 @@ def _linear_color(rgb: UInt8) -> NDArray[np.uint16]:
 def write_npz(path: Path, points: MapPoints, label_set: LabelSet, *, scale_known: bool = True) -> None:
     """Write xyz (N, 3) float32 metres in the world, rgb (N, 3) uint8, label (N,) uint8, confidence (N,) float32.
 
-    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale,
-    "unknown". Of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id,
-    label_set (its name).
-
-    Raises:
-        MapError: the file cannot be written.
-    """
+    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale, "unknown".
+    Of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id, label_set (its
+    name)."""
     measured = {} if points.measured is None or points.measured.all() else {"measured": points.measured}
     with atomic_write(path, raises=MapError) as file:
         np.savez_compressed(

@@ -72,12 +72,8 @@ class FrameDepth:
         """Take a frame; the frames that are ready, oldest first. One whose depth is computed may wait for later ones.
 
         A frame that has a spread of its depth, as it was here before or as its log has it, is left as it is; with
-        ``source`` "sensor" or "off" its depth is left out.
-
-        Raises:
-            FrameError: a picture that would spoil the map; see ``PictureCheck``. The next frame is welcome.
-            PoseError: the pose is not a rigid transform.
-        """
+        ``source`` "sensor" or "off" its depth is left out. ``FrameError``: a picture that would spoil the map; see
+        ``PictureCheck``."""
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
         if frame.depth_sigma_m is not None:

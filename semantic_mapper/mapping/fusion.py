@@ -1,16 +1,14 @@
 """Fusion of one frame in one compiled pass over the blocks it touches: TSDF, colour and class evidence together.
 
-TSDF and colour are the running means of Open3D's ``integrate``. Class evidence is the sum over frames of
-``w * log p`` at the pixel a voxel projects to: one vote a voxel a frame, only near the surface, where the field
-knows. ``w`` (0..1) trusts near and frontal looks more; see ``make_votes``.
+TSDF and colour are the running means of Open3D's ``integrate``. Class evidence is the sum over frames of ``w * log p``
+at the pixel a voxel projects to: one vote a voxel a frame, only near the surface, where the field knows. ``w`` (0..1)
+trusts near and frontal looks more; see ``make_votes``.
 
 Depth of a sensor weighs ``MEASURED`` in the TSDF. Computed depth (from the pictures, or rendered by a field) weighs at
-most ``COMPUTED_LOOK``, and all of it together at most ``COMPUTED_CAP``: so one measurement outweighs it, and the weight
-of a voxel says whether its surface was measured (from ``MEASURED`` on) or computed. Computed depth never changes what
-was measured.
+most ``COMPUTED_LOOK``, and all of it together at most ``COMPUTED_CAP``: so the weight of a voxel says whether its
+surface was measured (from ``MEASURED`` on). Computed depth never changes what was measured.
 
-The kernels (``fusion.c``) depend on no order among threads, so a frame gives the same bits every time.
-"""
+The kernels (``fusion.c``) depend on no order among threads, so a frame gives the same bits every time."""
 
 from __future__ import annotations
 
@@ -193,8 +191,7 @@ def _vote_weights(
     """Weigh votes (H, W): |cos| of the angle between ray and surface normal, from four neighbours, times nearness.
 
     ``proper`` (K,) is of ``_log_probability_rows``; ``bad`` (H,) is filled with the known pixels of each row of the
-    image whose probabilities are not proper.
-    """
+    image whose probabilities are not proper."""
     ...
 
 

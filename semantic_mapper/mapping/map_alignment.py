@@ -103,8 +103,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
 def _refine(voxel_map: VoxelMap, other: VoxelMap, T_map_other: Float64) -> Float64:
     """Fit the surfaces of two maps: ICP of points to planes, with Tukey's weights.
 
-    Single views leave 0.1 to 0.3 degrees, which is centimetres at the far end of a building.
-    """
+    Single views leave 0.1 to 0.3 degrees, which is centimetres at the far end of a building."""
     open3d = load_open3d()
     registration = open3d.pipelines.registration
     voxel_m = voxel_map.config.voxel_size_m

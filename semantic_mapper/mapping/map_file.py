@@ -143,16 +143,10 @@ def parse_manifest(content: bytes, where: str) -> MapManifest:
 def write_map(
     path: Path, manifest: MapManifest, parts: Iterable[BlockPart], places: Sequence[Place] = ()
 ) -> MapManifest:
-    """Write a map, replacing a file of that name in one step; returns the manifest as written.
-
-    Args:
-        manifest: Settings, classes and counters; what depends on the blocks is filled in here.
-        parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
-        places: What the map is found again by.
-
-    Raises:
-        MapError: the file cannot be written; one that was there before is untouched.
-    """
+    """Write a map, replacing a file of that name in one step; returns the manifest as written, with what depends on the
+    blocks filled in. ``parts`` are blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest;
+    ``places`` are what the map is found again by. ``MapError``: it cannot be written; a file that was there before
+    is untouched."""
     chunks: list[MapChunk] = []
     corners: list[Int32] = []
     try:
@@ -182,22 +176,15 @@ def write_map(
 
 
 def describe_map(path: Path) -> MapManifest:
-    """What a saved map says of itself; its blocks are not read, and not checked.
-
-    Raises:
-        MapError: no such file, not a map, of another format version, or damaged where it says this.
-    """
+    """What a saved map says of itself, without its blocks; ``MapError`` where it is missing, damaged or of another
+    format."""
     with open_map(path) as reader:
         return reader.manifest
 
 
 @contextmanager
 def open_map(path: Path) -> Iterator[MapReader]:
-    """Open a saved map to be read chunk by chunk.
-
-    Raises:
-        MapError: see ``describe_map``.
-    """
+    """Open a saved map to be read chunk by chunk; ``MapError`` as of ``describe_map``."""
     try:
         file = open_regular(path)
     except FileNotFoundError as error:
@@ -237,11 +224,7 @@ class MapReader:
             del values  # while the next ones are read
 
     def changes(self) -> BlockChanges:
-        """What ``VoxelMap.changes(0)`` of the loaded map gives, in memory for the result and one chunk.
-
-        Raises:
-            MapError: a chunk is damaged, or there is no memory.
-        """
+        """What ``VoxelMap.changes(0)`` of the loaded map gives, in memory for the result and one chunk."""
         saved, config = self.manifest, self.manifest.config
         decision = Decision(config.vote_discount, config.unknown_below, SURFACE_WEIGHT)
         try:

@@ -41,13 +41,9 @@ class FrozenMap:
         grid.watchers.append(self._copy)
 
     def write(self, path: Path, between: Callable[[], object] = lambda: None) -> None:
-        """Write a map file, whole or not at all, in memory for ``CHUNK_BLOCKS``; closes this.
-
-        ``between`` is called after every ``CHUNK_BLOCKS``, without the lock; an error of its own ends the writing.
-
-        Raises:
-            MapError: the file cannot be written, or the disk fails; a file that was there before is as it was.
-        """
+        """Write a map file, whole or not at all, in memory for ``CHUNK_BLOCKS``; closes this. ``between`` is called
+        after each of them, without the lock; an error of its own ends the writing. ``MapError``: the file cannot be
+        written, or the disk fails; a file that was there before is as it was."""
         try:
             manifest = write_map(path, self.manifest, self.parts(between, last=True), self.places)
         finally:
@@ -57,9 +53,7 @@ class FrozenMap:
 
     def parts(self, between: Callable[[], object] = lambda: None, *, last: bool = False) -> Iterator[BlockPart]:
         """All blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time; copies go as they are read where it is the
-        ``last`` time.
-
-        ``MapError``: the disk is full or fails, or has failed."""
+        ``last`` time."""
         for start in range(0, len(self._keys), CHUNK_BLOCKS):
             packed = self._keys[start : start + CHUNK_BLOCKS]
             with self._lock:

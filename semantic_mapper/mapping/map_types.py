@@ -81,8 +81,7 @@ class MapPoints:
 class MapMesh:
     """The fused surface as V vertices (V, 3), float32 metres in the world, and F faces (F, 3), int32 vertex indices.
 
-    The rest is that of the vertices, as of ``MapPoints``.
-    """
+    The rest is that of the vertices, as of ``MapPoints``."""
 
     vertices: Float32
     faces: NDArray[np.int32]

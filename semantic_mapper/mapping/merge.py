@@ -47,10 +47,8 @@ def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapCo
     """Refuse maps of another voxel size or other classes (their colours and the set's name do not matter):
     ``MapError``."""
     if config_a.voxel_size_m != config_b.voxel_size_m:
-        raise MapError(
-            f"maps of different voxel_map.voxel_size_m ({config_a.voxel_size_m:g} and {config_b.voxel_size_m:g}) "
-            "cannot be merged; make one of them again from its log with the setting of the other"
-        )
+        sizes = f"{config_a.voxel_size_m:g} and {config_b.voxel_size_m:g}"
+        raise MapError(f"maps of different voxel_map.voxel_size_m ({sizes}) cannot be merged; make one of them again")
     a, b = (set(zip(labels.ids, labels.names, strict=True)) for labels in (labels_a, labels_b))
     if a != b or labels_a.ids != labels_b.ids or labels_a.ignore_id != labels_b.ignore_id:
         differing = ", ".join(f"{i} {name}" for i, name in sorted(a ^ b)) or "their order, or the ignore id"

@@ -95,11 +95,7 @@ class MovingSpace:
 
 class MovingFilter:
     """Finds what moves, for one map; ``pixels`` were left out so far, ``space`` is where that was within the last
-    second.
-
-    Raises:
-        ConfigError: ``moving.classes``, and none of the classes does.
-    """
+    second. ``ConfigError``: ``moving.classes``, and none of the classes moves."""
 
     def __init__(self, config: MapperConfig, label_set: LabelSet) -> None:
         self._config = config.moving
@@ -209,7 +205,11 @@ class MotionDetector:
             self.poses_fit = self._is_steady(frame.camera_id, aligned.moved)
         if self.poses_fit and views and (cells.inside > 0).any():
             free, seen = _seen_before(frame, cells, views)
-            moving = _filled(_grown(_without_specks(free), cells.inside, ~(free | seen)), cells.inside)
+            _, labels, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=8)
+            large = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= LEAST_CELLS
+            large[0] = False  # what is not free
+            grown = _grown(large[np.asarray(labels, np.int64)], cells.inside, ~(free | seen))
+            moving = _filled(grown, cells.inside)
         last = max((v.stamp_ns for v in kept if v.camera_id == frame.camera_id), default=None)
         if last is None or frame.stamp_ns // _EVERY_NS > last // _EVERY_NS:  # whichever frame was the first one
             self._views.append(_view(frame, cells))
@@ -266,15 +266,9 @@ def _intrinsics(frame: PosedFrame, size: int) -> tuple[tuple[float, float], tupl
 def _view(frame: PosedFrame, cells: _Cells) -> SeenView:
     near = np.where(cells.full, cells.near, 0).astype(np.float32)
     around = cv2.erode(near, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
-    return SeenView(
-        frame.camera_id,
-        frame.stamp_ns,
-        invert_pose(frame.T_world_camera),
-        *_intrinsics(frame, cells.size),
-        cells.near,
-        np.asarray(around, np.float32),
-        depth_slopes(cells.inside),
-    )
+    lens, around = _intrinsics(frame, cells.size), np.asarray(around, np.float32)
+    T_camera_world, slopes = invert_pose(frame.T_world_camera), depth_slopes(cells.inside)
+    return SeenView(frame.camera_id, frame.stamp_ns, T_camera_world, *lens, cells.near, around, slopes)
 
 
 def _seen_before(frame: PosedFrame, cells: _Cells, views: list[SeenView]) -> tuple[Bool, Bool]:
@@ -296,13 +290,6 @@ def _seen_before(frame: PosedFrame, cells: _Cells, views: list[SeenView]) -> tup
         if frame.stamp_ns - view.stamp_ns >= SURE_S * _SECOND:
             seen[v[at], u[at]] |= np.abs(view.near[there] - depth) <= margin
     return free, seen
-
-
-def _without_specks(found: Bool) -> Bool:
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
-    large = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= LEAST_CELLS
-    large[0] = False
-    return large[np.asarray(labels, np.int64)] if count > 1 else np.zeros_like(found)
 
 
 def _grown(moving: Bool, depth: Float32, unknown: Bool) -> Bool:

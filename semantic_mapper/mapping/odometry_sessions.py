@@ -1,9 +1,8 @@
 """Frames of other odometry sessions, brought into the map's world.
 
 A camera that tracks itself begins its world where it starts: after it was unplugged, or in another launch, its poses
-say nothing of where it is in the map. Its frames are held until they are found there (``localization.relocalizer``),
-each by itself, and several agree with each other and with the camera's own motion between them. Then they are mapped,
-and those after them.
+say nothing of where it is in the map. Its frames are held until several of them are found there
+(``localization.relocalizer``), each by itself, and agree with each other and with the camera's own motion between them.
 """
 
 from __future__ import annotations

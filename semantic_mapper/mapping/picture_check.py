@@ -49,12 +49,8 @@ SENTENCES = PICTURE_SENTENCES | {
 
 
 class PictureCheck:
-    """Judges the pictures of all cameras as they come; changes nothing.
-
-    Attributes:
-        checked: Pictures that were judged.
-        counters: Pictures by what was wrong; the names are those of ``SENTENCES``.
-    """
+    """Judges the pictures of all cameras as they come; changes nothing. ``checked`` pictures were judged, ``counters``
+    are pictures by what was wrong, by the names of ``SENTENCES``."""
 
     def __init__(self) -> None:
         self._cameras: OrderedDict[str, _CameraCheck] = OrderedDict()

@@ -103,12 +103,8 @@ class MappingPipeline:
     def step(self, frame: PosedFrame) -> MapUpdate:
         """Render the semantics of one frame, fuse it, and maybe keep it as a source view.
 
-        A frame whose depth is to be computed gets it from those before it; see ``prepare``.
-
-        Raises:
-            FrameError, PoseError: the frame cannot be used. The map is unchanged and the next frame is welcome.
-            ConfigError: ``depth.from_motion.delay_frames`` is not 0, and the frame does not come from ``prepare``.
-        """
+        ``FrameError`` or ``PoseError``: the frame cannot be used; the map is unchanged and the next frame is welcome.
+        ``ConfigError``: ``depth.from_motion.delay_frames`` is not 0, and the frame does not come from ``prepare``."""
         frame = self.frame_depth.give(frame)
         with self.corrector.lock:
             self.corrector.make_room()
@@ -127,14 +123,11 @@ class MappingPipeline:
             return self._update(views.frame, view, full, sources, is_keyframe, touched)
 
     def prepare(self, frame: PosedFrame) -> list[PosedFrame]:
-        """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first.
+        """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first. One frame
+        each, unless ``depth.from_motion.delay_frames`` lets frames wait for later ones.
 
-        One frame each, unless ``depth.from_motion.delay_frames`` lets frames wait for later ones.
-
-        Raises:
-            FrameError: its picture cannot be mapped, such as a dark or blurred one; see ``picture_check``.
-            PoseError: the pose is not a rigid transform.
-        """
+        ``FrameError``: its picture cannot be mapped, such as a dark or blurred one; see ``picture_check``.
+        ``PoseError``: the pose is not a rigid transform."""
         return self.frame_depth.push(frame)
 
     def prepare_rest(self) -> list[PosedFrame]:
@@ -166,12 +159,8 @@ class MappingPipeline:
 
     def exchange_field(self, field: SemanticField, anchors: Sequence[Keyframe]) -> None:
         """Go on with other weights, which encode as the present ones do; what is in the map stays, with its weight.
-
-        Anchors of ``encode_anchor`` take the place of those of the weights before.
-
-        Raises:
-            WeightsError: it renders other classes than the map holds; nothing has changed.
-        """
+        Anchors of ``encode_anchor`` take the place of those before. ``WeightsError``: it renders other classes;
+        nothing has changed."""
         check_classes(field, self.label_set)
         self.field = self._renderer.field = field
         self.keyframes.exchange_labelled(anchors)
@@ -288,8 +277,7 @@ class MappingPipeline:
     def _depth_prior(self, views: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast.
 
-        Nowhere, without a sensor, for a field that holds the scene: it knows better.
-        """
+        Nowhere, without a sensor, for a field that holds the scene: it knows better."""
         frame, depth = views.frame, views.depth(intrinsics)
         if self._holds_scene and not is_measured(frame):
             return np.zeros_like(depth)

@@ -55,28 +55,22 @@ def _in_metres(T: Float64) -> Float64:
 
 
 # What is often wrong with a recording, as the change that would fix it.
-_CAUSES: tuple[tuple[str, Callable[[Float64], Float64], np.float32], ...] = (
-    ("poses inverted (they are T_camera_world; T_world_camera is needed)", invert_pose, np.float32(1.0)),
-    ("camera axes turned from OpenGL's (y up, z backward) to OpenCV's", lambda T: T @ _OPENGL, np.float32(1.0)),
-    (
-        "camera axes turned from a robot's (REP 103: x forward, y left, z up) to OpenCV's",
-        lambda T: T @ _REP_103,
-        np.float32(1.0),
-    ),
-    ("translations divided by 1000 (they are millimetres)", _in_metres, np.float32(1.0)),
-    ("depth divided by 5 (scale 5000, not 1000)", lambda T: T, np.float32(0.2)),
-    ("depth multiplied by 5 (scale 1000, not 5000)", lambda T: T, np.float32(5.0)),
+_CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
+    ("poses inverted (they are T_camera_world; T_world_camera is needed)", invert_pose, 1.0),
+    ("camera axes turned from OpenGL's (y up, z backward) to OpenCV's", lambda T: T @ _OPENGL, 1.0),
+    ("camera axes turned from a robot's (REP 103: x forward, y left, z up) to OpenCV's", lambda T: T @ _REP_103, 1.0),
+    ("translations divided by 1000 (they are millimetres)", _in_metres, 1.0),
+    ("depth divided by 5 (scale 5000, not 1000)", lambda T: T, 0.2),
+    ("depth multiplied by 5 (scale 1000, not 5000)", lambda T: T, 5.0),
 )
 
 
 class PoseCheck:
     """Compares keyframes as they come; changes nothing. Depth beyond ``FAR`` times the map's range is not compared.
 
-    Attributes:
-        compared: Keyframes that overlap with earlier ones and were compared.
-        worst, worst_contradicting: Largest ``recent`` and ``contradicting`` so far; None before ``MIN_KEYFRAMES``.
-        warning: What is wrong and how to fix it; empty where all is well. Stays, as the map keeps what was fused.
-    """
+    Of keyframes, ``compared`` overlap with earlier ones; ``worst`` and ``worst_contradicting`` are the largest
+    ``recent`` and ``contradicting`` so far. ``warning`` says what is wrong and how to fix it, empty where all is well;
+    it stays, as the map keeps what was fused."""
 
     def __init__(self, depth_max_m: float) -> None:
         self._limit_m = FAR * depth_max_m
@@ -147,7 +141,8 @@ class PoseCheck:
             )
         needed = ALIKE * _overlap(own, self._limit_m)
         best, least = "", min(MAX_DISAGREEMENT, recent) / 2
-        for cause, change, factor in _CAUSES:
+        for cause, change, depth_factor in _CAUSES:
+            factor = np.float32(depth_factor)
             changed = [replace(k, T_world_camera=change(k.T_world_camera), depth_m=k.depth_m * factor) for k in own]
             pairs = [disagreement([pair], self._limit_m) for pair in pairwise(changed)]
             singles = [d for d in pairs if d is not None]
@@ -199,8 +194,7 @@ def _oldest_neighbours(new: Keyframe, keyframes: Sequence[Keyframe], but: Sequen
 
 def _differences(a: Keyframe, b: Keyframe, limit_m: float) -> tuple[Float64, int]:
     """Depth of ``a``, carried into ``b``, less the depth that ``b`` has there, (N,) as fractions of the depth of
-    ``b``; and how many pixels of ``a`` were carried.
-    """
+    ``b``; and how many pixels of ``a`` were carried."""
     depth = a.depth_m[::STEP, ::STEP].astype(np.float64)
     row, column = np.nonzero((depth > 0) & (depth < limit_m))
     z, k = depth[row, column], a.intrinsics

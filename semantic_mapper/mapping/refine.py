@@ -46,8 +46,7 @@ class UpFrame(NamedTuple):
 class SurfaceVoxels(NamedTuple):
     """Voxels near the surface in some blocks: block (N, 3) and voxel (N,) of each, and what the network takes of them.
 
-    ``core`` (N,) are so near the surface that they make up the cells.
-    """
+    ``core`` (N,) are so near the surface that they make up the cells."""
 
     key: Int32
     at: Int64

@@ -135,9 +135,8 @@ def add_own_image(view: RenderedView, field: SemanticField, current: EncodedView
 class RateController:
     """Trades rays, then samples, for a target rate: at most this ``fraction`` of the pixels, and these samples.
 
-    What a frame takes is modelled as a part that does not depend on rays, and a cost a ray and sample; both are
-    followed from frame to frame. What it chooses depends on the machine, so a map made with it is not reproducible.
-    """
+    What a frame takes is modelled as a part that does not depend on rays, and a cost a ray and sample, both followed
+    from frame to frame. What it chooses depends on the machine, so a map made with it is not reproducible."""
 
     def __init__(self, target_hz: float, fraction: float, sampling: SamplingConfig) -> None:
         self._budget_ms = RESERVE * 1e3 / target_hz
@@ -184,9 +183,6 @@ def upsample(
 
     Returns:
         (H, W) int32 number of the coarse pixel (row * w + column), -1 where none of the nine is known.
-
-    Raises:
-        ShapeError: arrays that do not fit together.
     """
     sizes = expect_shape(probabilities, "h w L", "coarse probabilities")
     coarse = f"{sizes['h']} {sizes['w']}"

@@ -64,8 +64,7 @@ def cast_view(
     """See the map through a camera, up to ``depth_max_m`` away: depth (H, W), 0 = miss, and the rest.
 
     What it may see and is on disk comes back into memory; where there is no room for all of it, for a part of the image
-    after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)
-    """
+    after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)"""
     size = (intrinsics.height, intrinsics.width)
     depth, seen = np.zeros(size, np.float32), _empty_readout(size)
     lengths = config.voxel_size_m, config.truncation_voxels, config.depth_max_m
@@ -112,8 +111,7 @@ def surface_voxels(keys: Int32, blocks: Int32, grid: BlockGrid, min_weight: floa
     """Zero crossings along voxel edges, (N, 3) float64 in units of voxels, in the order of the blocks to look at.
 
     ``keys`` (B, 3) are their coordinates, ``blocks`` (B,) their buffer indices; both ends of an edge need
-    ``min_weight``.
-    """
+    ``min_weight``."""
     keys, blocks, buffers = np.ascontiguousarray(keys), np.ascontiguousarray(blocks), grid.buffers()
     starts = np.zeros(len(blocks) + 1, np.int64)
     _count_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, starts[1:])
@@ -126,8 +124,7 @@ def surface_voxels(keys: Int32, blocks: Int32, grid: BlockGrid, min_weight: floa
 def triangle_mesh(tile: Int32, grid: BlockGrid, voxel_size_m: float, min_weight: float) -> tuple[Float32, Int32]:
     """Marching cubes over the cells of sorted blocks (B, 3): vertices (V, 3) in metres, faces (F, 3), in a fixed order.
 
-    Cells reach into the next blocks, so those are copied, too.
-    """
+    Cells reach into the next blocks, so those are copied, too."""
     wanted = np.unique(pack_keys((tile[:, None] + NEIGHBOURS).reshape(-1, 3)))
     found, buffers = find_blocks(grid.index, wanted), grid.buffers()
     keys, source = unpack_keys(wanted[found >= 0]), found[found >= 0]

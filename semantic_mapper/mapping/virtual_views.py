@@ -4,8 +4,7 @@ A candidate stands where a keyframe stood, or a step to its side in air that a k
 surface that is in need of class votes (``surface_patches``). Its score is the need of what it sees, weighted by how
 many keyframes see that, too, and by its nearness, as votes are. What was looked at once is not looked at again.
 
-A rendered view measures nothing: TSDF, colour and weight stay as they are, to the bit, and no block is added.
-"""
+A rendered view measures nothing: TSDF, colour and weight stay as they are, to the bit, and no block is added."""
 
 from __future__ import annotations
 
@@ -74,12 +73,10 @@ def surface_patches(voxel_map: VoxelMap) -> SurfacePatches:
     config = voxel_map.config
     with voxel_map.locked() as grid:
         keys, blocks = grid.sorted_blocks()
-        near = SURFACE_VOXELS / config.truncation_voxels
+        near, count = SURFACE_VOXELS / config.truncation_voxels, np.zeros(len(blocks), np.int64)
         total, need = np.zeros((len(blocks), 3)), np.zeros(len(blocks))
-        count = np.zeros(len(blocks), np.int64)
-        _sum_surface_patches(
-            len(blocks), keys, blocks, grid.buffers(), near, config.vote_discount, MAX_VOTES, total, need, count
-        )
+        limits = near, config.vote_discount, MAX_VOTES
+        _sum_surface_patches(len(blocks), keys, blocks, grid.buffers(), *limits, total, need, count)
     has = count > 0
     xyz = total[has] / count[has, None] * config.voxel_size_m
     return SurfacePatches(pack_keys(keys[has]), xyz, need[has])
@@ -96,8 +93,7 @@ class VirtualView(NamedTuple):
 class ViewpointChooser:
     """Chooses virtual views of one map, each of something else.
 
-    Deterministic: the same map, keyframes, seed and number of choices before give the same view.
-    """
+    Deterministic: the same map, keyframes, seed and number of choices before give the same view."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
@@ -110,8 +106,7 @@ class ViewpointChooser:
     ) -> VirtualView | None:
         """The viewpoint of most gain for a camera, to be rendered from keyframes; None where none has enough of it.
 
-        After a new ``epoch`` of the map all of it may be looked at again.
-        """
+        After a new ``epoch`` of the map all of it may be looked at again."""
         if voxel_map.epoch != self._epoch:
             self._looked_at, self._epoch = np.empty(0, np.int64), voxel_map.epoch
         if len(keyframes) < LEAST_KEYFRAMES:
@@ -150,7 +145,7 @@ def _worth_a_look(patches: SurfacePatches, keyframes: Sequence[Keyframe], looked
     count = np.zeros(len(points), np.int64)
     for k in keyframes:
         near = ((points - k.T_world_camera[:3, 3]) ** 2).sum(1) < FARTHEST_M**2
-        count += near & visible_points(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=True)
+        count += near & _is_seen(points, k)
     seen = np.minimum(count, ENOUGH_KEYFRAMES) / ENOUGH_KEYFRAMES
     need = np.where(count >= LEAST_KEYFRAMES, seen * patches.need[fresh], 0)
     some = np.sort(np.argsort(-need, kind="stable")[:PATCHES])
@@ -163,13 +158,7 @@ def _candidates(patches: SurfacePatches, keyframes: Sequence[Keyframe], rng: np.
     poses: list[Float64] = []
     for target in _targets(patches):
         distance = [float(np.linalg.norm(k.T_world_camera[:3, 3] - target)) for k in keyframes]
-        seeing = [
-            i
-            for i in np.argsort(distance, kind="stable")
-            if visible_points(
-                target[None], keyframes[i].T_world_camera, keyframes[i].intrinsics, keyframes[i].depth_m, measured=True
-            )[0]
-        ]
+        seeing = [i for i in np.argsort(distance, kind="stable") if _is_seen(target[None], keyframes[i])[0]]
         for i in seeing[:EYES]:
             at = keyframes[i].T_world_camera[:3, 3]
             aside = at + rng.normal(0, STEP_M, (STEPS_ASIDE, 3))
@@ -179,6 +168,10 @@ def _candidates(patches: SurfacePatches, keyframes: Sequence[Keyframe], rng: np.
                 if NEAREST_M <= far <= FARTHEST_M and abs((target - eye) @ up) < ALONG_UP * far:
                     poses.append(look_at(eye, target, up))
     return poses
+
+
+def _is_seen(points: Float64, k: Keyframe) -> Bool:
+    return visible_points(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=True)
 
 
 def _targets(patches: SurfacePatches) -> Float64:
@@ -197,10 +190,8 @@ def _targets(patches: SurfacePatches) -> Float64:
 
 def _promising(poses: list[Float64], patches: SurfacePatches, intrinsics: CameraIntrinsics) -> list[Float64]:
     """Those of most gain if nothing hid anything, the best first."""
-    gain = np.zeros(len(poses))
-    for i, pose in enumerate(poses):
-        p = transform(invert_pose(pose), patches.xyz)
-        gain[i] = (nearest_pixels(p, intrinsics)[0] * _worth(p[:, 2], patches)).sum()
+    seen = [transform(invert_pose(pose), patches.xyz) for pose in poses]
+    gain = np.array([(nearest_pixels(p, intrinsics)[0] * _worth(p[:, 2], patches)).sum() for p in seen])
     return [poses[i] for i in np.argsort(-gain, kind="stable")[:CASTS]]
 
 
@@ -232,8 +223,8 @@ def add_votes(
 ) -> int:
     """Give the map's surface the class votes of one view, one a voxel; nothing else of the map changes.
 
-    A vote weighs ``VOTE_WEIGHT`` times what that of a frame would (``fuse.make_votes``), and only voxels take it that
-    have fewer than ``MAX_VOTES``. ``frames`` does not count the view, ``version`` does.
+    A vote weighs ``VOTE_WEIGHT`` times what that of a frame would, and only voxels take it that have fewer than
+    ``MAX_VOTES``. ``frames`` does not count the view, ``version`` does.
 
     Args:
         T_world_camera, intrinsics: (4, 4) of the view, and of ``depth_m``.
@@ -242,10 +233,6 @@ def add_votes(
 
     Returns:
         Blocks that were given votes to, or would have been had they had voxels near the surface.
-
-    Raises:
-        PoseError, ShapeError, FrameError: the view cannot be used; the map is as it was.
-        MapError: the disk fails.
     """
     where = "votes without a frame"
     check_pose(T_world_camera, where)
@@ -277,9 +264,8 @@ def _sum_surface_patches(
     need: Float64,
     count: Int64,
 ) -> None:
-    """Sums over the surface voxels of ``blocks_count`` blocks: keys (B, 3), buffer indices (B,).
+    """Sums over the surface voxels, of a TSDF up to ``near``, of blocks with keys (B, 3) and buffer indices (B,).
 
-    ``near`` is the largest TSDF of voxels of the surface. To fill, of zeros: ``total`` (B, 3) of positions in voxels,
-    ``need`` (B,) as of ``SurfacePatches``, ``count`` (B,) of voxels.
+    To fill, of zeros: ``total`` (B, 3) of positions in voxels, ``need`` (B,) as of ``SurfacePatches``, ``count`` (B,).
     """
     ...

@@ -66,18 +66,13 @@ class VoxelMap:
 
     Deterministic: the same frames in the same order give the same ``block_state``, bit for bit. Safe to call from
     several threads: calls wait for each other, and the long ones leave the GIL to others. L = len(label_set) channels
-    of class evidence.
+    of class evidence. ``ConfigError``: no map can be built with ``config``; ``MapError``: there is no memory.
 
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
-    are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
-    where none did. ``places`` are views to find the map again by. ``cleared`` counts the voxels of surfaces that frames
-    saw through, and that were forgotten (``clear_free_space``), in this process.
-
-    Raises:
-        ConfigError: a value of ``config`` that no map can be built with.
-        MapError: there is no memory for ``initial_blocks``, or for ``memory_mb``.
-    """
+    are metres (``note_scale``), ``refined`` is the digest of the weights that refined the map, ``places`` are views to
+    find it again by, ``cleared`` counts voxels of surfaces that frames of this process saw through
+    (``clear_free_space``)."""
 
     def __init__(self, config: VoxelMapConfig, label_set: LabelSet) -> None:
         self._limits = make_limits(config)
@@ -100,8 +95,7 @@ class VoxelMap:
     def note_scale(self, known: bool) -> None:
         """Say whether poses and depths of the frames to come are in metres; a map with some that are not stays unknown.
 
-        Frames do not say it: their stream does (``StreamInfo.scale_known``).
-        """
+        Frames do not say it: their stream does (``StreamInfo.scale_known``)."""
         self.scale_known = self.scale_known and known
 
     @property
@@ -125,11 +119,8 @@ class VoxelMap:
 
         At most ``limit`` blocks (0 = all), those that have been waiting longest, but never less than one whole version
         (a frame; a loaded map is one version): who goes on asking with the version they got comes to the present map.
-        Voxels of less than ``min_weight`` count as not observed; 1 = only what was measured.
-
-        Raises:
-            MapError: ``since`` is not a version of this map, or a bad ``limit`` or ``min_weight``.
-        """
+        Voxels of less than ``min_weight`` count as not observed; 1 = only what was measured. ``MapError``: ``since`` is
+        not a version of this map, or a bad ``limit`` or ``min_weight``."""
         with _KERNEL_LOCK:
             return self._choose_changes(since, limit, min_weight).compact()
 
@@ -225,14 +216,11 @@ class VoxelMap:
             self.version = version
 
     def take_over(self, other: VoxelMap) -> None:
-        """Become ``other``, all at once for readers in other threads; ``other`` must not be used any more.
+        """Become ``other``, all at once for readers in other threads; ``other``, of the same config and classes (else
+        ``MapError``), must not be used any more.
 
         Every block counts as changed, and ``epoch`` goes up: blocks that ``other`` does not have are gone. For
-        ``changes`` with a limit, ``version`` grows by one for each ``BLOCKS_A_VERSION`` of them.
-
-        Raises:
-            MapError: the other map has another config or other classes.
-        """
+        ``changes`` with a limit, ``version`` grows by one for each ``BLOCKS_A_VERSION`` of them."""
         if (other.config, other.label_set) != (self.config, self.label_set):
             raise MapError("a map can only take over one of the same config and label set")
         with _KERNEL_LOCK:
@@ -289,10 +277,8 @@ class VoxelMap:
     def block_state(self, keys: Int32 | None = None) -> dict[str, NDArray[np.generic]]:
         """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
 
-        Returns:
-            keys (B, 3) int32, in lexicographic order where none were given; tsdf, weight, votes (B, 8, 8, 8), color
-            (B, 8, 8, 8, 3) float32 and evidence (B, 8, 8, 8, L) as it is stored, voxels in the order [z][y][x].
-        """
+        keys (B, 3) int32, in lexicographic order where none were given; tsdf, weight, votes (B, 8, 8, 8), color (B, 8,
+        8, 8, 3) float32 and evidence (B, 8, 8, 8, L) as it is stored, voxels in the order [z][y][x]."""
         with _KERNEL_LOCK:
             keys = self._grid.all_keys() if keys is None else keys
             values = self._grid.read(pack_keys(keys))
@@ -330,15 +316,9 @@ class VoxelMap:
     def load(cls, path: Path, memory_mb: int | None = None, config: VoxelMapConfig | None = None) -> VoxelMap:
         """Read a saved map; it is the saved one bit for bit and can go on integrating.
 
-        Args:
-            path: What ``save`` wrote.
-            memory_mb: In place of the saved setting, for a machine with less memory, say; 0 = no limit.
-            config: In place of all saved settings.
-
-        Raises:
-            ConfigError: ``config`` has voxels of another size.
-            MapError: no such file, not a map, of another format version, or damaged (and what is).
-        """
+        ``memory_mb`` stands in place of the saved setting, for a machine with less memory, say; 0 = no limit.
+        ``config``, of voxels of the same size (else ``ConfigError``), stands in place of all settings. ``MapError``: no
+        such file, not a map, of another format version, or damaged (and what is)."""
         with open_map(path) as reader:
             saved = reader.manifest
             config = config or saved.config
@@ -352,10 +332,7 @@ class VoxelMap:
                 loaded = cls(config, saved.label_set)
                 loaded._grid.reserve(saved.blocks)
             except (ConfigError, MapError) as error:
-                raise MapError(
-                    f"{path}: the saved configuration cannot be used: {error}. Where memory is short, load with a "
-                    "memory_mb of your own"
-                ) from error
+                raise MapError(f"{path}: cannot be used: {error}; where memory is short, give memory_mb") from error
             loaded._begin_with(saved, reader.parts(), reader.places())
         return loaded
 
@@ -380,12 +357,9 @@ class VoxelMap:
         """Add all that another map, which lies at ``T_self_other`` (4, 4) in this one, has measured; see ``merge``.
 
         Where voxels coincide (no rotation but quarter turns, a shift by whole voxels) measurements add up exactly; else
-        those of ``other`` are interpolated. After an error of the disk the map holds a part of ``other``.
-
-        Raises:
-            MapError: the maps do not fit each other, have places of the same frames, only one is in metres, or this
-                one would grow past ``max_blocks``.
-        """
+        those of ``other`` are interpolated. After an error of the disk the map holds a part of ``other``. ``MapError``:
+        the maps do not fit each other, have places of the same frames, only one is in metres, or this one would grow
+        past ``max_blocks``."""
         check_pose(T_self_other, "merge")
         check_fit(self.config, self.label_set, other.config, other.label_set)
         if self.frames:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
-from semantic_mapper.geometry import rotation_vector
+from semantic_mapper.geometry import make_pose, rotation_vector
 from semantic_mapper.localization.relocalizer import Sighting, agreed, find_consensus, sighting
 from semantic_mapper.types import Float64
 
 
 def pose(x: float, y: float = 0.0, turn: float = 0.0) -> Float64:
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(np.array([0, turn, 0.0]))[0]
-    T[:3, 3] = x, y, 0
-    return T
+    return make_pose((0.0, turn, 0.0), (x, y, 0.0))
 
 
 def seen_at(step: float, off: Float64) -> Sighting:

@@ -112,14 +112,3 @@ def test_points_and_rays_of_thinned_images_are_those_of_the_whole() -> None:
         depth = thin_depth(frame.depth_m, stride, 100.0)
         assert depth.shape == (small.height, small.width)
         assert np.allclose(unproject(depth, small), whole[stride // 2 :: stride, stride // 2 :: stride], atol=1e-5)
-
-
-def test_normals_are_those_of_the_surface() -> None:
-    """A plane, aslant."""
-    normal = np.array((0.3, -0.4, -1.0)) / np.linalg.norm((0.3, -0.4, -1.0))
-    rays = unproject(np.ones((120, 160), np.float32), INTRINSICS)
-    depth = (-2.0 / (rays @ normal)).astype(np.float32)
-    for level in make_levels(depth, INTRINSICS, 2):
-        known = np.isfinite(level.normals[..., 0])
-        assert known.mean() > 0.8
-        assert np.abs(level.normals[known] @ normal).min() > 0.999

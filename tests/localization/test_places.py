@@ -1,9 +1,14 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
+import pytest
+from msgspec.structs import replace as with_settings
 
+from semantic_mapper.config import KeyframeConfig, MapperConfig
+from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.localization.features import (
     Features,
@@ -12,7 +17,10 @@ from semantic_mapper.localization.features import (
     pose_from_features,
     pose_from_points,
 )
-from semantic_mapper.localization.places import rank_places
+from semantic_mapper.localization.places import Place, PlaceStore, rank_places
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.map_file import describe_map
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.drawn_room import walk_frames
 
@@ -52,3 +60,53 @@ def test_images_without_features_match_nothing() -> None:
     assert rank_places(flat, {0: features_of(walk()[0]).descriptors}, 3) == []
     same = np.tile([[0.1, 0.2, 1.0]], (12, 1))
     assert pose_from_points(same, np.tile([[92.7, 85.9]], (12, 1)), INTRINSICS, 12, 4.0) is None
+
+
+DEFAULTS = MapperConfig()
+
+
+def mapped(config: MapperConfig = DEFAULTS) -> VoxelMap:
+    mapper = Mapper.load(None, with_settings(config, voxel_map=with_settings(config.voxel_map, voxel_size_m=0.05)))
+    for frame in walk()[:3]:
+        mapper.step(frame)
+    return mapper.pipeline.voxel_map
+
+
+def test_a_map_keeps_its_places_in_its_file(tmp_path: Path) -> None:
+    voxel_map = mapped()
+    voxel_map.save(tmp_path / "map.npz")
+    again = VoxelMap.load(tmp_path / "map.npz").places.places
+    assert len(again) >= 2 and all(len(p.points) > 20 for p in again)
+    for a, b in zip(voxel_map.places.places, again, strict=True):
+        assert (a.camera_id, a.stamp_ns) == (b.camera_id, b.stamp_ns)
+        assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("T_world_camera", "points", "descriptors"))
+
+
+def test_a_map_may_keep_nothing_to_be_found_by(tmp_path: Path) -> None:
+    mapped(MapperConfig(keyframes=KeyframeConfig(save_places=False))).save(tmp_path / "map.npz")
+    assert describe_map(tmp_path / "map.npz").places is None
+    assert len(VoxelMap.load(tmp_path / "map.npz").places) == 0
+
+
+def test_places_that_are_no_poses_are_refused(tmp_path: Path) -> None:
+    voxel_map = mapped()
+    bad = voxel_map.places.places[0]
+    voxel_map.places.add(Place("c", 1, np.diag([2.0, 1, 1, 1]), bad.points, bad.descriptors))
+    voxel_map.save(tmp_path / "map.npz")
+    with pytest.raises(MapError, match="its places"):
+        VoxelMap.load(tmp_path / "map.npz")
+
+
+def test_a_full_store_lets_the_most_crowded_place_go() -> None:
+    store = PlaceStore(capacity=3)
+    for number, x in enumerate((0.0, 1.0, 1.3, 5.0)):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        assert store.wants(pose)
+        store.add(Place("c", number, pose, np.zeros((1, 3), np.float32), np.zeros((1, 128), np.uint8)))
+    assert [p.stamp_ns for p in store.places] == [0, 1, 3]
+    near = np.eye(4)
+    near[0, 3] = 0.1
+    assert not store.wants(near)
+    store.move({("c", 0): np.diag([-1.0, -1, 1, 1])})
+    assert store.places[0].T_world_camera[0, 0] == -1

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semantic_mapper.geometry import make_pose
 from semantic_mapper.mapping import clearing
 from semantic_mapper.mapping.clearing import depth_bounds
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -20,10 +21,7 @@ THING = (slice(90, 150), slice(120, 200))  # pixels
 
 
 def pose(x: float = 0.0, yaw: float = 0.0) -> Float64:
-    T = np.eye(4)
-    T[:3, :3] = [[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]]
-    T[0, 3] = x
-    return T
+    return make_pose((0.0, yaw, 0.0), (x, 0.0, 0.0))
 
 
 def wall(thing: bool = False) -> Float32:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import structlog
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 
 from semantic_mapper.errors import MapError, PoseError
 from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.geometry import make_pose
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction import ALWAYS, PoseCorrection, PosePair
 from semantic_mapper.mapping.pipeline import MappingPipeline
@@ -48,10 +48,7 @@ def finish(pipeline: MappingPipeline) -> None:
 def drift(fraction: float) -> Float64:
     """(4, 4) in the world: up to 9 cm and 4.5 degrees away from the truth."""
     turn = np.radians([1.0, -1.5 * np.cos(2 * fraction), 4.0]) * fraction
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(turn)[0]
-    T[:3, 3] = 0.06 * np.sin(2.5 * fraction), -0.05 * fraction, 0.04 * fraction**2
-    return T
+    return make_pose(turn, (0.06 * np.sin(2.5 * fraction), -0.05 * fraction, 0.04 * fraction**2))
 
 
 def drifted(frames: tuple[PosedFrame, ...]) -> list[PosedFrame]:
@@ -357,20 +354,13 @@ small = st.floats(-0.5, 0.5)
 vectors = st.tuples(small, small, small).map(np.array)
 
 
-def rigid(turn: np.ndarray, shift: np.ndarray) -> Float64:
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(np.asarray(turn, np.float64))[0]
-    T[:3, 3] = shift
-    return T
-
-
 def test_halfway_in_time_a_frame_turns_by_half_the_angle_and_goes_half_the_way() -> None:
     axis = np.array([0.0, 0.0, 1.0])
-    here = rigid(np.zeros(3), np.array([2.0, 0.0, 0.0]))
-    turned = here @ rigid(0.4 * axis, np.array([0.0, 0.1, 0.0]))
+    here = make_pose(np.zeros(3), np.array([2.0, 0.0, 0.0]))
+    turned = here @ make_pose(0.4 * axis, np.array([0.0, 0.1, 0.0]))
     correction = PoseCorrection([PosePair("a", 0, here, here.copy()), PosePair("a", 200, here, turned)], 200)
     placed = correction.place("a", 50, here)
-    np.testing.assert_allclose(placed[:3, :3], rigid(0.1 * axis, np.zeros(3))[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(placed[:3, :3], make_pose(0.1 * axis, np.zeros(3))[:3, :3], atol=1e-12)
     np.testing.assert_allclose(placed[:3, 3], [2.0, 0.025, 0.0], atol=1e-12)
     np.testing.assert_allclose(correction.place("rear", 200, here), turned, atol=1e-12)  # on the same body
     assert correction.place("a", 201, here) is here
@@ -380,9 +370,9 @@ def test_halfway_in_time_a_frame_turns_by_half_the_angle_and_goes_half_the_way()
 @given(vectors, vectors, vectors, vectors, st.floats(0.01, 0.99))
 def test_where_the_world_has_its_origin_makes_no_difference(turn_a, shift_a, turn_b, shift_b, fraction) -> None:
     """Blended translations would fail this: the far origin is a lever."""
-    motions = rigid(turn_a, shift_a), rigid(turn_b, shift_b)
-    poses = [rigid(np.array([0.1 * i, 0.2, -0.1 * i]), np.array([0.3 * i, 0.1, 1.0])) for i in range(3)]
-    far = rigid(np.array([0.3, -1.0, 0.5]), np.array([300.0, -200.0, 50.0]))
+    motions = make_pose(turn_a, shift_a), make_pose(turn_b, shift_b)
+    poses = [make_pose(np.array([0.1 * i, 0.2, -0.1 * i]), np.array([0.3 * i, 0.1, 1.0])) for i in range(3)]
+    far = make_pose(np.array([0.3, -1.0, 0.5]), np.array([300.0, -200.0, 50.0]))
 
     def placed(G: Float64) -> Float64:
         pairs = [PosePair("a", n * 10**9, G @ poses[n], G @ m @ poses[n]) for n, m in enumerate(motions)]

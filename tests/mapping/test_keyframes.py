@@ -3,6 +3,7 @@ import torch
 
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.geometry import make_pose
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore, pose_distances
 from semantic_mapper.types import CameraIntrinsics
 
@@ -14,11 +15,7 @@ NOTHING = EncodedViews(
 
 
 def pose(x: float = 0.0, yaw_deg: float = 0.0) -> np.ndarray:
-    a = np.radians(yaw_deg)
-    T = np.eye(4)
-    T[:3, :3] = [[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]
-    T[0, 3] = x
-    return T
+    return make_pose((0.0, np.radians(yaw_deg), 0.0), (x, 0.0, 0.0))
 
 
 def keyframe(seq: int, T: np.ndarray, labelled: bool = False, depth: np.ndarray = WALL) -> Keyframe:

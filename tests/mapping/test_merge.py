@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError, PoseError
-from semantic_mapper.geometry import invert_pose
+from semantic_mapper.geometry import invert_pose, make_pose
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping import merge
 from semantic_mapper.mapping.blocks import BlockValues, empty_blocks
@@ -32,15 +32,7 @@ def fuse_views(voxel_map: VoxelMap, views: range, T_map_world: Float64 | None = 
 
 
 def turned(angles_deg: tuple[float, float, float], shift: tuple[float, float, float]) -> Float64:
-    T = np.eye(4)
-    for axis, angle in enumerate(np.deg2rad(angles_deg)):
-        c, s = np.cos(angle), np.sin(angle)
-        i, j = ((1, 2), (2, 0), (0, 1))[axis]
-        R = np.eye(3)
-        R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
-        T[:3, :3] = R @ T[:3, :3]
-    T[:3, 3] = shift
-    return T
+    return make_pose(np.deg2rad(angles_deg), shift)
 
 
 def measured_blocks(voxel_map: VoxelMap) -> dict:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.geometry import make_pose
 from semantic_mapper.labels import KITTI360, ROOMS
 from semantic_mapper.mapping.moving import (
     SETTLED_S,
@@ -93,10 +93,7 @@ def corner(number: int, pose: Float64, thing_m: float | None = None) -> PosedFra
 
 
 def off_by(sigma_m: float, sigma_deg: float, rng: np.random.Generator) -> Float64:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(rng.normal(0, np.deg2rad(sigma_deg), 3)).as_matrix()
-    T[:3, 3] = rng.normal(0, sigma_m, 3)
-    return T
+    return make_pose(rng.normal(0, np.deg2rad(sigma_deg), 3), rng.normal(0, sigma_m, 3))
 
 
 @pytest.mark.parametrize(("sigma_m", "sigma_deg", "fit"), [(0.02, 0.5, True), (0.1, 3.0, False)])

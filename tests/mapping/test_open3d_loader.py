@@ -4,8 +4,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-from semantic_mapper.mapping.open3d_loader import preload_folder
-
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
@@ -26,11 +24,3 @@ def test_missing_system_library_is_named_with_the_mend(tmp_path: Path) -> None:
     )
     done = run_python(code, tmp_path)
     assert "libGL.so.1" in done.stdout and "make setup" in done.stdout and "apt-get install" in done.stdout, done.stderr
-
-
-def test_what_cannot_be_preloaded_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
-    assert preload_folder(tmp_path / "none") == []
-    (tmp_path / "deep").mkdir()
-    (tmp_path / "deep" / "libbroken.so.1").write_bytes(b"not a library")
-    failures = preload_folder(tmp_path)
-    assert len(failures) == 1 and failures[0].startswith("libbroken.so.1: ")

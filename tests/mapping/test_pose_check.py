@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
 from semantic_mapper.config import KeyframeConfig
-from semantic_mapper.geometry import invert_pose
+from semantic_mapper.geometry import invert_pose, make_pose
 from semantic_mapper.imaging import resize_depth, working_intrinsics
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.pipeline import COVERAGE_WIDTH
@@ -95,10 +94,7 @@ def test_a_good_recording_is_far_from_a_warning() -> None:
 
 def moved(x: float = 0.0, z: float = 0.0, turned_deg: float = 0.0) -> np.ndarray:
     """How the world is shifted (metres) and turned about its y axis, (4, 4)."""
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(np.array([0.0, np.radians(turned_deg), 0.0]))[0]
-    T[:3, 3] = x, 0, z
-    return T
+    return make_pose((0.0, np.radians(turned_deg), 0.0), (x, 0.0, z))
 
 
 def from_on(fraction: float, T: np.ndarray) -> Change:

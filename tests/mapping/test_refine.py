@@ -97,17 +97,12 @@ def test_the_file_says_by_what_it_was_refined_and_other_files_say_nothing(tmp_pa
 
 
 def test_what_cannot_be_refined_is_refused() -> None:
-    with pytest.raises(MapError, match="empty"):
-        check_refinable(VoxelMap(VoxelMapConfig(), ROOMS))
-    with pytest.raises(MapError, match="too coarse"):
-        check_refinable(make_map(voxel_size_m=0.08))
     unknown = make_map()
     unknown.note_scale(False)
-    with pytest.raises(MapError, match="not metres"):
-        check_refinable(unknown)
-
-
-def test_weights_of_other_classes_are_refused_with_both_sets() -> None:
+    empty = VoxelMap(VoxelMapConfig(), ROOMS)
+    for voxel_map, why in ((empty, "empty"), (make_map(voxel_size_m=0.08), "too coarse"), (unknown, "not metres")):
+        with pytest.raises(MapError, match=why):
+            check_refinable(voxel_map)
     with pytest.raises(WeightsError, match=r"'rooms'.*'nyu40'.*--by-name"):
         refine(make_map(), random_weights(NYU40), up=UP)
     with pytest.raises(WeightsError, match="no class alike"):

@@ -7,9 +7,6 @@ import pytest
 import torch
 
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.fields.streaming import StreamingSRay
-from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.rendering import (
     COLOUR_RATE,
     DEPTH_SIGMA,
@@ -21,7 +18,6 @@ from semantic_mapper.mapping.rendering import (
     add_own_image,
     upsample,
 )
-from tests.small import tiny_config, tiny_field, tiny_frames
 
 
 def spoken_by(v, u, p, known, rgb_low, depth_low, rgb, depth):
@@ -113,21 +109,6 @@ def test_both_opinions_are_joined_as_their_geometric_mean_where_the_view_is_know
     np.testing.assert_allclose(found.probabilities[known], expected[known], atol=1e-5)
     np.testing.assert_array_equal(found.probabilities[~known], view_p.astype(np.float32)[~known])
     assert found.probabilities.dtype == np.float32
-
-
-def test_the_map_takes_it_in_unless_the_frame_is_no_source_or_its_weight_is_nothing() -> None:
-    frames = tiny_frames(2)
-
-    def map_of(**keyframes: object):
-        pipeline = MappingPipeline(tiny_config(keyframes=keyframes), StreamingSRay(tiny_field()), ROOMS)
-        confidence = np.stack([pipeline.step(frame).confidence for frame in frames])
-        return pipeline.voxel_map.block_state()["evidence"], confidence
-
-    (with_own, said), (without, said_without) = map_of(), map_of(own_image_weight=0.0)
-    assert np.abs(with_own - without).max() > 0.01
-    assert np.median(np.abs(said - said_without)) < 1e-6  # frames are labelled by the rendered view alone
-    novel = [map_of(use_current_view=False, own_image_weight=weight)[0] for weight in (0.0, 0.5)]
-    np.testing.assert_array_equal(*novel)
 
 
 PIXELS = 19_200
