@@ -86,9 +86,7 @@ def replay_log(
 
     Args:
         log: The log, a folder with the parts of a recording, or these parts.
-        out: Folder for the results.
         weights: None = those that ship with the package.
-        config: Of the mapper.
         max_frames: 0 = all.
         rerun: Where to write a Rerun recording.
         corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
@@ -163,14 +161,14 @@ def evaluate_log(
 ) -> Evaluation:
     """Score a log with several methods.
 
+    Computed depth never waits for later frames, since scores are of frames as they come.
+
     Args:
         log: The log, or a folder with the parts of a recording.
         weights: None = those that ship with the package.
-        config: Of the mapper; computed depth never waits for later frames, since scores are of frames as they come.
         max_frames: 0 = all.
         baseline_s: Also fit the baselines to the keyframes of the weights, the U-Net for so long; 0 = no baselines.
         instances: Folder with images of the frames' true objects; None = things are not scored.
-        monitor: Gets the progress.
 
     Raises LogError, LabelError, WeightsError: nothing can be scored.
     """
@@ -266,13 +264,10 @@ def refine_map(
     """Relabel a saved map by its shape, colour and votes, into a new one.
 
     Args:
-        path: Saved map.
-        out: Map to write.
         weights: Of a network, or ``smoothed``; None = those that ship, or smoothing for a map of other classes.
         fill: Surface without votes gets a class that is at least so likely; 1 = never.
         up: Up in the world: ``auto``, an axis, or three numbers.
         by_name: Whether weights of other classes are matched by the names of these.
-        monitor: Gets the progress.
 
     Raises ConfigError: ``up`` is no direction, or the new map cannot be written there. MapError, WeightsError: map and
     weights cannot be read, or do not go together.

@@ -105,13 +105,9 @@ class LatencyHistogram:
 class MapSession:
     """Feeds frames to the pipeline, keeps count, and scores against labels where the stream has them.
 
-    Args:
-        bundle: From ``Mapper.load``.
-        stream_labels: Label set of the frames' label images; None where they have none.
-        source: Name of the log or stream, for the summary.
-        scale_known: Whether its lengths are metres.
-        rerun: Gets every frame, what was rendered for it, and the map at the end; see ``open_recording``.
-        own_first: See ``OdometrySessions``; False where the map was there before the stream.
+    ``stream_labels`` are the classes of the frames' label images; None where they have none. ``source`` names the log
+    or stream in the summary. ``rerun`` gets every frame, what was rendered for it, and the map at the end.
+    ``own_first`` (of ``OdometrySessions``) is False where the map was there before the stream.
     """
 
     def __init__(
@@ -130,12 +126,9 @@ class MapSession:
         self.source = source
         self.odometry_sessions = OdometrySessions(self.pipeline, own_first=own_first)
         self.exclude_stamps = bundle.checkpoint.train_stamps_ns
-        self.published = 0
-        self.fused = 0
-        self.dropped = 0
+        self.published = self.fused = self.dropped = 0
         self.unreadable = 0  # refused by the player of a log; they never came here
-        self.scored = 0
-        self.excluded = 0
+        self.scored = self.excluded = 0
         self.pseudo_labelled = 0  # frames whose labels a field has rendered; they are no truth
         self.corrected_poses = 0  # given; the map has moved with them
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
@@ -206,7 +199,10 @@ class MapSession:
             self.stage_ms.setdefault(name, LatencyHistogram()).add(value)
         self.fused += int(update.fused)
         self._note_depth(frame)
-        self._note_scene(update)
+        # How much weights of one scene know of it: weights of another scene cannot be recognised otherwise.
+        known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
+        self._known.append(known)
+        self.outside += known < MOSTLY
         frame = self.pipeline.corrector.place(frame)  # where the map has it
         self._keep_snapshot(self._score(frame, update), update)
         if self.rerun is not None:
@@ -233,27 +229,6 @@ class MapSession:
                 _log.warning("depth_is_computed", seq=frame.seq, reason="the frame has no sensor depth")
             self.computed_depth += 1
             self.too_little_motion += not frame.depth_m.any()
-
-    def _note_scene(self, update: MapUpdate) -> None:
-        """How much of a frame weights of one scene know: weights of another scene cannot be recognised otherwise."""
-        known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
-        self._known.append(known)
-        self.outside += known < MOSTLY
-
-    def _scene_summary(self) -> dict[str, Any]:
-        """Of weights of one scene that know classes: what they know of the frames."""
-        model = self.bundle.checkpoint.model
-        mapped = len(self._known)
-        if not (model.holds_scene and model.knows_classes and mapped):
-            return {}
-        if self.outside > MOSTLY * mapped:
-            _log.warning(
-                "scene_unknown",
-                frames=self.outside,
-                of=mapped,
-                reason="the weights know less than half of these frames: made for another scene or world frame",
-            )
-        return {"scene": {"known": round(sum(self._known) / mapped, 4), "frames_outside": self.outside}}
 
     def refuse(self, seq: int, stamp_ns: int, reason: str) -> None:
         """Count a frame that was damaged before it could be processed."""
@@ -286,7 +261,13 @@ class MapSession:
 
     def more_summary(self) -> dict[str, Any]:
         """What only some summaries say: of weights of one scene, of odometry sessions found in the map."""
-        sessions, found = self.odometry_sessions, self._scene_summary()
+        sessions, found = self.odometry_sessions, dict[str, Any]()
+        model, mapped = self.bundle.checkpoint.model, len(self._known)
+        if model.holds_scene and model.knows_classes and mapped:
+            found["scene"] = {"known": round(sum(self._known) / mapped, 4), "frames_outside": self.outside}
+            if self.outside > MOSTLY * mapped:
+                reason = "the weights know less than half of these frames: made for another scene or world frame"
+                _log.warning("scene_unknown", frames=self.outside, of=mapped, reason=reason)
         if sessions.found or sessions.refused:
             found["relocalization"] = {"sessions_found": sessions.found, "looks_refused": dict(sessions.refused)}
         return found

@@ -11,7 +11,8 @@ from __future__ import annotations
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import json
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -71,9 +72,12 @@ class Checkpoint:
 COMPUTED_DEPTH = Path("rooms-computed-depth")  # names the weights that ship for cameras without a depth sensor
 
 
+SHIPPED = Path(str(resources.files("semantic_mapper"))) / "weights"
+
+
 def default_checkpoint_path() -> Path:
     """The small checkpoint that ships with the package."""
-    return _shipped() / "rooms.safetensors"
+    return SHIPPED / "rooms.safetensors"
 
 
 def find_checkpoint(path: Path) -> Path:
@@ -83,12 +87,8 @@ def find_checkpoint(path: Path) -> Path:
 
 def shipped_checkpoint(name: Path) -> Path | None:
     """Weights that ship with the package under a name; None where they are missing."""
-    named = _shipped() / f"{name}.safetensors"
+    named = SHIPPED / f"{name}.safetensors"
     return named if name.parent == Path() and named.exists() else None
-
-
-def _shipped() -> Path:
-    return Path(str(resources.files("semantic_mapper"))) / "weights"
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -> None:
@@ -105,13 +105,13 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
 def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
     """The weights file of a checkpoint; ``half`` as of ``save_checkpoint``.
     Raises SafetensorError: tensors that the format does not know."""
-    half = half or checkpoint.model.stored_in_half
-    # Running variances span more powers of ten than float16 has.
-    tensors = {
-        f"model.{name}": _stored(t, half and "running_" not in name)
-        for name, t in checkpoint.model.state_dict().items()
-    }
     model = checkpoint.model
+    tensors = {f"model.{name}": t.detach().cpu().contiguous() for name, t in model.state_dict().items()}
+    if half or model.stored_in_half:
+        for name, tensor in tensors.items():
+            # Not poses (float64), which it would move, nor running variances, which span more powers of ten.
+            if tensor.is_floating_point() and tensor.dtype != torch.float64 and "running_" not in name:
+                tensors[name] = tensor.half()
     metadata = describe(model.kind, model.config, model.label_set, checkpoint.recipe)
     if checkpoint.anchors:
         anchor_tensors, metadata["anchors"] = _pack_anchors(checkpoint.anchors)
@@ -132,8 +132,7 @@ def describe(kind: str, config: Config, label_set: LabelSet, recipe: dict[str, A
 
 
 def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[str, str]) -> None:
-    """``safetensors.save_file``, whole or not at all, with the mode that any new file has.
-    Raises SafetensorError: tensors that the format does not know. OSError: it cannot be written."""
+    """``safetensors.save_file``, whole or not at all. Raises SafetensorError, OSError: it cannot be written."""
     write_bytes(path, save(tensors, metadata))
 
 
@@ -142,7 +141,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config."""
     path = find_checkpoint(path)
     tensors, metadata = open_weights(path)
-    try:
+    with refusing_damage(path):
         label_set = unpack_label_set(metadata["label_set"])
         recipe = _checked_recipe(json.loads(metadata["recipe"]))
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
@@ -150,11 +149,18 @@ def load_checkpoint(path: Path) -> Checkpoint:
         if kind == MAP_KIND:
             raise ValueError("they refine saved maps (`refine --weights`) and label no frames")
         model = build_field(kind, json.loads(metadata["model_config"]), label_set)
+    load_tensors(model, {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")}, path)
+    return Checkpoint(model.eval(), anchors, recipe)
+
+
+@contextmanager
+def refusing_damage(path: Path) -> Generator[None]:
+    """Meanwhile the metadata of a file is read. Raises WeightsError: it is damaged."""
+    try:
+        yield
     except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:MESSAGE]
         raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
-    load_tensors(model, {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")}, path)
-    return Checkpoint(model.eval(), anchors, recipe)
 
 
 def load_tensors(model: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
@@ -173,10 +179,11 @@ def load_tensors(model: nn.Module, tensors: dict[str, torch.Tensor], path: Path)
 def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     """Tensors and metadata of a weights file of this project, of any kind, joined with those of its base.
     Raises WeightsError: missing, damaged, of another format or version, or its base is."""
-    if path.exists() and not path.is_file():
-        raise WeightsError(f"{path}: is no regular file; copy its content to one")
-    if not path.exists():
-        raise WeightsError(f"{path}: no such weights file; make one with `semantic-mapper finetune` or check the path")
+    if not path.is_file():
+        raise WeightsError(
+            f"{path}: no such weights file; check the path, or make one with `semantic-mapper finetune` (to refine maps "
+            f"`semantic-mapper-research train --kind {MAP_KIND}`)"
+        )
     try:
         with safe_open(path, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
@@ -249,8 +256,8 @@ def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
     return replace(
         frame,
         rgb=resize_rgb(frame, intrinsics),
-        depth_m=None if frame.depth_m is None else _rounded(resize_depth(frame, intrinsics)),
-        depth_sigma_m=None if spread is None else _rounded(spread),
+        depth_m=None if frame.depth_m is None else _depth_from_units(_depth_to_units(resize_depth(frame, intrinsics))),
+        depth_sigma_m=None if spread is None else _depth_from_units(_depth_to_units(spread)),
         label=None if frame.label is None else resize_label(frame.label, intrinsics),
         label_is_pseudo=False,
         world=0,
@@ -268,22 +275,12 @@ def _checked_recipe(recipe: Any) -> dict[str, Any]:
     return recipe
 
 
-def _stored(tensor: torch.Tensor, half: bool) -> torch.Tensor:
-    tensor = tensor.detach().cpu().contiguous()
-    # Poses are float64, which float16 would move.
-    return tensor.half() if half and tensor.is_floating_point() and tensor.dtype != torch.float64 else tensor
-
-
 def _depth_to_units(depth_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.rint(np.clip(depth_m, 0, 65535 / DEPTH_UNITS_PER_M) * DEPTH_UNITS_PER_M).astype(np.uint16)
 
 
 def _depth_from_units(units: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return units.astype(np.float32) / np.float32(DEPTH_UNITS_PER_M)
-
-
-def _rounded(depth_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    return _depth_from_units(_depth_to_units(depth_m))
 
 
 def _pack_anchors(anchors: Sequence[PosedFrame]) -> tuple[dict[str, torch.Tensor], str]:

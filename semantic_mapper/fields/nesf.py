@@ -29,13 +29,14 @@ from numpy.typing import NDArray
 from torch import nn
 
 from semantic_mapper.config import AtLeastOne, Config, convert_config
-from semantic_mapper.errors import SemanticMapperError, WeightsError
+from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import (
     MAP_KIND,
     describe,
     find_checkpoint,
     load_tensors,
     open_weights,
+    refusing_damage,
     save_tensors,
     unpack_label_set,
 )
@@ -95,17 +96,13 @@ def cell_levels(cells: NDArray[np.int64], count: int) -> tuple[CellLevel, ...]:
     ``cells``: (N, 3) of the finest, unique and in lexicographic order; N > 0."""
     levels: list[CellLevel] = []
     for _ in range(count):
-        coarse, parent = _unique_cells(cells >> 1)
+        _, first, parent = np.unique(pack_cells(cells >> 1), return_index=True, return_inverse=True)
+        coarse, parent = (cells >> 1)[first], parent.reshape(-1)
         corner = (cells & 1) @ np.array((4, 2, 1))
         neighbours, up, place = (torch.from_numpy(t) for t in (_neighbours(cells), parent, corner))
         levels.append(CellLevel(cells, neighbours, up, place, len(coarse)))
         cells = coarse
     return tuple(levels)
-
-
-def _unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    _, first, inverse = np.unique(pack_cells(cells), return_index=True, return_inverse=True)
-    return cells[first], inverse.reshape(-1)
 
 
 def _neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -129,7 +126,10 @@ class _Submanifold(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(x, weight, table)
-        return _convolve(x, weight, table)
+        flat, out = weight.reshape(-1, weight.shape[2]), x.new_empty(len(table), weight.shape[2])
+        for rows, gathered in _chunks(x, table):
+            torch.mm(gathered, flat, out=out[rows])
+        return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
@@ -150,17 +150,13 @@ class _Submanifold(torch.autograd.Function):
         return of_x, of_weight.view(channels_in, places, channels_out).flip(1).transpose(0, 1), None
 
 
-def _convolve(x: torch.Tensor, weight: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
-    flat = weight.reshape(-1, weight.shape[2])
-    out = x.new_empty(len(table), weight.shape[2])
-    for rows, gathered in _chunks(x, table):
-        torch.mm(gathered, flat, out=out[rows])
-    return out
+def _padded(x: torch.Tensor) -> torch.Tensor:
+    return torch.cat((x, x.new_zeros(1, x.shape[1])))
 
 
 def _chunks(x: torch.Tensor, table: torch.Tensor) -> Iterator[tuple[slice, torch.Tensor]]:
     """Rows, and features of their neighbours (rows, K * C)."""
-    padded = torch.cat((x, x.new_zeros(1, x.shape[1])))
+    padded = _padded(x)
     for start in range(0, len(table), CHUNK_ROWS):
         part = table[start : start + CHUNK_ROWS]
         yield slice(start, start + len(part)), padded.index_select(0, part.reshape(-1)).view(len(part), -1)
@@ -298,10 +294,6 @@ def smoothed(cells: Cells, level: CellLevel) -> torch.Tensor:
         said = torch.einsum("nk,nkc->nc", weight, _padded(said)[table]) / total.clamp_min(1e-6)[:, None]
         votes = total / kernel.sum(dim=1)
     return said
-
-
-def _padded(x: torch.Tensor) -> torch.Tensor:
-    return torch.cat((x, x.new_zeros(1, x.shape[1])))
 
 
 class Block(nn.Module):
@@ -453,24 +445,15 @@ def save_nesf(weights: NesfWeights, path: Path) -> None:
 def load_nesf(path: Path) -> NesfWeights:
     """Read weights that ``save_nesf`` wrote. Raises WeightsError: no such file, damaged, or weights of another kind."""
     path = find_checkpoint(path)
-    if not path.exists():
-        raise WeightsError(
-            f"{path}: no such weights file; train them by `semantic-mapper-research train --kind {MAP_KIND}`"
-        )
     tensors, metadata = open_weights(path)
-    kind = metadata.get("field", "sray")
-    if kind != MAP_KIND:
+    if metadata.get("field") != MAP_KIND:
         raise WeightsError(
-            f"{path}: weights of kind '{kind}', which label frames (`replay --weights`); to refine maps takes weights "
-            f"of kind '{MAP_KIND}', from `semantic-mapper-research train --kind {MAP_KIND}`"
+            f"{path}: weights of kind '{metadata.get('field')}', which label frames (`replay --weights`); to refine "
+            f"maps takes weights of kind '{MAP_KIND}', from `semantic-mapper-research train --kind {MAP_KIND}`"
         )
-    try:
-        label_set = unpack_label_set(metadata["label_set"])
+    with refusing_damage(path):
         config = convert_config(json.loads(metadata["model_config"]), NesfConfig, str(path))
         recipe = dict(json.loads(metadata["recipe"]))
-        model = Nesf(label_set, config)
-    except (KeyError, TypeError, ValueError, SemanticMapperError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise WeightsError(f"{path}: damaged: {type(error).__name__}: {reason}") from error
+        model = Nesf(unpack_label_set(metadata["label_set"]), config)
     load_tensors(model, tensors, path)
     return NesfWeights(model.eval(), recipe, hashlib.sha256(path.read_bytes()).hexdigest())

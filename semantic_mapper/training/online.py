@@ -54,12 +54,9 @@ class Kept:
 
 
 class KeyframePool:
-    """A bounded set of labelled keyframes in the classes of one label set.
+    """A bounded set of labelled keyframes in the classes of the weights' label set.
 
-    Args:
-        label_set: Of the weights.
-        held_out_every: Of this many keyframes, the last one is held out, for good.
-        capacity: Keyframes kept; past it the oldest is dropped.
+    Of ``held_out_every`` keyframes the last one is held out, for good; past ``capacity`` the oldest is dropped.
     """
 
     def __init__(self, label_set: LabelSet, *, held_out_every: int, capacity: int) -> None:
@@ -150,11 +147,10 @@ class KeyframePool:
                 f"{where}: none of its pixels is of a class that the weights know; they know "
                 f"{', '.join(self._label_set.names)}"
             )
-        size, first = _size(frame), next(iter(self._kept.values()), None)
-        if first is not None and size != _size(first.frame):
+        sizes = [f"{f.intrinsics.width}x{f.intrinsics.height}" for f in (frame, *(k.frame for k in self.kept[:1]))]
+        if len(set(sizes)) > 1:
             raise FrameError(
-                f"{where}: {size[0]}x{size[1]} pixels, but those before have "
-                f"{'x'.join(map(str, _size(first.frame)))}; keyframes must be of one size"
+                f"{where}: {sizes[0]} pixels, but those before have {sizes[1]}; keyframes must be of one size"
             )
         return replace(frame, label=label)
 
@@ -162,10 +158,6 @@ class KeyframePool:
 def key_of(frame: PosedFrame) -> Key:
     """What tells a keyframe from all others."""
     return frame.camera_id, frame.stamp_ns
-
-
-def _size(frame: PosedFrame) -> tuple[int, int]:
-    return frame.intrinsics.width, frame.intrinsics.height
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,15 +214,28 @@ def learn(
         parent_score=parent_score,
         validated=len(keyframes.validated),
     )
-    refusal, worse = _refusal_by_score(score, parent_score, config), score < parent_score
+    refusal, worse = "", score < parent_score
     validated = [i for i, f in enumerate(held_out) if key_of(f) in keyframes.validated]
-    if not refusal and validated:
-        accuracy, parent_accuracy = (_total(m[i] for i in validated).total_accuracy for m in (after, before))
-        refusal = _refusal_by_accuracy(accuracy, parent_accuracy, config)
-        worse = True
-    worse = bool(refusal) and worse and _shares_views(keyframes, current.label_set, config)
+    if score < config.least_score:
+        refusal = f"mIoU on held-out keyframes {score:.3f}: less than {config.least_score:g} (least_score)"
+    elif score < parent_score + config.least_gain:
+        refusal = (
+            f"mIoU on held-out keyframes {score:.3f}, with the weights in use {parent_score:.3f}: less than "
+            f"{config.least_gain:g} gained"
+        )
+    elif validated:
+        new, old = (_total(m[i] for i in validated).total_accuracy for m in (after, before))
+        if new is not None and old is not None and new < old - config.tolerance:
+            worse = True
+            refusal = (
+                f"accuracy {new:.3f} on held-out keyframes that were validated, with the weights in use {old:.3f}: the "
+                "new labels contradict the old ones"
+            )
+    if refusal and worse:  # one can speak of the other only where what is held out is seen by what is learned from
+        views = [view_from_frame(f, current.label_set, config.finetune.width) for f in (*held_out, *train)]
+        worse = bool(view_overlap(views)[: len(held_out), len(held_out) :].any())
     keys = frozenset(key_of(f) for f in (*train, *held_out))
-    return OnlineResult(made, score, parent_score, keys, refusal, worse)
+    return OnlineResult(made, score, parent_score, keys, refusal, bool(refusal) and worse)
 
 
 def judge(
@@ -266,36 +271,6 @@ def judge(
             matrix.update(label_set.to_ids(channel.numpy()), label_set.to_ids(said.numpy()))
             on_judged()
     return matrices
-
-
-def _shares_views(keyframes: KeyframeSplit, label_set: LabelSet, config: OnlineConfig) -> bool:
-    """Whether anything held out is seen by keyframes that are learned from, so that one can speak of the other."""
-    frames = (*keyframes.held_out, *keyframes.train)
-    overlap = view_overlap([view_from_frame(f, label_set, config.finetune.width) for f in frames])
-    held_out = len(keyframes.held_out)
-    return bool(overlap[:held_out, held_out:].any())
-
-
-def _refusal_by_score(score: float, parent_score: float, config: OnlineConfig) -> str:
-    """Why weights of this mIoU are refused; empty = they are not."""
-    if score < config.least_score:
-        return f"mIoU on held-out keyframes {score:.3f}: less than {config.least_score:g} (least_score)"
-    if score < parent_score + config.least_gain:
-        return (
-            f"mIoU on held-out keyframes {score:.3f}, with the weights in use {parent_score:.3f}: less than "
-            f"{config.least_gain:g} gained"
-        )
-    return ""
-
-
-def _refusal_by_accuracy(accuracy: float | None, parent_accuracy: float | None, config: OnlineConfig) -> str:
-    """Why weights of this accuracy on validated keyframes are refused; empty = they are not. None = no pixel."""
-    if accuracy is None or parent_accuracy is None or accuracy >= parent_accuracy - config.tolerance:
-        return ""
-    return (
-        f"accuracy {accuracy:.3f} on held-out keyframes that were validated, with the weights in use "
-        f"{parent_accuracy:.3f}: the new labels contradict the old ones"
-    )
 
 
 def _total(matrices: Iterable[ConfusionMatrix]) -> SegmentationMetrics:
