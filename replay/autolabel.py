@@ -360,7 +360,7 @@ class InstanceImages:
     def add(self, number: int, frame: PosedFrame, label: UInt8) -> None:
         """Write the things of a frame, by its number in the log; ``label`` (H, W) says where their classes are.
         Raises LogError: it cannot be written."""
-        ids = thing_image(self._field, frame, label)
+        ids = thing_image(self._field, frame, label).instance
         name = f"{frame.camera_id}/{number:06d}"
         path = self._unfinished / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -181,8 +181,8 @@ def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     Raises WeightsError: missing, damaged, of another format or version, or its base is."""
     if not path.is_file():
         raise WeightsError(
-            f"{path}: no such weights file; check the path, or make one with `semantic-mapper finetune` (to refine maps "
-            f"`semantic-mapper-research train --kind {MAP_KIND}`)"
+            f"{path}: no such weights file; check the path, or make one with `semantic-mapper finetune` (to refine "
+            f"maps `semantic-mapper-research train --kind {MAP_KIND}`)"
         )
     try:
         with safe_open(path, framework="pt") as stored:
