@@ -70,9 +70,9 @@ def test_a_kernel_that_the_library_has_not_or_has_otherwise_is_named() -> None:
     def no_such_kernel() -> int: ...
 
     sum_arguments.__annotations__ = {"values": Int64, "other": Float32, "return": int}
-    with pytest.raises(DependencyError, match="no kernel sum_arguments that takes 96 bytes .*`make setup`"):
+    with pytest.raises(DependencyError, match=r"no kernel sum_arguments that takes 96 bytes .*`make setup`"):
         kernel(sum_arguments)(VALUES, np.zeros(1, np.float32))
-    with pytest.raises(DependencyError, match="no kernel no_such_kernel .*`make setup`"):
+    with pytest.raises(DependencyError, match=r"no kernel no_such_kernel .*`make setup`"):
         kernel(no_such_kernel)()
 
 
