@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -274,8 +274,8 @@ DepthSource = Literal["auto", "sensor", "computed", "off"]
 class DepthConfig(Config, frozen=True):
     """Where the depth of frames comes from."""
 
-    # "auto": the sensor's, and computed from the pictures where a frame has none; "computed": always computed;
-    # "sensor", "off": rendered by the field where a frame has none, or always
+    # "auto": the sensor's, else computed from the pictures; "computed": always; "sensor", "off": rendered by the field
+    # where a frame has none, or always
     source: DepthSource = "auto"
     from_motion: DepthFromMotionConfig = DepthFromMotionConfig()
     # Whether given poses are made to fit the pictures where depth is computed from these; without, poses that are some
@@ -319,7 +319,7 @@ class MapperConfig(Config, frozen=True):
     virtual: VirtualViewConfig = VirtualViewConfig()
     moving: MovingConfig = MovingConfig()
     render: RenderConfig = RenderConfig()
-    quality: Quality = "custom"  # "fast", "balanced", "reference": few, some or all rays and samples; else as set
+    quality: Quality = "custom"  # few, some or all rays and samples; "custom" as set
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0  # of everything that is drawn at random
 
 
@@ -344,9 +344,8 @@ def check_quality(data: Mapping[str, Any], quality: Quality, where: str) -> None
     """Refuse what a file says of settings that a quality sets otherwise: one of the two would be without effect.
 
     Args:
-        data: The mapper's config as the file has it, of the right form.
+        data: The mapper's config as the file ``where`` has it, of the right form.
         quality: In force, whether the file asks for it or somebody else.
-        where: The file's name.
 
     Raises:
         ConfigError: names the settings.
@@ -383,10 +382,8 @@ def load_mapper_config(
 ) -> MapperConfig:
     """The mapper's config: a TOML file, what goes before it, and what stands in where it says nothing.
 
-    Args:
-        path: The file; None = the defaults of ``MapperConfig``.
-        settings: By dotted name ("voxel_map.voxel_size_m"); they replace what the file says. None = not given.
-        defaults: By dotted name; for what neither the file nor ``settings`` say.
+    ``settings`` by dotted name ("voxel_map.voxel_size_m") replace what the file says (None = not given); ``defaults``
+    stand in for what neither says.
 
     Raises:
         ConfigError: see ``load_config`` and ``check_quality``.
@@ -404,32 +401,38 @@ def load_mapper_config(
 
 
 def parse_assignments(texts: Iterable[str]) -> dict[str, Any]:
-    """What ``--set NAME=VALUE`` says, by name; values as in TOML, bare words are text.
+    """What ``--set NAME=VALUE`` says, by name; values as of ``parse_value``.
 
     Raises:
         ConfigError: not of this form.
     """
-    found: dict[str, Any] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name:
-            raise ConfigError(f"--set {text}: write NAME=VALUE, such as seed=1")
-        try:
-            found[name] = tomllib.loads(f"value = {value}")["value"]
-        except (ValueError, RecursionError):
-            found[name] = value
-    return found
+    return {name: parse_value(value) for name, value in map(split_assignment, texts)}
+
+
+def split_assignment(text: str) -> tuple[str, str]:
+    """Name and value of NAME=VALUE.
+
+    Raises:
+        ConfigError: not of this form.
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise ConfigError(f"--set {text}: write NAME=VALUE, such as seed=1")
+    return name, value
+
+
+def parse_value(text: str) -> Any:
+    """A value as in TOML; bare words are text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):  # a path, or a number of thousands of digits
+        return text
 
 
 def assign(data: dict[str, Any], name: str, value: Any, where: str, *, replace: bool = True) -> None:
-    """Set a value of plain data by its dotted name, making the tables on the way.
+    """Set a value of nested tables by its dotted name, making the tables on the way.
 
-    Args:
-        data: Nested tables; changed.
-        name: Such as "voxel_map.voxel_size_m".
-        value: Plain.
-        where: Its file, for messages.
-        replace: Whether a value that is there gives way.
+    ``replace`` says whether a value that is there gives way; ``where`` names the file in messages.
 
     Raises:
         ConfigError: a part of the name is a value already, not a table.
@@ -494,10 +497,7 @@ def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
 def check_values(data: Any, where: str, name: str = "") -> None:
     """Refuse what no setting can be: numbers that are not finite or too large to compute with, text that is no name.
 
-    Args:
-        data: Plain data.
-        where: Its file, for messages.
-        name: Of the setting, dotted.
+    ``where`` and the dotted ``name`` of the setting are for messages.
 
     Raises:
         ConfigError: names the setting.
@@ -514,10 +514,8 @@ def check_values(data: Any, where: str, name: str = "") -> None:
             if not -limit <= data <= limit:  # NaN is not, either
                 text = f"{data:g}" if isinstance(data, float) else f"a number of {data.bit_length()} bits"
                 raise ConfigError(f"{where}: {name} = {text}: give a number between -{limit:g} and {limit:g}")
-        case str() if "\0" in data:
-            raise ConfigError(f"{where}: {name} holds a NUL character, which no path and no name may")
-        case str() if re.search("[\ud800-\udfff]", data):  # what the command line cannot decode
-            raise ConfigError(f"{where}: {name} is not UTF-8; rename the file")
+        case str() if re.search("[\0\ud800-\udfff]", data):  # halves of pairs: what the command line cannot decode
+            raise ConfigError(f"{where}: {name} holds a NUL character or is not UTF-8, as no path and no name may")
         case _:
             pass
 
@@ -556,25 +554,24 @@ def _explain(message: str, kind: type[msgspec.Struct]) -> str:
     if found is None:
         return f"{at}{what}"
     text, name, actual = found.groups()
-    if "unknown field" in text:
-        keys = {item.encode_name for at in _types_at(path, kind) for item in getattr(at, "fields", ())}
-        return f"{at}unknown key `{name}`{_nearest(name, keys, 'keys')}"
     if "missing required field" in text:
         return f"{at}the key `{name}` is missing"
-    if "enum value" in text:
-        values = {str(value) for at in _types_at(path, kind) for value in getattr(at, "values", ())}
-        return f"{at}'{name}' is not valid{_nearest(name, values, 'values')}"
+    if "unknown field" in text or "enum value" in text:
+        places = _types_at(path, kind)
+        keys = {item.encode_name for at in places for item in getattr(at, "fields", ())}
+        values = {str(value) for at in places for value in getattr(at, "values", ())}
+        word = "key" if "unknown field" in text else "value"
+        return f"{at}unknown {word} `{name}`{nearest(name[:_MESSAGE], sorted(keys | values))}"
     if actual is not None:
         wanted = " or ".join(_TOML_WORDS.get(word, word) for word in name.split(" | "))
         return f"{at}must be {wanted}, not {_TOML_WORDS.get(actual, actual)}"
     return f"{at}{what}"
 
 
-def _nearest(wrong: str, valid: Collection[str], what: str) -> str:
-    near = difflib.get_close_matches(wrong[:_MESSAGE], sorted(valid), n=1, cutoff=0.5)
-    if near:
-        return f"; did you mean `{near[0]}`?"
-    return f"; valid {what} are {', '.join(sorted(valid))}" if valid else ""
+def nearest(wrong: str, valid: Sequence[str]) -> str:
+    """How a message about a wrong name ends: with the valid one that is nearest, else with all."""
+    near = difflib.get_close_matches(wrong, valid, n=1, cutoff=0.5)
+    return f"; did you mean `{near[0]}`?" if near else f"; there are {', '.join(valid) or 'none'}"
 
 
 def _types_at(path: str, kind: type[msgspec.Struct]) -> list[inspect.Type]:
@@ -585,19 +582,11 @@ def _types_at(path: str, kind: type[msgspec.Struct]) -> list[inspect.Type]:
     return found
 
 
-def _inside(outer: inspect.Type, step: str) -> list[inspect.Type]:
+def _inside(outer: Any, step: str) -> list[inspect.Type]:
     """What may stand in a value: at a field, or at any index or key."""
-    match outer:
-        case inspect.StructType():
-            return [item.type for item in outer.fields if item.encode_name == step]
-        case inspect.VarTupleType() | inspect.ListType():
-            return [outer.item_type]
-        case inspect.TupleType():
-            return list(outer.item_types)
-        case inspect.DictType():
-            return [outer.value_type]
-        case _:
-            return []
+    fields = [item.type for item in getattr(outer, "fields", ()) if item.encode_name == step]
+    inner = [getattr(outer, name) for name in ("item_type", "value_type") if hasattr(outer, name)]
+    return [*fields, *inner, *getattr(outer, "item_types", ())]
 
 
 def _members(found: inspect.Type) -> list[inspect.Type]:

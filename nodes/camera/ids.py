@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from semantic_mapper.errors import ConfigError, LogError
+from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.options import CameraOptions
 from semantic_mapper.replay.log.sequence import open_log
 
 
-def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions], where: str) -> None:
-    """Raise ``ConfigError`` for frames of one name from two cameras, by node name, that node ``reader`` takes."""
+def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions]) -> None:
+    """Raise ``ValueError`` for frames of one name from two cameras, by node name, that node ``reader`` takes."""
     if len(cameras) < 2:
         return
     taken: dict[str, str] = {}
@@ -27,9 +27,7 @@ def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions], where: s
                     "or give each log a mapper of its own; parts of one recording are one node, whose `log` is their "
                     "folder"
                 )
-            raise ConfigError(
-                f"{where}: two cameras of node '{reader}', '{other}' and '{node}', have the id '{name}'; {fix}"
-            )
+            raise ValueError(f"two cameras of node '{reader}', '{other}' and '{node}', have the id '{name}'; {fix}")
 
 
 def _camera_ids(options: CameraOptions) -> tuple[str, ...]:

@@ -10,10 +10,10 @@ import typer
 
 from semantic_mapper.config import AtLeastOne
 from semantic_mapper.errors import LogError, TransportError
-from semantic_mapper.nodes.cli.verb import JsonOutput, must_be_there, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, Port, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
-from semantic_mapper.nodes.launcher.running import running_launches
+from semantic_mapper.nodes.launcher.running import socket_in_launch
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.sequence import open_log
@@ -48,7 +48,7 @@ def label(
     # the weights in the package
     classes: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     weights: Path | None = None,  # --suggest, --serve: weights whose keyframes count as labelled; also their classes
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 9092,  # --serve: of the page; 0 = any that is free
+    port: Port = 9092,  # --serve: of the page; 0 = any that is free
 ) -> None:
     """Label frames of a log by hand (--serve), or say which to label (--suggest); or send labelled ones to a finetuner.
 
@@ -66,16 +66,13 @@ def label(
     Example: semantic-mapper label kitchen.mcap --keyframes 12
     """
     send = suggest is None and not serve
-    refused = (
+    refuse_options(
         (bool(out or classes) and not serve, "--out and --classes", "go with --serve"),
         (weights is not None and send, "--weights", "goes with --suggest or --serve"),
         (images is not None and serve, "--images", "the page goes on with what is in --out"),
         (bool(to) and not send, "--to", "nothing is sent with --suggest and --serve"),
         (output.quiet and (suggest is None or serve), "--json", "goes with --suggest"),
     )
-    for wrong, option, why in refused:
-        if wrong:
-            raise typer.BadParameter(why, param_hint=option)
     must_be_there(log)
     if serve:
         folder = out or log.with_name(f"{log.stem}-labels")
@@ -131,7 +128,7 @@ def _serve(
 def _send(output: Output, log: Path, keyframes: int, images: Path | None, to: str) -> None:
     from semantic_mapper.nodes.cli.labelling import choose_keyframes
 
-    endpoint = labels_endpoint(to)
+    endpoint = socket_in_launch(to, LABELS)
     with StopRequest() as stop, frame_progress("label", None, stop=stop) as bar:
         found, label_set = choose_keyframes(log, keyframes, images, bar)
         with Publisher(endpoint, policy="block", linger_ms=DELIVERY_MS) as publisher:
@@ -141,24 +138,6 @@ def _send(output: Output, log: Path, keyframes: int, images: Path | None, to: st
     output.print(f"{counted(len(found), 'labelled keyframe')} sent: frames {', '.join(map(str, found))} of {log.name}")
     if pseudo := sum(frame.label_is_pseudo for frame in found.values()):
         output.print(f"  {pseudo} of them have pseudo labels (`autolabel`): what weights have rendered, right or wrong")
-
-
-def labels_endpoint(place: str) -> str:
-    """Where a finetuner listens.
-
-    Args:
-        place: An endpoint, or the socket folder of a launch; empty = that of the one launch that runs.
-
-    Raises:
-        TransportError: none runs, or several do.
-    """
-    if "://" in place:
-        return place
-    folders = [Path(place).absolute()] if place else running_launches()
-    if len(folders) != 1:
-        which = f"several launches run: {', '.join(map(str, folders))}" if folders else "no launch runs here"
-        raise TransportError(f"{which}; say with --to where the finetuner listens (its option `labels`)")
-    return f"ipc://{folders[0]}/{LABELS}"
 
 
 def _wait_for_finetuner(publisher: Publisher, stop: StopRequest) -> None:

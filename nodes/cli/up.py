@@ -7,11 +7,11 @@ from pathlib import Path
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.eval import print_results
-from semantic_mapper.nodes.cli.verb import SetOption, verb
+from semantic_mapper.nodes.cli.verb import SetOption, must_be_there, verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
 from semantic_mapper.nodes.launcher.launcher import Launcher, Notifier
-from semantic_mapper.nodes.options import MapperOptions
+from semantic_mapper.nodes.options import CameraOptions, MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.run_folder import hold_folder
@@ -37,6 +37,7 @@ def up(
     Example: semantic-mapper up camera --set camera.kind=oak
     """
     checked = load_launch(find_launch(launch), set_ or (), out)
+    must_be_there(*(Path(o.log) for o in checked.options.values() if isinstance(o, CameraOptions) and o.log))
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
     before = [_written(f) for f in folders]
     with StopRequest() as stop, ExitStack() as stack:

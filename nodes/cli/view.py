@@ -5,22 +5,22 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import rich.live
-import typer
 
 from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import ConfigError, TransportError
-from semantic_mapper.nodes.cli.verb import JsonOutput, Remote, WeightsOption, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, WeightsOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.launcher.running import (
     QUERY_SOCKET,
     LaunchView,
     launch_folder,
     node_endpoints,
     read_launch_note,
-    status_endpoint,
+    socket_in_launch,
 )
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import DATA_PORT, WEB_PORT, WebViewer
@@ -47,8 +47,7 @@ def view(
     # of a running launch, or where a mapper answers (tcp://...); by default the one launch that runs here
     source: str = "",
     *,
-    # of the web page; 0 = any that is free
-    port: Annotated[int, typer.Option(min=0, max=65535)] = WEB_PORT,
+    port: Port = WEB_PORT,  # of the web page; 0 = any that is free
     weights: WeightsOption = None,
     config: Path | None = None,  # log: TOML file with settings of the mapper
     status: bool = False,  # launch: show how its nodes are, as a table in this terminal
@@ -71,18 +70,17 @@ def view(
     Example: semantic-mapper view --status
     Example: ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 robot semantic-mapper view
     """
-    if (once and not status) or (output.quiet and not once):
-        raise typer.BadParameter("goes with --status", param_hint="--once and --json")
+    refuse_options(((once and not status) or (output.quiet and not once), "--once and --json", "go with --status"))
     if status:
         _show_status(output, source, remote, once=once)
         return
     path = Path(source)
     log = bool(source) and is_log(path)
     saved = map_path(path) if source and not log and is_map(path) else None
-    if not log and (weights or config):
-        raise typer.BadParameter("go with a log", param_hint="--weights and --config")
-    if remote.server and "://" not in source:
-        raise typer.BadParameter("goes with an endpoint such as tcp://robot:5570", param_hint="--server")
+    refuse_options(
+        (not log and (weights or config), "--weights and --config", "go with a log"),
+        (remote.server and "://" not in source, "--server", "goes with an endpoint such as tcp://robot:5570"),
+    )
     if source and "://" not in source and not path.exists():
         other = "" if log or saved else ", and no socket folder of a launch"
         raise ConfigError(f"{path}: no such file{other}; without a name, `view` shows the one launch that runs here")
@@ -119,11 +117,7 @@ class _Page(ExitStack):
         return self._viewer is not None and self._viewer.alive
 
     def begin(self) -> RecordingStream:
-        """Serve it, say where, and tell what writes on it.
-
-        Raises:
-            DependencyError, TransportError: see ``WebViewer``.
-        """
+        """Serve it, say where, and tell what writes on it."""
         from semantic_mapper.replay.exporters.rerun_log import recording_server
 
         self._viewer = self.enter_context(WebViewer(self._port, DATA_PORT if self._port else 0))
@@ -134,11 +128,7 @@ class _Page(ExitStack):
 
 
 def _find_live(source: str, remote: Remote) -> Live:
-    """Endpoints of a running launch, or of a mapper anywhere.
-
-    Raises:
-        TransportError: none runs here, several do, or the folder is not that of a launch.
-    """
+    """Endpoints of a running launch, or of a mapper anywhere."""
     folder = None if "://" in source else launch_folder(source)
     from semantic_mapper.nodes.viewer.sources import Live
 
@@ -158,14 +148,10 @@ def _show_log(path: Path, weights: Path | None, config: Path | None, page: _Page
 
 
 def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> None:
-    """A running launch as a table.
-
-    Raises:
-        TransportError: none runs here, several do, or nobody answers.
-    """
+    """A running launch as a table."""
     if not output.console.is_terminal:
         output.console.width = FILE_WIDTH
-    endpoint = status_endpoint(place)
+    endpoint = socket_in_launch(place, STATUS_SOCKET)
     view = LaunchView()
     with NewestSubscriber(endpoint, ("status",), identity=remote.identity()) as subscriber:
         deadline = time.monotonic() + ANSWER_S

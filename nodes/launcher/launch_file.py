@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import importlib
 import os
 import re
-import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,11 +16,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 import semantic_mapper
-from semantic_mapper.config import Config, convert_config, load_config
+from semantic_mapper.config import Config, convert_config, load_config, nearest, parse_value, split_assignment
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.camera.ids import check_camera_ids
 from semantic_mapper.nodes.options import (
     CAMERA_KINDS,
+    ENDPOINT_PATTERN,
     OPTIONS,
     POSE_KINDS,
     CameraOptions,
@@ -53,21 +54,16 @@ class NodeEntry(Config, frozen=True):
     enabled: bool = True
 
 
-class Limits(Config, frozen=True):
-    """What a launch file says of the launch as a whole."""
+class LaunchFile(Config, frozen=True, kw_only=True):
+    """A launch file as it stands on disk."""
 
     # A node that gives no sign of life for so long, and neither has had nor wants processor time meanwhile, is killed.
     # One that starts or ends, or is busy, or waits for a processor or a disk, may be silent for half a minute.
     heartbeat_s: Annotated[float, msgspec.Meta(ge=0.5)] = 30.0
     # A fixed endpoint at which the status of all nodes can be subscribed to (`view --status`), next to the one in the
     # folder of sockets: ipc://PATH, tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
-    publish: Annotated[str, msgspec.Meta(pattern=r"^([a-z]+://.+|)\Z")] = ""
+    publish: Annotated[str, msgspec.Meta(pattern=ENDPOINT_PATTERN)] = ""
     keys: str = ""  # folder of keys (`semantic-mapper keys`), also for nodes that name none; empty = none
-
-
-class LaunchFile(Limits, frozen=True, kw_only=True):
-    """A launch file as it stands on disk."""
-
     node: Annotated[tuple[NodeEntry, ...], msgspec.Meta(max_length=MAX_NODES)]
     # Folder of the results, "{out}" in options of nodes. "{now}" stands for the time of the start, such as
     # 20261123T024700Z, with a number where that is there already.
@@ -78,15 +74,14 @@ class LaunchFile(Limits, frozen=True, kw_only=True):
     restart: Restart = "never"
 
 
-class Launch(Limits, frozen=True, kw_only=True):
-    """A launch file with every option checked, ready to start.
-
-    ``options`` are by node name, in the order of the file.
-    """
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """A launch file with every option checked, ready to start."""
 
     name: str  # of the file
-    nodes: tuple[NodeEntry, ...]
-    options: dict[str, NodeOptions]
+    file: LaunchFile
+    nodes: tuple[NodeEntry, ...]  # those that are enabled, with their restart policy
+    options: dict[str, NodeOptions]  # by node name, in the order of the file
 
     def sockets(self) -> tuple[str, ...]:
         """Names of all endpoints: of the nodes, where mappers answer questions and labels come, the launcher's own."""
@@ -106,23 +101,18 @@ def launch_files() -> dict[str, Path]:
 
 
 def find_launch(path: Path) -> Path:
-    """A launch file: the file that ``path`` names, else that of the package which is called so.
-
-    Args:
-        path: Of a file, or a bare name ("replay" or "replay.toml").
+    """The launch file that ``path`` names, else that of the package which is called so ("replay" or "replay.toml").
 
     Raises:
-        ConfigError: it is a folder, or neither is there; lists those of the package.
+        ConfigError: neither is there; lists those of the package.
     """
-    if path.exists() and not path.is_dir():
+    if path.is_file():
         return path
     files = launch_files()
     name = path.name.removesuffix(".toml")
-    if path.parent == Path() and name in files:
-        return files[name]
-    if path.is_dir():
-        raise ConfigError(f"{path}: is a folder; name a launch file in it")
-    raise ConfigError(f"{path}: no such file; launch files that come with the package: {', '.join(files)}")
+    if path.parent != Path() or name not in files:
+        raise ConfigError(f"{path}: no such file; launch files that come with the package: {', '.join(files)}")
+    return files[name]
 
 
 def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = None) -> Launch:
@@ -142,7 +132,7 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         if names.count(name) > 1 or not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", name):
             raise ConfigError(f"{path}: node names must be unique words of letters, digits and _ -, got '{name}'")
     overrides = _Overrides(file, path)
-    for name, value in sorted(map(_parse_setting, settings), key=lambda s: not s[0].endswith(".kind")):
+    for name, value in sorted(map(split_assignment, settings), key=lambda s: not s[0].endswith(".kind")):
         overrides.apply(name, value)
     if out is not None:
         overrides.apply("out", str(out))
@@ -153,25 +143,12 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         for n in file.node
         if n.enabled
     )
-    _complete_cameras(nodes)
-    _complete_viewers(nodes)
-    options = {n.name: _convert_options(n, file.keys, path) for n in nodes}
-    for name, own in options.items():
-        for source in own.inputs():
-            if source not in options:
-                raise ConfigError(
-                    f"{path}: node '{name}' listens to '{source}', which is no node{_nearest(source, list(options))}"
-                )
-    _check_restarts(nodes, options, path)
-    _check_cameras(options, path)
-    limits = {name: getattr(file, name) for name in Limits.__struct_fields__}
-    launch = Launch(name=path.name, nodes=nodes, options=options, **limits)
-    sockets = launch.sockets()
-    if twice := sorted({name for name in sockets if sockets.count(name) > 1}):
-        raise ConfigError(
-            f"{path}: {', '.join(twice)}: names two endpoints; give each mapper a `query` of its own that is no node "
-            f"('{STATUS_SOCKET}' is the launcher's own)"
-        )
+    _complete_options(nodes)
+    launch = Launch(path.name, file, nodes, {n.name: _convert_options(n, file.keys, path) for n in nodes})
+    try:
+        _check_launch(launch)
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
     return launch
 
 
@@ -195,31 +172,30 @@ class _Overrides:
         """
         first, *keys = name.split(".")
         node = self._nodes.get(first)
-        if not keys and first in LaunchFile.__struct_fields__ and first != "node":
-            self.plain[first] = _typed(text, _field_type(LaunchFile, first))
+        settings = [f for f in LaunchFile.__struct_fields__ if f != "node"]
+        if not keys and first in settings:
+            self.plain[first] = _typed(text, LaunchFile, first)
         elif node is None or not keys:
-            known = [*(f for f in LaunchFile.__struct_fields__ if f != "node"), *self._nodes]
-            raise ConfigError(f"{self._path}: no setting and no node is called '{first}'{_nearest(first, known)}")
+            raise self._unknown(f"no setting and no node is called '{first}'", first, [*settings, *self._nodes])
         elif len(keys) == 1 and keys[0] in ("restart", "enabled"):
-            node[keys[0]] = _typed(text, _field_type(NodeEntry, keys[0]))
+            node[keys[0]] = _typed(text, NodeEntry, keys[0])
         else:
             self._set_option(node, keys, text)
 
     def _set_option(self, node: dict[str, Any], keys: list[str], text: str) -> None:
         table, kind = node["options"], OPTIONS[node["kind"]]
-        if kind is CameraOptions and keys[0] in LiveCamera.__struct_fields__:
-            table.pop("log", None)
-            table, kind = table.setdefault("camera", {}), LiveCamera
-        elif kind is CameraOptions and keys == ["log"]:
-            table.pop("camera", None)
-            if self.plain["restart"] != "never":
-                table.setdefault("mode", "realtime")
-        known = kind.__struct_fields__
+        known = [*kind.__struct_fields__, "restart", "enabled"]
+        if kind is CameraOptions:
+            known += LiveCamera.__struct_fields__
+            if keys[0] in LiveCamera.__struct_fields__:
+                table.pop("log", None)
+                table, kind = table.setdefault("camera", {}), LiveCamera
+            elif keys == ["log"]:
+                table.pop("camera", None)
+                if self.plain["restart"] != "never":
+                    table.setdefault("mode", "realtime")
         if keys[0] not in known:
-            known = (*known, *(LiveCamera.__struct_fields__ if kind is CameraOptions else ()), "restart", "enabled")
-            raise ConfigError(
-                f"{self._path}: node '{node['name']}' has no option '{keys[0]}'{_nearest(keys[0], known)}"
-            )
+            raise self._unknown(f"node '{node['name']}' has no option '{keys[0]}'", keys[0], known)
         *tables, last = keys
         struct: type[msgspec.Struct] | None = kind
         for key in tables:
@@ -229,7 +205,10 @@ class _Overrides:
                 raise ConfigError(
                     f"{self._path}: {node['name']}.{'.'.join(tables)} names the file {table!r}; set '{last}' there"
                 )
-        table[last] = _typed(text, Any if struct is None else _field_type(struct, last))
+        table[last] = _typed(text, struct, last)
+
+    def _unknown(self, what: str, name: str, names: Sequence[str]) -> ConfigError:
+        return ConfigError(f"{self._path}: {what}{nearest(name, names)}")
 
 
 def _struct_of(key: str, camera: Mapping[str, Any]) -> type[msgspec.Struct] | None:
@@ -242,33 +221,18 @@ def _struct_of(key: str, camera: Mapping[str, Any]) -> type[msgspec.Struct] | No
     return None
 
 
-def _field_type(struct: type[msgspec.Struct], name: str) -> Any:
-    types = {item.encode_name: item.type for item in msgspec.structs.fields(struct)}
-    return types.get(name, Any)
-
-
-def _typed(text: str, kind: Any) -> Any:
+def _typed(text: str, struct: type[msgspec.Struct] | None, name: str) -> Any:
     """A value as its setting wants it; what is to be a text stays one, whatever it looks like: ids may be numbers."""
-    try:
-        parsed = tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):  # a bare word, such as a path, or a number of thousands of digits
-        return text
-    if kind is Any or isinstance(parsed, str):
+    parsed = parse_value(text)
+    if isinstance(parsed, str):
         return parsed
+    fields = {} if struct is None else {item.encode_name: item.type for item in msgspec.structs.fields(struct)}
     for value in (parsed, text) if isinstance(parsed, list | dict) else (text, parsed):
-        try:
-            msgspec.convert(value, kind)
-        except msgspec.ValidationError:
-            continue
-        return value
+        with suppress(msgspec.ValidationError):
+            if name in fields:
+                msgspec.convert(value, fields[name])
+                return value
     return parsed
-
-
-def _parse_setting(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals or not name:
-        raise ConfigError(f"--set {text}: write NODE.OPTION=VALUE")
-    return name, value
 
 
 def _name_start(out: str) -> str:
@@ -287,35 +251,31 @@ def _fill_in(value: Any, out: str) -> Any:
     return value.replace("{out}", out) if isinstance(value, str) else value
 
 
-def _complete_cameras(nodes: Sequence[NodeEntry]) -> None:
-    """Poses of cameras that know them, and a history for the map where poses close loops."""
-    for node in nodes:
-        live = node.options.get("camera")
-        if node.kind != "camera" or not isinstance(live, dict):
-            continue
-        if "poses" not in live and live.get("kind") in DEFAULT_POSES:
-            live["poses"] = {"kind": DEFAULT_POSES[live["kind"]]}
-        poses, config = live.get("poses"), live.setdefault("config", {})
-        if not isinstance(poses, dict):
-            continue
-        if poses.get("kind") == "device" and live.get("kind") == "oak" and isinstance(config, dict):
-            config.setdefault("odometry", True)
-        if poses.get("kind") == "rgbd" and "corrections" not in node.options:
-            mappers = [n.options for n in nodes if n.kind == "mapper" and n.options.get("input", "camera") == node.name]
-            for mapper in mappers:
-                mapper.setdefault("history_frames", HISTORY_FRAMES)
-                node.options["corrections"] = mapper.get("query", "query")
+def _complete_options(nodes: Sequence[NodeEntry]) -> None:
+    """What options follow from those of other nodes, or from the kind of a camera.
 
-
-def _complete_viewers(nodes: Sequence[NodeEntry]) -> None:
-    """Where the mapper of a viewer answers, and its keys."""
+    Cameras that know their poses have them; the map keeps a history where poses close loops; viewers know where their
+    mapper answers, and its keys.
+    """
     mappers = {node.name: node.options for node in nodes if node.kind == "mapper"}
     for node in nodes:
+        live = node.options.get("camera")
         if node.kind == "foxglove":
             mapper = mappers.get(node.options.get("mapper", "mapper"), {})
-            for name in ("query", "keys"):
-                if name in mapper:
-                    node.options.setdefault(name, mapper[name])
+            node.options.update({name: mapper[name] for name in ("query", "keys") if name in mapper} | node.options)
+        if node.kind != "camera" or not isinstance(live, dict):
+            continue
+        if live.get("kind") in DEFAULT_POSES:
+            live.setdefault("poses", {"kind": DEFAULT_POSES[live["kind"]]})
+        poses, config = live.get("poses"), live.setdefault("config", {})
+        source = poses.get("kind") if isinstance(poses, dict) else None
+        if source == "device" and live.get("kind") == "oak" and isinstance(config, dict):
+            config.setdefault("odometry", True)
+        if source == "rgbd" and "corrections" not in node.options:
+            for mapper in mappers.values():
+                if mapper.get("input", "camera") == node.name:
+                    mapper.setdefault("history_frames", HISTORY_FRAMES)
+                    node.options["corrections"] = mapper.get("query", "query")
 
 
 def _convert_options(node: NodeEntry, keys: str, path: Path) -> NodeOptions:
@@ -325,84 +285,73 @@ def _convert_options(node: NodeEntry, keys: str, path: Path) -> NodeOptions:
         if plain.get(item.encode_name) == "" and (item.required or item.default is None):
             name = f"{node.name}.{item.encode_name}"
             raise ConfigError(f"{where}: needs '{item.encode_name}'; give it with --set {name}=... or in the file")
-    _check_camera_kinds(plain.get("camera"), node.name, where)
+    if isinstance(camera := plain.get("camera"), dict):
+        try:
+            _check_camera(camera, node.name)
+        except ValueError as error:
+            raise ConfigError(f"{where}: {error}") from error
     return convert_config(plain, kind, where)
 
 
-def _check_camera_kinds(camera: Any, node: str, where: str) -> None:
+def _check_camera(camera: dict[str, Any], node: str) -> None:
     """Say at once, before a mapper has started, what the camera's own process would refuse much later.
 
     Raises:
-        ConfigError: no such kind of camera or of poses, or no poses at all.
+        ValueError: no such kind of camera or of poses, or no poses at all.
     """
-    if not isinstance(camera, dict):
-        return
-    kind, poses = camera.get("kind"), camera.get("poses")
-    if not kind:
-        raise ConfigError(
-            f"{where}: which kind of camera? Give --set {node}.kind=KIND; there are {', '.join(CAMERA_KINDS)}"
-        )
-    if isinstance(kind, str) and kind not in CAMERA_KINDS:
-        raise ConfigError(f"{where}: `camera.kind`: no kind of camera is called '{kind}'{_nearest(kind, CAMERA_KINDS)}")
-    if poses is None or poses in ({}, ""):
-        raise ConfigError(
-            f"{where}: `camera.poses` is {'missing' if poses is None else 'empty'}: a camera alone does not know "
-            f"where it is. Give --set {node}.poses.kind=KIND, or in the file [node.options.camera.poses], with kind "
+    kind, poses = str(camera.get("kind") or ""), camera.get("poses")
+    if kind not in CAMERA_KINDS:
+        what = f"`camera.kind`: no kind of camera is called '{kind}'" if kind else "which kind of camera"
+        raise ValueError(f"{what}{nearest(kind, CAMERA_KINDS)}; give --set {node}.kind=KIND")
+    if not poses:
+        raise ValueError(
+            "`camera.poses` is missing or empty: a camera alone does not know where it is. Give "
+            f"--set {node}.poses.kind=KIND, or in the file [node.options.camera.poses], with kind "
             '"topic" (odometry from a socket), "board" (a printed board), "rgbd" (odometry from depth), "visual" (from '
             'its pictures alone), "device" (it tracks itself, OAK) or "fixed" (it never moves); for example '
             'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
         )
-    if isinstance(poses, dict) and poses.get("kind") not in POSE_KINDS:
-        if "kind" not in poses:
-            raise ConfigError(f"{where}: `camera.poses` has no kind; there are {', '.join(POSE_KINDS)}")
-        named = str(poses["kind"])
-        raise ConfigError(f"{where}: `camera.poses.kind`: '{named}' is no source of poses{_nearest(named, POSE_KINDS)}")
     if isinstance(poses, dict):
-        try:
-            check_tracking(str(kind), poses["kind"])
-        except ValueError as error:
-            raise ConfigError(f"{where}: {error}") from error
+        source = str(poses.get("kind", ""))
+        if source not in POSE_KINDS:
+            raise ValueError(f"`camera.poses.kind`: '{source}' is no source of poses{nearest(source, POSE_KINDS)}")
+        check_tracking(kind, source)
 
 
-def _check_restarts(nodes: Iterable[NodeEntry], options: Mapping[str, NodeOptions], path: Path) -> None:
-    """Restarts are for what is live: frames that wait for their readers have a result, which a restart would spoil.
+def _check_launch(launch: Launch) -> None:
+    """Whether the nodes fit together.
 
     Raises:
-        ConfigError: a node is to be restarted while a camera waits for others; or there is no camera.
+        ValueError: a node listens to what is not there, or to what is of another kind; there is no camera; two cameras
+            of one name, or two endpoints; or a node is to be restarted while a camera waits for others: frames that
+            wait for their readers have a result, which a restart would spoil.
     """
+    options = launch.options
     cameras = {name: own for name, own in options.items() if isinstance(own, CameraOptions)}
     if not cameras:
-        raise ConfigError(f"{path}: no node of kind 'camera': nothing would ever happen")
-    restarted = [n.name for n in nodes if n.restart != "never"]
+        raise ValueError("no node of kind 'camera': nothing would ever happen")
+    for name, own in options.items():
+        for source in own.inputs():
+            if source not in options:
+                raise ValueError(f"node '{name}' listens to '{source}', which is no node{nearest(source, [*options])}")
+        if isinstance(own, MapperOptions | RecorderOptions | FoxgloveOptions):
+            for source in own.cameras:
+                if source not in cameras:
+                    raise ValueError(f"node '{name}' takes the frames of '{source}', which is no camera")
+            check_camera_ids(name, {source: cameras[source] for source in own.cameras})
+        if isinstance(own, FoxgloveOptions) and not isinstance(options[own.mapper], MapperOptions):
+            raise ValueError(f"node '{name}' shows the map of '{own.mapper}', which is no mapper")
+    restarted = [n.name for n in launch.nodes if n.restart != "never"]
     waiting = [name for name, own in cameras.items() if not own.live]
     if restarted and waiting:
-        raise ConfigError(
-            f"{path}: node '{restarted[0]}' is to be restarted, but camera '{waiting[0]}' waits for those who read its "
+        raise ValueError(
+            f"node '{restarted[0]}' is to be restarted, but camera '{waiting[0]}' waits for those who read its "
             f"frames, and what they have lost would be missing in the result; set {waiting[0]}.mode=realtime, or "
             "restart=never"
         )
-
-
-def _check_cameras(options: Mapping[str, NodeOptions], path: Path) -> None:
-    """Frames that go to one place are distinguished by the names of their cameras.
-
-    Raises:
-        ConfigError: two cameras of one name, frames of what is no camera, or the map of what is no mapper.
-    """
-    for name, own in options.items():
-        if not isinstance(own, MapperOptions | RecorderOptions | FoxgloveOptions):
-            continue
-        cameras: dict[str, CameraOptions] = {}
-        for source in own.cameras:
-            camera = options[source]
-            if not isinstance(camera, CameraOptions):
-                raise ConfigError(f"{path}: node '{name}' takes the frames of '{source}', which is no camera")
-            cameras[source] = camera
-        check_camera_ids(name, cameras, str(path))
-        if isinstance(own, FoxgloveOptions) and not isinstance(options[own.mapper], MapperOptions):
-            raise ConfigError(f"{path}: node '{name}' shows the map of '{own.mapper}', which is no mapper")
-
-
-def _nearest(name: str, names: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    return f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(names[:MAX_NODES]) or 'none'}"
+    sockets = launch.sockets()
+    if twice := sorted({name for name in sockets if sockets.count(name) > 1}):
+        raise ValueError(
+            f"{', '.join(twice)}: names two endpoints; give each mapper a `query` of its own that is no node "
+            f"('{STATUS_SOCKET}' is the launcher's own)"
+        )

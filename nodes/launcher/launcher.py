@@ -16,9 +16,8 @@ import structlog
 from msgspec.structs import replace
 
 from semantic_mapper.errors import CodecError, NodeError, TransportError
-from semantic_mapper.nodes.launcher.fork_server import ForkServer
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
-from semantic_mapper.nodes.launcher.processes import PROCESS_TABLE, ManagedProcess, node_environment
+from semantic_mapper.nodes.launcher.processes import PROCESS_TABLE, ManagedProcess
 from semantic_mapper.nodes.launcher.running import leave_launch_note
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.process_folder import OwnFolder, sweep
@@ -46,9 +45,8 @@ class Notifier:
     def __init__(self, address: str, watchdog_s: float = 0.0) -> None:
         self._address = address.replace("@", "\0", 1) if address.startswith("@") else address
         self._watchdog_s = watchdog_s
-        self._last_sign = 0.0
+        self._last_sign = self._extended_at = float("-inf")
         self._last_status = ""
-        self._extended_at = float("-inf")
         self._failed = False
 
     @classmethod
@@ -60,7 +58,8 @@ class Notifier:
 
     def ready(self, status: str) -> None:
         """Start-up is over."""
-        self._send(f"READY=1\nSTATUS={_one_line(status)}")
+        self._send("READY=1")
+        self.status(status)
 
     def stopping(self, extend_s: float) -> None:
         """The end has begun, and may take so long from now; to be called in a loop."""
@@ -73,7 +72,7 @@ class Notifier:
         """One line for ``systemctl status``; sent when it changes."""
         if text != self._last_status:
             self._last_status = text
-            self._send(f"STATUS={_one_line(text)}")
+            self._send(f"STATUS={text}")
 
     def alive(self) -> None:
         """A sign of life, as often as the watchdog asks for; to be called in a loop."""
@@ -99,9 +98,7 @@ class Launcher:
 
     Sockets are in a folder of their own that only this user can enter; two launches never meet.
 
-    Args:
-        launch: From ``load_launch``.
-        notifier: Receives the state of the launch, in addition to the status topic.
+    ``notifier`` receives the state of the launch, in addition to the status topic.
     """
 
     def __init__(self, launch: Launch, notifier: Notifier | None = None) -> None:
@@ -134,7 +131,8 @@ class Launcher:
             NodeError: a node failed, hung, had to be killed, or says at its end what it has lost; names it and its
                 last words.
         """
-        while not stop and not self._failures() and self._sources_run():
+        # When no camera runs, the others have the end of the stream and end by themselves.
+        while not stop and not self._failures() and any(p.runs for p in self._processes if p.kind == "camera"):
             self._look_after_all()
             self._report("running" if self._reported_ready else "starting")
             time.sleep(POLL_S)
@@ -151,20 +149,13 @@ class Launcher:
         _log.info("launching", nodes=len(self._launch.nodes), sockets=str(folder))
         leave_launch_note(self._launch, folder)
         endpoints = {name: f"ipc://{folder}/{name}" for name in self._launch.sockets()}
-        names = [n.name for n in self._launch.nodes]
-        self._status = LaunchStatus(self._stack, endpoints, names, self._launch.publish, self._launch.keys)
-        server = ForkServer(node_environment())
-        self._stack.callback(server.close)
+        self._status = LaunchStatus(self._stack, endpoints, self._launch)
         for node in self._launch.nodes:
-            self._processes.append(ManagedProcess(node, self._launch, endpoints, str(folder), server))
+            self._processes.append(ManagedProcess(node, self._launch, endpoints, str(folder)))
 
     def _failures(self) -> list[str]:
         """Of nodes that are not started any more: the first one may explain the others."""
         return [p.failure for p in sorted(self._processes, key=lambda p: p.failed_at) if p.failure]
-
-    def _sources_run(self) -> bool:
-        """Whether a camera still runs: when none does, the others have the end of the stream and end by themselves."""
-        return any(p.runs for p in self._processes if p.kind == "camera")
 
     def _look_after_all(self, *, last: bool = False) -> None:
         for process in self._processes:
@@ -226,25 +217,17 @@ class LaunchStatus:
     frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms`` and ``fds``, and the ages ``start``
     (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
 
-    Args:
-        stack: Its sockets are freed with this.
-        endpoints: Of the nodes and, under ``STATUS_SOCKET``, of this topic.
-        nodes: Names of those that may publish a status.
-        public, keys: A second endpoint for it, see ``PublicPublisher``.
-
     Raises:
         TransportError: the endpoint cannot be bound.
     """
 
-    def __init__(
-        self, stack: ExitStack, endpoints: Mapping[str, str], nodes: Sequence[str], public: str, keys: str
-    ) -> None:
+    def __init__(self, stack: ExitStack, endpoints: Mapping[str, str], launch: Launch) -> None:
         self._began = time.monotonic()
         self._reported_at = 0.0
         self._own: dict[str, Status] = {}
-        publisher = PublicPublisher(endpoints[STATUS_SOCKET], public, keys, linger_ms=200)
-        self._publisher = stack.enter_context(publisher)
-        self._subscriber = stack.enter_context(NewestSubscriber([endpoints[name] for name in nodes], ("status",)))
+        own, file, nodes = endpoints[STATUS_SOCKET], launch.file, [endpoints[node.name] for node in launch.nodes]
+        self._publisher = stack.enter_context(PublicPublisher(own, file.publish, file.keys, linger_ms=200))
+        self._subscriber = stack.enter_context(NewestSubscriber(nodes, ("status",)))
 
     def report(self, processes: Sequence[ManagedProcess], state: NodeState, *, now: bool = False) -> None:
         """Publish, if it is time to."""
@@ -256,15 +239,11 @@ class LaunchStatus:
                 self._own[message.node] = message
         statuses = [node_status(managed, self._own.get(managed.name)) for managed in processes]
         for status in (*statuses, self._of_launch(processes, statuses, state)):
-            self._publish(status)
-
-    def _publish(self, status: Status) -> None:
-        """What cannot be published is no reason to end a launch."""
-        short = tuple(sentence[:MAX_SENTENCE] for sentence in status.degraded[:MAX_SENTENCES])
-        try:
-            self._publisher.publish(encode(replace(status, degraded=short)))
-        except (CodecError, TransportError) as error:
-            _log.warning("status_not_sent", node=status.node, reason=str(error))
+            short = tuple(sentence[:MAX_SENTENCE] for sentence in status.degraded[:MAX_SENTENCES])
+            try:
+                self._publisher.publish(encode(replace(status, degraded=short)))
+            except (CodecError, TransportError) as error:  # no reason to end a launch
+                _log.warning("status_not_sent", node=status.node, reason=str(error))
 
     def _of_launch(self, processes: Sequence[ManagedProcess], statuses: Sequence[Status], state: NodeState) -> Status:
         degraded = tuple(f"node '{s.node}' is not well" for s in statuses if s.degraded)
@@ -315,7 +294,3 @@ def process_stats(pid: int) -> dict[str, int]:
             }
     except (psutil.Error, OSError):
         return {}
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split("\n"))

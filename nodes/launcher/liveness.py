@@ -29,16 +29,10 @@ _ACTIVE = (psutil.STATUS_RUNNING, psutil.STATUS_DISK_SLEEP)
 # Of a limit; a process whose main thread is stuck uses a tenth of it for its heartbeats, one of fifty that compute on
 # a core uses four times as much.
 _LEAST_CPU = 0.005
-_CPU_READINGS = 20  # within a limit: reading the processor time costs some, too
 
 
 class HeartbeatWriter:
-    """The node's end of the pipe.
-
-    Args:
-        fd: Where to write; -1 = no launcher listens.
-        orphan_timeout_s: See ``ORPHAN_TIMEOUT_S``.
-    """
+    """The node's end of the pipe ``fd``; -1 = no launcher listens."""
 
     def __init__(self, fd: int, orphan_timeout_s: int = ORPHAN_TIMEOUT_S) -> None:
         self._fd = fd
@@ -118,17 +112,9 @@ def _signal_when_launcher_dies(signum: signal.Signals) -> None:
 
 
 class HeartbeatMonitor:
-    """The launcher's end of the pipe; it tells a frozen process from one that is busy or waits for a processor.
+    """The launcher's end of the pipe; it distinguishes a frozen process from one that is busy or waits for a processor.
 
-    Args:
-        fd: The pipe.
-        pid: Of the process.
-        heartbeat_s: Of the launch file.
-
-    Attributes:
-        ready, ending: Whether start-up is over, and whether results are being written.
-        frames: Published, where the node counts them.
-        turns: How often turns were among it: of the main loop, or steps of writing results.
+    ``heartbeat_s`` is that of the launch file.
     """
 
     def __init__(self, fd: int, pid: int, heartbeat_s: float) -> None:
@@ -139,8 +125,9 @@ class HeartbeatMonitor:
         self._started = self._last_beat = time.monotonic()
         self._last_turn: float | None = None
         self._last_frame: float | None = None
-        self.ready = self.ending = False
-        self.frames = self.turns = 0
+        self.ready = self.ending = False  # whether start-up is over, and whether results are being written
+        self.frames = 0  # published, where the node counts them
+        self.turns = 0  # how often turns were among it: of the main loop, or steps of writing results
         os.set_blocking(fd, False)
 
     @property
@@ -182,11 +169,7 @@ class HeartbeatMonitor:
         self.ready |= RUNNING in beats or self.ending
 
     def find_hang(self, *, stopping: bool) -> str:
-        """Why the process has to be killed; empty where it need not be.
-
-        Args:
-            stopping: It was requested to stop: start-up has no limit then.
-        """
+        """Why the process has to be killed; empty = no need. Start-up has no limit in one that is to stop."""
         self.poll()
         frozen, busy_s = self._is_frozen(), max(self._heartbeat_s, BUSY_SILENCE_S)
         if frozen or self.silent_s > busy_s:
@@ -209,23 +192,19 @@ class HeartbeatMonitor:
 
 
 class ProgressLimit:
-    """A limit on the time without progress, however long all of the work takes.
+    """A limit on the time without progress, however long all of the work takes. ``clock`` is monotonic.
 
     On a machine that has too much to do, a process may wait for the processor nearly all the time. It gets on if it
     says so, or if it has used the processor. What has used the processor for the whole limit, and has said nothing, has
     lost its way.
-
-    Args:
-        limit_s: Seconds without a new mark and without processor time, or seconds of processor time without a new mark.
-        cpu_s: Processor time of the process so far, seconds.
-        clock: Seconds, monotonic.
     """
 
     def __init__(self, limit_s: float, cpu_s: Callable[[], float], clock: Callable[[], float] = time.monotonic) -> None:
         self._limit_s = limit_s
         self._cpu_s = cpu_s
         self._clock = clock
-        self._begin(None)
+        self._mark: object = self  # none that a process could report
+        self._since = self._cpu_at_mark = self._cpu_at_progress = 0.0
 
     def exceeded(self, mark: object = None) -> bool:
         """Whether nothing got on for too long; to be called often.
@@ -233,26 +212,13 @@ class ProgressLimit:
         Args:
             mark: What the process says of its progress: anything that differs from before where it gets on.
         """
-        now = self._clock()
+        now, cpu = self._clock(), self._cpu_s()
         if mark != self._mark:
-            self._begin(mark)
-        if now < self._next_reading:
-            return False
-        self._next_reading = now + self._limit_s / _CPU_READINGS
-        cpu = self._cpu_s()
-        if self._cpu_at_mark is None:
+            self._mark, self._since = mark, now
             self._cpu_at_mark = self._cpu_at_progress = cpu
         if cpu - self._cpu_at_progress >= _LEAST_CPU * self._limit_s:
             self._since, self._cpu_at_progress = now, cpu
         return now - self._since > self._limit_s or cpu - self._cpu_at_mark > self._limit_s
-
-    def _begin(self, mark: object) -> None:
-        """There is progress: limits count from now."""
-        self._mark = mark
-        self._since = self._clock()
-        self._next_reading = self._since + self._limit_s / _CPU_READINGS
-        self._cpu_at_mark: float | None = None  # read with the first reading
-        self._cpu_at_progress = 0.0
 
 
 def cpu_seconds(pid: int) -> float:

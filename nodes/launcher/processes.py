@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import subprocess
@@ -14,17 +13,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 import msgspec
-import psutil
 import structlog
 
-from semantic_mapper.nodes.launcher.fork_server import ForkServer
 from semantic_mapper.nodes.launcher.launch_file import Launch, NodeEntry
-from semantic_mapper.nodes.launcher.liveness import (
-    BUSY_SILENCE_S,
-    HeartbeatMonitor,
-    ProgressLimit,
-    cpu_seconds,
-)
+from semantic_mapper.nodes.launcher.liveness import BUSY_SILENCE_S, HeartbeatMonitor, ProgressLimit, cpu_seconds
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT, STOP_SIGNAL
 from semantic_mapper.plain_text import visible, without_secrets
@@ -46,26 +38,20 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ProcessKind:
-    """How a kind of node is started and stopped."""
+    """How a kind of node is stopped."""
 
-    preloaded: bool  # forked from a process that has imported PyTorch and Open3D, which take seconds
     ends_with_stream: bool  # ends by itself when the stream does; otherwise it is requested to
     stop_s: float  # how long it may make no progress when it is to end
 
 
 # In the order in which they are stopped: sources first, so that the others get the end of the stream.
 PROCESS_TABLE: dict[str, ProcessKind] = {
-    "camera": ProcessKind(preloaded=False, ends_with_stream=True, stop_s=STOP_S),
-    "finetuner": ProcessKind(preloaded=True, ends_with_stream=False, stop_s=FINISH_S),
-    "foxglove": ProcessKind(preloaded=True, ends_with_stream=True, stop_s=STOP_S),
-    "recorder": ProcessKind(preloaded=False, ends_with_stream=True, stop_s=STOP_S),
-    "mapper": ProcessKind(preloaded=True, ends_with_stream=True, stop_s=FINISH_S),
+    "camera": ProcessKind(ends_with_stream=True, stop_s=STOP_S),
+    "finetuner": ProcessKind(ends_with_stream=False, stop_s=FINISH_S),
+    "foxglove": ProcessKind(ends_with_stream=True, stop_s=STOP_S),
+    "recorder": ProcessKind(ends_with_stream=True, stop_s=STOP_S),
+    "mapper": ProcessKind(ends_with_stream=True, stop_s=FINISH_S),
 }
-
-
-def node_environment() -> dict[str, str]:
-    """The launcher's, without what is meant for the launcher alone."""
-    return {name: value for name, value in os.environ.items() if name not in SYSTEMD_VARIABLES}
 
 
 class RestartBackoff:
@@ -90,55 +76,41 @@ class RestartBackoff:
 
 
 class NodeProcess:
-    """A running node. Its stderr is passed on line by line, marked with its name.
+    """A running node, in an interpreter of its own. Its stderr is passed on line by line, marked with its name.
 
     Args:
         kind: A row of the process table.
         job: What it is to do (``heartbeat_fd`` is filled in here).
-        server: Forks it, where its kind is preloaded; None = a new interpreter.
         heartbeat_s: Of the launch file.
 
     Raises:
-        OSError: no process, thread, file or memory is to be had; nothing is left behind.
+        OSError, RuntimeError: no process, thread, file or memory is to be had; nothing is left behind.
     """
 
-    def __init__(
-        self, kind: str, job: NodeJob, server: ForkServer | None = None, heartbeat_s: float = BUSY_SILENCE_S
-    ) -> None:
+    def __init__(self, kind: str, job: NodeJob, heartbeat_s: float = BUSY_SILENCE_S) -> None:
         self.name = job.name
         self.kind = kind
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
         self.stop_requested = False
         with ExitStack() as ours, ExitStack() as theirs:
-            self._beats, beats = _pipe(ours, theirs)
-            self._output, output = _pipe(ours, theirs)
-            given = _in_memory(msgspec.json.encode(msgspec.structs.replace(job, heartbeat_fd=beats)))
-            theirs.callback(os.close, given)
-            if server is not None and PROCESS_TABLE[kind].preloaded:
-                self._process = server.fork(f"semantic_mapper.nodes.{kind}.__main__", given, beats, output)
-            else:
-                self._process = _start_interpreter(kind, given, beats, output)
+            self._beats, beats = os.pipe()
+            ours.callback(os.close, self._beats)
+            theirs.callback(os.close, beats)
+            # Arguments are seen by all users (``ps``), and a camera's address may hold a password.
+            given = theirs.enter_context(open(os.memfd_create("job"), "w+b"))
+            given.write(msgspec.json.encode(msgspec.structs.replace(job, heartbeat_fd=beats)))
+            given.seek(0)
+            self._process = _start_interpreter(kind, given.fileno(), beats)
             ours.callback(self._end)
+            self.pid = self._process.pid
             self.heartbeat = HeartbeatMonitor(self._beats, self.pid, heartbeat_s)
             self._reader = threading.Thread(target=self._pass_on, name=f"stderr of {self.name}", daemon=True)
-            try:
-                self._reader.start()
-            except RuntimeError as error:
-                raise OSError(errno.EAGAIN, f"no thread that reads what '{self.name}' says: {error}") from error
+            self._reader.start()
             ours.pop_all()
-
-    @property
-    def pid(self) -> int:
-        """Process number."""
-        return self._process.pid
 
     def exit_code(self) -> int | None:
         """None while it runs; negative: the signal that ended it."""
-        try:
-            code = self._process.wait(0)
-        except (subprocess.TimeoutExpired, psutil.TimeoutExpired):
-            return None
-        return None if code is None else int(code)
+        return self._process.poll()
 
     def has_failed(self) -> bool:
         """Ended otherwise than well; our request may hit a process that is too young to handle it."""
@@ -161,25 +133,24 @@ class NodeProcess:
         """``STOP_SIGNAL``, once; no matter if it has ended already."""
         if not self.stop_requested:
             self.stop_requested = True
-            self._signal(STOP_SIGNAL)
+            self._process.send_signal(STOP_SIGNAL)
 
     def kill(self) -> None:
         """SIGKILL; no matter if it has ended already."""
-        self._signal(signal.SIGKILL)
+        self._process.kill()
 
     def wait(self, timeout_s: float) -> bool:
         """Whether it ends within the time."""
         try:
             self._process.wait(timeout_s)
-        except (subprocess.TimeoutExpired, psutil.TimeoutExpired):
+        except subprocess.TimeoutExpired:
             return False
         return True
 
     def close(self) -> None:
         """Kill it if it still runs, and free what belongs to it."""
         self._end()
-        if self._reader.is_alive():
-            self._reader.join(timeout=2.0)  # a grandchild could keep the pipe open
+        self._reader.join(timeout=2.0)  # a grandchild could keep the pipe open
         os.close(self._beats)
 
     def describe_exit(self) -> str:
@@ -199,17 +170,14 @@ class NodeProcess:
         end = f"node '{self.name}' ({self.kind}) ended: {self.describe_exit()}"
         return end + (f"; its last words: {words}" if words else "")
 
-    def _signal(self, signum: signal.Signals) -> None:
-        if self.exit_code() is None:
-            self._process.send_signal(signum)
-
     def _end(self) -> None:
         self.kill()
         if not self.wait(KILL_S):  # in the kernel, for a device or a disk that does not answer
             _log.error("node_does_not_die", node=self.name, pid=self.pid)
 
     def _pass_on(self) -> None:
-        with os.fdopen(self._output, "rb") as stream:
+        assert self._process.stdout is not None
+        with self._process.stdout as stream:
             for raw in stream:
                 line = visible(without_secrets(raw.decode(errors="replace").rstrip("\n")))
                 self.tail.append(line)
@@ -220,40 +188,37 @@ class NodeProcess:
                     continue
 
 
+def _start_interpreter(kind: str, job: int, heartbeat: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        # -I: a sourced workspace on PYTHONPATH, or a file in the current folder, cannot shadow our modules.
+        [sys.executable, "-I", "-m", f"semantic_mapper.nodes.{kind}", f"{JOB_PREFIX}{job}"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        pass_fds=(heartbeat, job),
+        env={name: value for name, value in os.environ.items() if name not in SYSTEMD_VARIABLES},
+        process_group=0,  # Ctrl-C in the terminal reaches the launcher only, which then stops all in order
+    )
+
+
 class ManagedProcess:
-    """Starts a node at once, and again where it fails and its launch file says so.
+    """Starts a node at once, and again where it fails and its launch file says so."""
 
-    Args:
-        entry: Of the launch file.
-        launch: For its options and limits.
-        endpoints: Of all nodes.
-        folder: Of the launch.
-        server: Forks the processes of preloaded kinds; None = each is a new interpreter.
-    """
-
-    def __init__(
-        self,
-        entry: NodeEntry,
-        launch: Launch,
-        endpoints: dict[str, str],
-        folder: str,
-        server: ForkServer | None = None,
-    ) -> None:
+    def __init__(self, entry: NodeEntry, launch: Launch, endpoints: dict[str, str], folder: str) -> None:
         self.name = entry.name
         self.kind = entry.kind
         self.process: NodeProcess | None = None
         self.failure = ""  # why it is not started any more
         self.failed_at = 0.0
-        self._entry = entry
-        self._launch = launch
-        self._server = server
+        self._restarts = entry.restart != "never"
+        self._heartbeat_s = launch.file.heartbeat_s
         self._job = NodeJob(
             name=entry.name,
             options=msgspec.to_builtins(launch.options[entry.name]),
             endpoints=endpoints,
             subscribers=launch.listeners(entry.name),
             folder=folder,
-            restartable=entry.restart != "never",
+            restartable=self._restarts,
         )
         self._backoff = RestartBackoff()
         self._due = 0.0  # of the next start, while there is no process
@@ -291,7 +256,7 @@ class ManagedProcess:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What happened to it recent."""
+        """What happened to it recently."""
         if self.failure or self.loss:
             return (self.failure or self.loss,)
         recent = self._backoff.recent(time.monotonic())
@@ -312,11 +277,8 @@ class ManagedProcess:
             elif not self.failure and time.monotonic() >= self._due:
                 self._start()
         elif self.process.exit_code() is None:
-            hang = self.process.heartbeat.find_hang(stopping=self.process.stop_requested)
-            if hang:
-                self.process.kill()
-                self.process.wait(KILL_S)
-                self._on_failure(self.process, hang, last=last)
+            if hang := self.process.heartbeat.find_hang(stopping=self.process.stop_requested):
+                self._kill(self.process, hang, last=last)
         elif last and self.process.was_terminated:
             self.process.request_stop()  # the process that ends us may have sent the signal to all of us
         elif self.process.has_failed() and not self.failure:
@@ -341,10 +303,8 @@ class ManagedProcess:
         if self.process is None or self.process.exit_code() is not None:
             return
         self.process.request_stop()
-        if not self.process.wait(KILL_S):
-            self.process.kill()
-            self.process.wait(KILL_S)
-        self._on_failure(self.process, f"it did not end, and made no progress for {limit_s:g} s", last=True)
+        self.process.wait(KILL_S)
+        self._kill(self.process, f"it did not end, and made no progress for {limit_s:g} s", last=True)
 
     def request_stop(self) -> None:
         """Of its process, if there is one."""
@@ -354,18 +314,18 @@ class ManagedProcess:
 
     def start_to_finish(self) -> None:
         """Start a node that is given up once more, to be stopped: it writes results of what it saved."""
-        if not self.failure or self._finishing or self._hopeless or self._entry.restart == "never":
+        if not self.failure or self._finishing or self._hopeless or not self._restarts:
             return
         self._finishing = True
         before = self.process
         try:
-            self._start_process(self.restarts + 1)  # it goes on from what this launch saved
-        except OSError as error:
+            process = self._start_process(self.restarts + 1)  # it goes on from what this launch saved
+        except (OSError, RuntimeError) as error:
             _log.error("results_not_written", node=self.name, reason=str(error))
             return
         if before is not None:
             before.close()
-        _log.info("node_finishes", node=self.name, pid=self.process.pid if self.process else 0)
+        _log.info("node_finishes", node=self.name, pid=process.pid)
 
     def close(self) -> None:
         """Leave no process behind."""
@@ -377,13 +337,10 @@ class ManagedProcess:
         count = self.restarts
         try:
             process = self._start_process(count)
-        except OSError as error:  # no process, memory or file is to be had: that may pass
+        except (OSError, RuntimeError) as error:  # no process, memory or file is to be had: that may pass
             _log.error("node_not_started", node=self.name, reason=str(error))
-            text = f"node '{self.name}' ({self.kind}) could not be started: {error}"
-            if self._entry.restart == "never":
-                self._give_up(text)
-            else:
-                self._restart_later(text, f"could not be started: {error}")
+            reason = f"could not be started: {error}"
+            self._restart_or_give_up(f"node '{self.name}' ({self.kind}) {reason}", reason, restart=self._restarts)
             return
         _log.info("node_started", node=self.name, kind=self.kind, pid=process.pid, restarts=count)
 
@@ -391,9 +348,14 @@ class ManagedProcess:
         # A restarted node waits for no subscribers: the others are there, and frames do not wait.
         subscribers = 0 if restarts else self._job.subscribers
         job = msgspec.structs.replace(self._job, restarts=restarts, subscribers=subscribers)
-        self.process = process = NodeProcess(self.kind, job, self._server, self._launch.heartbeat_s)
+        self.process = process = NodeProcess(self.kind, job, self._heartbeat_s)
         self._end_limit: ProgressLimit | None = None  # of this process, once its end is awaited
         return process
+
+    def _kill(self, process: NodeProcess, why: str, *, last: bool) -> None:
+        process.kill()
+        process.wait(KILL_S)
+        self._on_failure(process, why, last=last)
 
     def _on_failure(self, process: NodeProcess, why: str, *, last: bool) -> None:
         text = process.describe_end() + (f" ({why})" if why else "")
@@ -403,13 +365,15 @@ class ManagedProcess:
         failed_itself = code is not None and code > 0 and not process.was_terminated
         hopeless = failed_itself and not process.heartbeat.ready and not self.restarts
         self._hopeless |= hopeless
-        if last or hopeless or self._entry.restart == "never":
-            self._give_up(text)
-        else:
-            self._restart_later(text, why or process.describe_exit())
+        restart = self._restarts and not (last or hopeless)
+        self._restart_or_give_up(text, why or process.describe_exit(), restart=restart)
+        if restart:
             self.close()
 
-    def _restart_later(self, text: str, reason: str) -> None:
+    def _restart_or_give_up(self, text: str, reason: str, *, restart: bool) -> None:
+        if not restart:
+            self._give_up(text)
+            return
         delay = self._backoff.delay_s(time.monotonic())
         self._last_end, self._last_reason = text, reason
         self._due = time.monotonic() + delay
@@ -418,36 +382,3 @@ class ManagedProcess:
     def _give_up(self, why: str) -> None:
         self.failure = why
         self.failed_at = time.monotonic()
-
-
-def _pipe(ours: ExitStack, theirs: ExitStack) -> tuple[int, int]:
-    read, write = os.pipe()
-    ours.callback(os.close, read)
-    theirs.callback(os.close, write)
-    return read, write
-
-
-def _start_interpreter(kind: str, job: int, heartbeat: int, output: int) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        # -I: a sourced workspace on PYTHONPATH, or a file in the current folder, cannot shadow our modules.
-        [sys.executable, "-I", "-m", f"semantic_mapper.nodes.{kind}", f"{JOB_PREFIX}{job}"],
-        stdin=subprocess.DEVNULL,
-        stdout=output,
-        stderr=subprocess.STDOUT,
-        pass_fds=(heartbeat, job),
-        env=node_environment(),
-        process_group=0,  # Ctrl-C in the terminal reaches the launcher only, which then stops all in order
-    )
-
-
-def _in_memory(job: bytes) -> int:
-    """An open file with a job. Arguments are seen by all users (``ps``), and a camera's address may hold a password."""
-    fd = os.memfd_create("job")
-    try:
-        with open(fd, "wb", closefd=False) as file:
-            file.write(job)
-        os.lseek(fd, 0, os.SEEK_SET)
-    except OSError:
-        os.close(fd)
-        raise
-    return fd

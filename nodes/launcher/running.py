@@ -22,6 +22,7 @@ from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
 from semantic_mapper.nodes.process_folder import is_in_use, own_folders
 from semantic_mapper.plain_text import plain_without_secrets, visible
+from semantic_mapper.replay.summary import dig
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 
@@ -55,15 +56,9 @@ class LaunchNote(msgspec.Struct, frozen=True):
 
 
 def leave_launch_note(launch: Launch, folder: Path) -> None:
-    """Write the note of a launch into its folder, as it may stand in every recording.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    nodes = tuple(
-        NodeNote(n.name, n.kind, plain_without_secrets(msgspec.to_builtins(launch.options[n.name])))
-        for n in launch.nodes
-    )
+    """Write the note of a launch into its folder, as it may stand in every recording."""
+    options = plain_without_secrets(msgspec.to_builtins(launch.options))
+    nodes = tuple(NodeNote(n.name, n.kind, options[n.name]) for n in launch.nodes)
     text = msgspec.json.format(msgspec.json.encode(LaunchNote(launch.name, nodes)), indent=1)
     write_bytes(folder / NOTE, text, sync="none")
 
@@ -76,12 +71,10 @@ def read_launch_note(folder: Path) -> LaunchNote:
     """
     try:
         return msgspec.json.decode(read_regular(folder / NOTE, MAX_FILE_BYTES), type=LaunchNote)
-    except OSError as error:
+    except (OSError, msgspec.DecodeError) as error:
         raise TransportError(
-            f"{folder}: no socket folder of a launch ({error.strerror}); `up` names its own"
+            f"{folder / NOTE}: no note of a launch of this version of the package: {error}; `up` names its folder"
         ) from error
-    except msgspec.DecodeError as error:
-        raise TransportError(f"{folder / NOTE}: {error}; does another version of the package run there?") from error
 
 
 def running_launches() -> list[Path]:
@@ -98,17 +91,12 @@ def running_launches() -> list[Path]:
 
 
 def launch_folder(place: str) -> Path:
-    """The socket folder of a running launch.
-
-    Args:
-        place: The folder itself; empty = that of the one launch that runs.
+    """The socket folder of a running launch; an empty place stands for the one launch that runs.
 
     Raises:
         TransportError: none runs, several do, or the folder is not that of a launch.
     """
     if place:
-        if not Path(place).exists():
-            raise TransportError(f"{place}: no such folder; `up` names the socket folder of its launch as it starts")
         if not (Path(place) / STATUS_SOCKET).exists():
             raise TransportError(f"{place}: no socket folder of a launch that runs; `up` names its own as it starts")
         return Path(place).absolute()
@@ -120,18 +108,13 @@ def launch_folder(place: str) -> Path:
     return folders[0]
 
 
-def refuse_missing_socket(endpoint: str) -> None:
-    """Say at once that nobody answers, rather than after several attempts, where there is not even a socket's file.
+def socket_in_launch(place: str, name: str) -> str:
+    """The endpoint ``name`` of a running launch, which is named as for ``launch_folder``; endpoints stay as they are.
 
     Raises:
-        TransportError: an ``ipc://`` path without a file.
+        TransportError: as of ``launch_folder``.
     """
-    transport, _, path = endpoint.partition("://")
-    if transport == "ipc" and path and not path.startswith("@") and not Path(path).exists():
-        raise TransportError(
-            f"{endpoint}: there is no such socket; does the mapper run? `up` names the socket folder of its launch as "
-            "it starts, and its mapper answers at ipc://FOLDER/query"
-        )
+    return place if "://" in place else f"ipc://{launch_folder(place)}/{name}"
 
 
 def map_endpoint(place: str) -> str:
@@ -143,24 +126,19 @@ def map_endpoint(place: str) -> str:
     Raises:
         TransportError: there is no such socket, no launch runs, or several do.
     """
-    if place == LIVE:
-        place = f"ipc://{launch_folder('')}/{QUERY_SOCKET}"
-    elif (Path(place) / STATUS_SOCKET).exists():
-        place = f"ipc://{Path(place).absolute()}/{QUERY_SOCKET}"
-    if "://" not in place:
-        return ""
-    refuse_missing_socket(place)
-    return place
+    if place == LIVE or (Path(place) / STATUS_SOCKET).exists():
+        place = socket_in_launch("" if place == LIVE else place, QUERY_SOCKET)
+    transport, separator, path = place.partition("://")
+    if transport == "ipc" and path and not path.startswith("@") and not Path(path).exists():
+        raise TransportError(  # at once, rather than after several attempts
+            f"{place}: there is no such socket; does the mapper run? `up` names the socket folder of its launch as "
+            "it starts, and its mapper answers at ipc://FOLDER/query"
+        )
+    return place if separator else ""
 
 
 def node_endpoints(folder: Path) -> dict[str, str]:
-    """Where the nodes of a running launch publish, as soon as all of them have said that they run.
-
-    Args:
-        folder: Of the launch, from ``launch_folder``.
-
-    Returns:
-        By the name of each node that has not ended.
+    """Where the nodes of a running launch that have not ended publish, by name, as soon as all have said that they run.
 
     Raises:
         TransportError: the launcher says nothing, or not all nodes have come to run in time.
@@ -189,18 +167,6 @@ def _all_ready(known: Mapping[str, Status]) -> bool:
     if launch is None or len(known) - 1 < launch.counters["nodes"]:
         return False
     return all(status.state != "starting" for status in known.values())
-
-
-def status_endpoint(place: str) -> str:
-    """Where the launcher of a running launch publishes how it goes.
-
-    Args:
-        place: An endpoint, or a socket folder; empty = that of the one launch that runs.
-
-    Raises:
-        TransportError: none runs, several do, or the folder is not that of a launch.
-    """
-    return place if "://" in place else f"ipc://{launch_folder(place)}/{STATUS_SOCKET}"
 
 
 class LaunchView:
@@ -252,19 +218,14 @@ class LaunchView:
 
     def table(self) -> Table:
         """For people."""
-        table = Table(
-            title=f"launch, heard {self.silent_s:.1f} s ago",
-            title_justify="left",
-            box=SIMPLE,
-            collapse_padding=True,
-            pad_edge=False,
-        )
+        table = Table(title=f"launch, heard {self.silent_s:.1f} s ago", title_justify="left", box=SIMPLE)
+        table.collapse_padding, table.pad_edge = True, False
         for heading in ("node", *_COLUMNS):
             table.add_column(heading, justify="left" if heading in ("node", "state") else "right", no_wrap=True)
         shown = self.to_json()
         rows = {**shown["nodes"], **({STATUS_SOCKET: shown["launch"]} if shown["launch"] else {})}
         for name, row in rows.items():
-            table.add_row(name, *(show(row) for show in _COLUMNS.values()))
+            table.add_row(name, *(_cell(row, *column) for column in _COLUMNS.values()))
         warnings = [f"{name}: {t}" for name, row in rows.items() for t in row["degraded"] if name != STATUS_SOCKET]
         if warnings:
             table.caption, table.caption_justify = Text("\n".join(map(visible, warnings))), "left"
@@ -277,17 +238,16 @@ def _describe(history: list[Status]) -> dict[str, Any]:
     seconds, said_s = (last.stamp_ns - since.stamp_ns) / 1e9, _said_s(last) - _said_s(since)
     gained = {name: last.counters[name] - since.counters.get(name, 0) for name in last.counters}
     rates = {name: gained[name] / said_s for name in _RATES if name in gained} if said_s > 0 else {}
-    cpu = {"cpu_percent": round(gained["cpu_ms"] / seconds / 10, 1)} if seconds and "cpu_ms" in gained else {}
-    step = {"step_ms": round(gained["step_us"] / gained["fused"] / 1e3, 2)} if gained.get("fused") else {}
+    losses = [last.counters[name] for name in _LOSSES if name in last.counters]
     return {
         "state": last.state,
         "pid": last.counters.get("pid"),
         "restarts": last.counters.get("restarts", 0),
         "memory_mb": round(last.counters.get("rss_kb", 0) / 1024, 1),
         **({"log_mb": round(last.counters["log_kb"] / 1024, 1)} if "log_kb" in last.counters else {}),
-        "lost": _lost(last.counters),
-        **cpu,
-        **step,
+        "lost": sum(losses) if losses else None,
+        **({"cpu_percent": round(gained["cpu_ms"] / seconds / 10, 1)} if seconds and "cpu_ms" in gained else {}),
+        **({"step_ms": round(gained["step_us"] / gained["fused"] / 1e3, 2)} if gained.get("fused") else {}),
         "rates_hz": {name: round(rate, 2) for name, rate in rates.items()},
         "ages_s": {name: round(age, 3) for name, age in last.ages_s.items()},
         "counters": dict(last.counters),
@@ -300,46 +260,30 @@ def _said_s(status: Status) -> float:
     return status.stamp_ns / 1e9 - status.ages_s.get("status", 0.0)
 
 
-def _rate(name: str) -> Any:
-    return lambda row: f"{row['rates_hz'][name]:.1f}" if name in row["rates_hz"] else ""
-
-
-def _figure(name: str, pattern: str = "{}") -> Any:
-    return lambda row: pattern.format(row[name]) if row.get(name) is not None else ""
-
-
-def _age(name: str) -> Any:
-    return lambda row: f"{row['ages_s'][name]:.1f}" if name in row["ages_s"] else ""
-
-
-def _lost(counters: Mapping[str, int]) -> int | None:
-    """What a node lost, of what it should have passed on, mapped or recorded; None where it does not say."""
-    known = [counters[name] for name in _LOSSES if name in counters]
-    return sum(known) if known else None
-
-
-def _frame_rate(row: Mapping[str, Any]) -> str:
-    return _rate("published")(row) or _rate("recorded")(row)
+def _cell(row: Mapping[str, Any], pattern: str, *names: str) -> str:
+    """The first of the figures that a node has, by dotted name; empty where it has none."""
+    values = (dig(row, name) for name in names)
+    return next((pattern.format(value) for value in values if value is not None), "")
 
 
 _RATES = ("published", "fused", "recorded", "messages")
 # Mapper: frames that never came, or could not be used. Camera: images that became no frame, for want of a pose mostly.
 # Recorder: frames that never came, and messages that the disk had no room for. All: messages that could not be read.
 _LOSSES = ("missed", "refused", "missing", "lost", "rejected")
-_COLUMNS: dict[str, Any] = {
-    "state": _figure("state"),
-    "pid": _figure("pid"),
-    "up s": _age("start"),
-    "restarts": _figure("restarts"),
-    "MB": _figure("memory_mb", "{:.0f}"),
-    "cpu %": _figure("cpu_percent", "{:.0f}"),
-    "frames/s": _frame_rate,
-    "mapped/s": _rate("fused"),
-    "step ms": _figure("step_ms", "{:.1f}"),
-    "frame s": _age("frame"),
-    "age s": _age("capture"),
-    "msgs/s": _rate("messages"),
-    "log MB": _figure("log_mb", "{:.1f}"),
-    "lost": _figure("lost"),
-    "beat s": _age("beat"),
+_COLUMNS = {  # by heading: how it is written, and what
+    "state": ("{}", "state"),
+    "pid": ("{}", "pid"),
+    "up s": ("{:.1f}", "ages_s.start"),
+    "restarts": ("{}", "restarts"),
+    "MB": ("{:.0f}", "memory_mb"),
+    "cpu %": ("{:.0f}", "cpu_percent"),
+    "frames/s": ("{:.1f}", "rates_hz.published", "rates_hz.recorded"),
+    "mapped/s": ("{:.1f}", "rates_hz.fused"),
+    "step ms": ("{:.1f}", "step_ms"),
+    "frame s": ("{:.1f}", "ages_s.frame"),
+    "age s": ("{:.1f}", "ages_s.capture"),
+    "msgs/s": ("{:.1f}", "rates_hz.messages"),
+    "log MB": ("{:.1f}", "log_mb"),
+    "lost": ("{}", "lost"),
+    "beat s": ("{:.1f}", "ages_s.beat"),
 }

@@ -191,7 +191,7 @@ class LiveLaunch:
 
     def all_pids(self) -> list[int]:
         """Of every process that ever was."""
-        return [int(pid) for pid in self.told.all(r"(?:node|fork_server)_started .*pid=(\d+)")]
+        return [int(pid) for pid in self.told.all(r"node_started .*pid=(\d+)")]
 
     def logged(self) -> set[Key]:
         """All messages that can be read in its logs."""

@@ -190,7 +190,7 @@ class Running:
 
     def all_pids(self) -> list[int]:
         """Of nodes, and of the process that forks them."""
-        return [int(n) for line in self.lines for n in re.findall(r"(?:node|fork_server)_started.*pid=(\d+)", line)]
+        return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
 
     def node_pid(self, name: str) -> int:
         line = self.wait_for_line(rf"node_started.*node={name}\b")

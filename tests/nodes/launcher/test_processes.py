@@ -134,9 +134,9 @@ def test_a_node_that_writes_results_is_killed_where_it_is_stuck_not_where_it_is_
 ) -> None:
     now_s, limit_s = 1000.0, 15.0
 
-    def interpreter(kind: str, job: int, beats: int, output: int) -> subprocess.Popen[bytes]:
+    def interpreter(kind: str, job: int, beats: int) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-I", "-c", WRITER, f"fd:{job}"]
-        return subprocess.Popen(command, stdout=output, stderr=output, pass_fds=(beats, job))
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, pass_fds=(beats, job))
 
     monkeypatch.setattr(processes, "_start_interpreter", interpreter)
     monkeypatch.setattr(processes, "ProgressLimit", lambda s, cpu_s: ProgressLimit(s, lambda: 0.0, lambda: now_s))

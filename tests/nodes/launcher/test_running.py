@@ -22,7 +22,7 @@ def test_advice_fits_how_many_launches_run(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(TransportError) as caught:
         launch_folder("")
     assert all(str(folder) in str(caught.value) for folder in both) and "starts one" not in str(caught.value)
-    with pytest.raises(TransportError, match="missing: no such folder"):
+    with pytest.raises(TransportError, match="missing: no socket folder"):
         launch_folder(str(tmp_path / "missing"))
 
 

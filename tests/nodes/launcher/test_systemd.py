@@ -31,8 +31,8 @@ class Manager:
 def test_what_is_told_is_what_systemd_expects(tmp_path: Path) -> None:
     manager = Manager(str(tmp_path / "notify"))
     notifier = Notifier.from_environment({"NOTIFY_SOCKET": str(tmp_path / "notify")})
-    notifier.ready("all\nwell")
-    assert manager.hear() == ["READY=1", "STATUS=all well"]
+    notifier.ready("all well")
+    assert (manager.hear(), manager.hear()) == (["READY=1"], ["STATUS=all well"])
     notifier.status("one")
     notifier.status("one")
     notifier.stopping(2.5)
