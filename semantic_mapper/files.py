@@ -30,10 +30,7 @@ _NAME_BYTES = 200  # of the final name that are part of the other one: names end
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file to be read.
-
-    Args:
-        path: Of the file. Pipes, devices and sockets are refused: they may never end, or never begin.
+    """Open a regular file to be read. Pipes, devices and sockets are refused: they may never end, or never begin.
 
     Raises:
         ConfigError: no regular file.
@@ -47,15 +44,10 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_regular(path: Path, limit: int) -> bytes:
-    """All bytes of a regular file.
-
-    Args:
-        path: Of the file. Pipes, devices and sockets are refused: they may never end, or never begin.
-        limit: Largest size in bytes.
+    """All bytes of a regular file of at most ``limit`` bytes.
 
     Raises:
-        ConfigError: no regular file, or a larger one.
-        OSError: it is missing or cannot be read; ``filename`` is set.
+        ConfigError, OSError: as of ``open_regular``; or it is larger.
     """
     with open_regular(path) as file:
         data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
@@ -144,23 +136,14 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def open_unlinked(path: str | Path, flags: int) -> int:
-    """``os.open`` that follows no link at the end of ``path``, and makes the file where ``flags`` has ``O_CREAT``.
-
-    Raises:
-        OSError: as of ``os.open``; ELOOP for a link.
-    """
+    """``os.open`` that follows no link at the end of ``path``, and makes the file where ``flags`` has ``O_CREAT``."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 def remove_stale(folder: Path, name: str = "") -> list[Path]:
     """Remove unfinished files that killed processes have left in a folder; those that are being written stay.
 
-    Args:
-        folder: Of the files.
-        name: Only those that were to become this one; empty = all.
-
-    Returns:
-        What was removed.
+    With a name only those that were to become this one. Returns what was removed.
     """
     removed = []
     with suppress(OSError):  # no such folder, or one of somebody else: nothing of ours to remove

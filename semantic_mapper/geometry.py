@@ -50,12 +50,7 @@ def expect_shape(x: torch.Tensor | NDArray[np.generic], pattern: str, name: str 
 
 
 def check_pose(T_world_camera: Float64, where: str, of: str = "camera") -> None:
-    """Refuse what is not a rigid transform.
-
-    Args:
-        T_world_camera: (4, 4).
-        where: Names the frame or file in the error.
-        of: Whose pose it is.
+    """Refuse what is not a rigid transform (4, 4) ``of`` something; ``where`` names the frame or file in the error.
 
     Raises:
         PoseError: NaN or infinite numbers, wrong last row, a 3x3 part that is not a rotation, or a position farther
@@ -219,11 +214,7 @@ def nearest_pixels(
 
 
 def unproject(depth_m: Float32, intrinsics: CameraIntrinsics) -> Float64:
-    """Unproject a depth image (H, W) to camera points (H, W, 3) in metres; z = 0 where there is no depth.
-
-    Raises:
-        ShapeError: the depth image is not of the camera's size.
-    """
+    """Unproject a depth image (H, W) of the camera's size to camera points (H, W, 3) in metres; z = 0 without depth."""
     expect_shape(depth_m, f"{intrinsics.height} {intrinsics.width}", "depth_m")
     z = depth_m.astype(np.float64)
     u = np.arange(intrinsics.width)[None, :]
@@ -254,13 +245,9 @@ def visible_points(
 ) -> NDArray[np.bool_]:
     """Which points a view sees: (P,), those in its image that nothing hides. A hole in its depth hides nothing.
 
-    Args:
-        points: (P, 3) world.
-        T_world_camera: (4, 4) of the view.
-        intrinsics: Of ``depth_m``.
-        depth_m: (H, W) float32, 0 = none.
-        measured: The points lie on measured surfaces, so a depth beyond them speaks of another surface. Else they are
-            guesses, and only what stands before them tells that they are not seen.
+    ``points`` are (P, 3) in the world, ``depth_m`` (H, W) with 0 = none. ``measured`` points lie on measured surfaces,
+    so a depth beyond them speaks of another surface. Others are guesses, and only what stands before them tells that
+    they are not seen.
     """
     p = transform(invert_pose(T_world_camera), points)
     inside, row, column = nearest_pixels(p, intrinsics)

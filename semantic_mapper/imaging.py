@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.geometry import expect_shape, scale_intrinsics
@@ -160,11 +162,7 @@ def draw_borders_to_edges(
 
 
 def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntrinsics:
-    """Intrinsics of an image that was turned clockwise by this many quarters of a full turn.
-
-    Raises:
-        FrameError: an image that is not rectified.
-    """
+    """Intrinsics of a rectified image (else FrameError) that was turned clockwise by quarters of a full turn."""
     if intrinsics.distorted:
         raise FrameError("an image with lens distortion cannot be turned by itself; rectify it first")
     k = intrinsics
@@ -183,17 +181,18 @@ def rotate_frame(frame: PosedFrame, quarters: int) -> PosedFrame:
     quarters %= 4
     if quarters == 0:
         return frame
+    images = {"depth_m": frame.depth_m, "label": frame.label, "depth_sigma_m": frame.depth_sigma_m}
     return replace(
         frame,
-        rgb=np.ascontiguousarray(np.rot90(frame.rgb, -quarters)),
-        depth_m=None if frame.depth_m is None else np.ascontiguousarray(np.rot90(frame.depth_m, -quarters)),
-        label=None if frame.label is None else np.ascontiguousarray(np.rot90(frame.label, -quarters)),
-        depth_sigma_m=(
-            None if frame.depth_sigma_m is None else np.ascontiguousarray(np.rot90(frame.depth_sigma_m, -quarters))
-        ),
+        rgb=_rotated(frame.rgb, quarters),
+        **{name: None if image is None else _rotated(image, quarters) for name, image in images.items()},
         intrinsics=rotate_intrinsics(frame.intrinsics, quarters),
         T_world_camera=frame.T_world_camera @ _turn(quarters),
     )
+
+
+def _rotated(image: NDArray[Any], quarters: int) -> NDArray[Any]:
+    return np.ascontiguousarray(np.rot90(image, -quarters))
 
 
 def _turn(quarters: int) -> Float64:

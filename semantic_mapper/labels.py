@@ -32,29 +32,21 @@ class LabelSet:
     ignore_id: int = 0  # the id that means "unknown, do not count"
 
     def __post_init__(self) -> None:
-        if not len(self.ids) == len(self.names) == len(self.colors):
-            raise LabelError(f"label set '{self.name}': ids, names and colors must have one entry a class")
-        if not self.ids:
-            raise LabelError(f"label set '{self.name}' has no classes")
-        if len(set(self.ids)) != len(self.ids) or len(set(self.names)) != len(self.names):
-            raise LabelError(f"label set '{self.name}' names a class or an id twice")
-        for class_id, name in ((None, self.name), *zip(self.ids, self.names, strict=True)):
-            if len(name) > MAX_NAME:
-                what = "its own name" if class_id is None else f"the name of class {class_id}"
-                raise LabelError(
-                    f"label set '{self.name[:MAX_NAME]}': {what} has {len(name):,} letters, and may have {MAX_NAME}"
-                )
-        if self.ignore_id is None:
-            raise LabelError(
-                f"label set '{self.name}': needs an ignore id; make_label_set chooses one for ignore_id=None"
-            )
-        if self.ignore_id in self.ids:
-            raise LabelError(
-                f"label set '{self.name}': id {self.ignore_id} is both a class and the ignore id; make_label_set with "
-                "ignore_id=None chooses one that is no class"
-            )
-        if not all(0 <= i <= 255 for i in (*self.ids, self.ignore_id)):
-            raise LabelError(f"label set '{self.name}': ids must lie in 0..255")
+        longest = max((self.name, *self.names), key=len)
+        troubles = (
+            (not len(self.ids) == len(self.names) == len(self.colors), "ids, names and colors: one entry a class"),
+            (not self.ids, "has no classes"),
+            (len(set(self.ids)) != len(self.ids) or len(set(self.names)) != len(self.names), "has a class twice"),
+            (len(longest) > MAX_NAME, f"{longest[:MAX_NAME]}... has {len(longest):,} letters, and may have {MAX_NAME}"),
+            (
+                self.ignore_id is None or self.ignore_id in self.ids,
+                f"needs an ignore id that is no class, got {self.ignore_id}; make_label_set(ignore_id=None) finds one",
+            ),
+            (not all(0 <= i <= 255 for i in (*self.ids, self.ignore_id or 0)), "ids must lie in 0..255"),
+        )
+        for wrong, what in troubles:
+            if wrong:
+                raise LabelError(f"label set '{self.name[:MAX_NAME]}': {what}")
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -107,10 +99,7 @@ class LabelSet:
         return tuple(i for i, name in zip(self.ids, self.names, strict=True) if name in MOVING_NAMES)
 
     def renamed(self, names: Mapping[str, str]) -> tuple[LabelSet, UInt8]:
-        """Give classes other names; classes that then have the same name become one, with the lowest of their ids.
-
-        Args:
-            names: New name of each class to rename, by its present one.
+        """Give classes other names, by the present ones; those that then have one name become one, of the lowest id.
 
         Returns:
             The new set, and its id for each id 0..255 of this one (ids that this set lacks stay as they are).
@@ -155,11 +144,8 @@ def make_label_set(
 ) -> LabelSet:
     """Build a label set with distinct generated colours.
 
-    Args:
-        name: Of the set.
-        names: One a class.
-        ids: One a class, 0 to 255; None = 1, 2, 3, ...
-        ignore_id: Means unknown; None, for a data set that has none: the highest id that is no class.
+    Without ids the classes are 1, 2, 3, ... The ignore id means unknown; None, for a data set that has none, stands for
+    the highest id that is no class.
 
     Raises:
         LabelError: names or ids that are no label set, or all 256 ids are classes, so that none can mean unknown.
@@ -209,7 +195,6 @@ _CARLA = (
     "roads sidewalks building wall fence pole trafficlight trafficsign vegetation terrain pedestrian car truck bus "
     "static dynamic water roadline ground bridge"
 ).split()
-
 _KLEVR = "background cube cylinder sphere torus gear".split()
 
 NYU40 = make_label_set("nyu40", _NYU40)
@@ -227,7 +212,5 @@ STUFF_NAMES = frozenset(
     "wall floor ceiling floormat otherstructure sky building road roads roadline pavement sidewalk sidewalks parking "
     "terrain vegetation tree fence ground water bridge static background".split()
 )
-
-
 # Classes of things that move by themselves. Vehicles are not among them: most that a camera meets are parked.
 MOVING_NAMES = frozenset("person people human pedestrian rider bicyclist cyclist motorcyclist animal dog cat".split())

@@ -21,11 +21,7 @@ _PROCESSORS: tuple[Any, ...] = (
 
 
 def get_logger(name: str) -> Any:
-    """As ``structlog.get_logger``.
-
-    Args:
-        name: Of the module; that of its logger in ``logging``.
-    """
+    """As ``structlog.get_logger``; ``name`` is that of the module, and of its logger in ``logging``."""
     return _Logger(name)
 
 

@@ -20,17 +20,11 @@ from semantic_mapper.types import MapUpdate, PosedFrame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapper:
-    """A mapping pipeline and the weights that it renders with; ``Mapper.load`` makes one.
+    """A mapping pipeline and the weights that it renders with; ``Mapper.load`` makes one."""
 
-    Args:
-        pipeline: What every frame goes through, live or replayed.
-        checkpoint: The weights, their classes and their training.
-        weights_path: File that they came from.
-    """
-
-    pipeline: MappingPipeline
-    checkpoint: Checkpoint
-    weights_path: Path
+    pipeline: MappingPipeline  # what every frame goes through, live or replayed
+    checkpoint: Checkpoint  # the weights, their classes and their training
+    weights_path: Path  # file that they came from
 
     @classmethod
     def load(cls, weights: Path | str | None = None, config: MapperConfig | Path | str | None = None) -> Mapper:

@@ -17,10 +17,7 @@ def keep_freed_memory() -> bool:
 
     By default glibc maps each large tensor again and unmaps it when it is freed, and the kernel clears its pages every
     time. The price is that memory stays the process's own at its peak. For processes that do the same work over and
-    over; the library itself never calls this.
-
-    Returns:
-        Whether it could be set: other C libraries than glibc have no such switch.
+    over; the library itself never calls this. False where the C library is not glibc, and has no such switch.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
@@ -32,10 +29,7 @@ def give_back_freed_memory() -> bool:
     """Return what this process has freed, and the C library still holds in pieces, to the system, once.
 
     A process that runs for hours holds more and more of it, up to a bound: between blocks that live long lie holes. It
-    takes some milliseconds; the library itself never calls this.
-
-    Returns:
-        Whether the C library can do that.
+    takes some milliseconds; the library itself never calls this. False where the C library cannot do that.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is None:

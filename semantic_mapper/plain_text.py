@@ -65,11 +65,7 @@ def visible(text: str, keep: str = "") -> str:
     r"""The text with every character that prints nothing, or steers what shows it, as an escape such as ``\x1b``.
 
     These are control characters (terminal commands, line breaks, tabs), those that turn the direction of writing, and
-    halves of surrogate pairs, as file names that are not UTF-8 hold them.
-
-    Args:
-        text: Any.
-        keep: Characters that stay as they are.
+    halves of surrogate pairs, as file names that are not UTF-8 hold them. Characters of ``keep`` stay as they are.
     """
     if text.isprintable():
         return text

@@ -126,11 +126,7 @@ def new_figure(width: int, height: int, **options: Any) -> Figure:
 
 
 def encode_picture(picture: UInt8, *, jpeg: bool = False) -> bytes:
-    """An RGB picture (H, W, 3) as PNG or JPEG.
-
-    Raises:
-        SemanticMapperError: OpenCV cannot encode it.
-    """
+    """An RGB picture (H, W, 3) as PNG or JPEG."""
     crisp = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)  # thin lines keep their colour
     kind, options = (
         (".jpg", (cv2.IMWRITE_JPEG_QUALITY, 90, *crisp)) if jpeg else (".png", (cv2.IMWRITE_PNG_COMPRESSION, 6))
@@ -219,10 +215,7 @@ def class_colors(label: UInt8, label_set: LabelSet) -> UInt8:
 def class_rows(labels: UInt8, label_set: LabelSet, shown: Sequence[UInt8] = ()) -> list[LegendRow]:
     """Classes that occur, the most frequent first and the unknown last.
 
-    Args:
-        labels: (N,) class ids of the map's points: fractions are of these.
-        label_set: Names and colours.
-        shown: Images of class ids (...) whose classes are listed, too.
+    Fractions are of ``labels``, (N,) class ids of the map's points; classes of the ``shown`` images are listed, too.
     """
     counts = np.bincount(labels.ravel(), minlength=256)
     present = counts + sum(np.bincount(image.ravel(), minlength=256) for image in shown) > 0

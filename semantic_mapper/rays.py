@@ -21,14 +21,7 @@ def pixel_rays(
 ) -> RayBatch:
     """Rays through pixels, in world coordinates (S-Ray Eq. 3 with z as the parameter).
 
-    Args:
-        pixels: (R, 2) float32 as (u, v).
-        intrinsics: Of the query view.
-        T_world_camera: (4, 4) float32.
-        near_m, far_m: z bounds for every ray.
-        prior_depth_m: (R,) z, 0 = none.
-        measured: (R,) bool, where the prior is not filled in; None = wherever there is one.
-        stamp_ns: Of the view.
+    ``pixels`` are (R, 2) float32 as (u, v), the pose is float32; the others are as in ``RayBatch``, (R,).
     """
     count = expect_shape(pixels, "R 2", "pixels")["R"]
     x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx

@@ -62,28 +62,19 @@ class CameraIntrinsics:
         return any(self.distortion)
 
     def __post_init__(self) -> None:
+        got = f"got fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy} {self.width}x{self.height} {self.distortion}"
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(np.isfinite(v) for v in values):
-            raise FrameError(
-                f"intrinsics must be finite numbers, got fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy} "
-                f"distortion={self.distortion}"
-            )
-        if self.fx <= 0 or self.fy <= 0 or self.width <= 0 or self.height <= 0:
-            raise FrameError(
-                f"focal lengths and image size must be positive, got fx={self.fx} fy={self.fy} "
-                f"width={self.width} height={self.height}"
-            )
+        if not np.isfinite(values).all() or min(self.fx, self.fy, self.width, self.height) <= 0:
+            raise FrameError(f"intrinsics must be finite, focal lengths and image size positive, {got}")
         if max(self.width, self.height) > MAX_SIDE or self.width * self.height > MAX_PIXELS:
             raise FrameError(
                 f"an image of {self.width}x{self.height} is too large: at most {MAX_SIDE} pixels a side and "
                 f"{MAX_PIXELS} in all; send smaller images"
             )
         _check_lens(self)
-        if len(self.distortion) not in COEFFICIENTS:
-            raise FrameError(f"distortion has {len(self.distortion)} coefficients; OpenCV's models have {COEFFICIENTS}")
-        if any(abs(d) > MAX_DISTORTION for d in self.distortion):
+        if len(self.distortion) not in COEFFICIENTS or any(abs(d) > MAX_DISTORTION for d in self.distortion):
             raise FrameError(
-                f"distortion {self.distortion} has a coefficient beyond {MAX_DISTORTION:g}: calibrate again"
+                f"distortion: {COEFFICIENTS} coefficients up to {MAX_DISTORTION:g}, {got}; calibrate again"
             )
 
 
@@ -113,209 +104,153 @@ def _check_lens(k: CameraIntrinsics) -> None:
     least, longest = MIN_FOCAL * (1 - ROUNDING), MAX_FOCAL * (1 + ROUNDING) * max(k.width, k.height)
     focal = least * k.width <= k.fx <= longest and least * k.height <= k.fy <= longest
     margin_x, margin_y = CENTER_MARGIN * (1 + ROUNDING) * k.width, CENTER_MARGIN * (1 + ROUNDING) * k.height
-    center = -margin_x <= k.cx + 0.5 <= k.width + margin_x and -margin_y <= k.cy + 0.5 <= k.height + margin_y
-    if focal and center:
+    if focal and -margin_x <= k.cx + 0.5 <= k.width + margin_x and -margin_y <= k.cy + 0.5 <= k.height + margin_y:
         return
-    got = f"fx={k.fx:.6g} fy={k.fy:.6g} cx={k.cx:.6g} cy={k.cy:.6g} do not fit a {k.width}x{k.height} image"
-    if k.fx < 5 and k.fy < 5 and 0 <= k.cx <= 1 and 0 <= k.cy <= 1:
-        raise FrameError(
-            f"intrinsics {got}: they look normalised to the image size, but must be in pixels; multiply fx and cx by "
-            f"the width and fy and cy by the height (fx={k.fx * k.width:.6g} fy={k.fy * k.height:.6g} "
-            f"cx={k.cx * k.width:.6g} cy={k.cy * k.height:.6g})"
-        )
-    if not focal:
-        raise FrameError(
-            f"intrinsics {got}: focal lengths must be in pixels, from {MIN_FOCAL:g} times the image side (a field of "
-            f"view of 157 degrees) to {MAX_FOCAL:g} times; check the calibration"
-        )
-    raise FrameError(
-        f"intrinsics {got}: the principal point must be in the image, or at most {CENTER_MARGIN:g} image side outside "
-        "of it; where images were resized or cropped after calibration, scale and shift the intrinsics with them"
+    why = (
+        f"the principal point must be in the image, or at most {CENTER_MARGIN:g} image side outside of it; where "
+        "images were resized or cropped after calibration, scale and shift the intrinsics with them"
     )
+    if k.fx < 5 and k.fy < 5 and 0 <= k.cx <= 1 and 0 <= k.cy <= 1:
+        why = (
+            "they look normalised to the image size, but must be in pixels; multiply fx and cx by the width and fy and "
+            f"cy by the height (fx={k.fx * k.width:.6g} fy={k.fy * k.height:.6g} cx={k.cx * k.width:.6g} "
+            f"cy={k.cy * k.height:.6g})"
+        )
+    elif not focal:
+        why = (
+            f"focal lengths must be in pixels, {MIN_FOCAL:g} (157 degrees of view) to {MAX_FOCAL:g} times the "
+            "image side; check the calibration"
+        )
+    got = f"fx={k.fx:.6g} fy={k.fy:.6g} cx={k.cx:.6g} cy={k.cy:.6g}"
+    raise FrameError(f"intrinsics {got} do not fit a {k.width}x{k.height} image: {why}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedFrame:
     """One camera image with its pose, as a driver or a log gives it.
 
-    Args:
-        stamp_ns: Capture time, int64 nanoseconds on the robot's monotonic clock, 0 to ``MAX_STAMP_NS``.
-        seq: Counter of the source, from 0 to 2^63 - 1; missing numbers mean lost frames.
-        camera_id: Name of the camera.
-        rgb: (H, W, 3) uint8.
-        depth_m: (H, W) float32 z-depth in metres, None without a depth sensor; what is not from ``MIN_DEPTH_M`` to
-            ``MAX_DEPTH_M``, such as 0, is no measurement.
-        label: (H, W) uint8 class ids of the stream's label set; None = unlabelled.
-        intrinsics: Of the rectified image.
-        T_world_camera: (4, 4) float64.
-        pose_source: Where the pose comes from ("log", "odometry", ...).
-        pose_sigma: One-sigma position uncertainty in metres; 0 = not known.
-        depth_sigma_m: (H, W) float32 one-sigma spread of ``depth_m`` in metres, where it was computed from pictures;
-            None where a sensor measured it.
-        label_is_pseudo: ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth:
-            nothing is scored against it.
-        world: Of a camera whose world begins where it starts: which one the pose is in. 0 = the one that there is.
-
     Raises:
         FrameError: a shape or dtype is off, or a number out of its range. ``geometry.check_pose`` checks the pose.
     """
 
-    stamp_ns: int
-    seq: int
-    camera_id: str
-    rgb: UInt8
+    stamp_ns: int  # of capture, int64 nanoseconds on the robot's monotonic clock, 0 to ``MAX_STAMP_NS``
+    seq: int  # counter of the source, from 0 to 2^63 - 1; missing numbers mean lost frames
+    camera_id: str  # name of the camera
+    rgb: UInt8  # (H, W, 3)
+    # (H, W) z-depth in metres, None without a depth sensor; what is not from ``MIN_DEPTH_M`` to ``MAX_DEPTH_M``, such
+    # as 0, is no measurement
     depth_m: Float32 | None
-    label: UInt8 | None
-    intrinsics: CameraIntrinsics
-    T_world_camera: Float64
-    pose_source: str = "log"
-    pose_sigma: float = 0.0
+    label: UInt8 | None  # (H, W) class ids of the stream's label set; None = unlabelled
+    intrinsics: CameraIntrinsics  # of the rectified image
+    T_world_camera: Float64  # (4, 4)
+    pose_source: str = "log"  # where the pose comes from ("log", "odometry", ...)
+    pose_sigma: float = 0.0  # one-sigma position uncertainty in metres; 0 = not known
+    # (H, W) one-sigma spread of ``depth_m`` in metres, where it was computed from pictures; None where a sensor
+    # measured it
     depth_sigma_m: Float32 | None = None
+    # ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth: nothing is scored
+    # against it.
     label_is_pseudo: bool = False
-    world: int = 0
+    world: int = (
+        0  # of a camera whose world begins where it starts: which one the pose is in. 0 = the one that there is
+    )
 
     def __post_init__(self) -> None:
-        size = (self.intrinsics.height, self.intrinsics.width)
-        if isinstance(self.intrinsics, FisheyeIntrinsics):
-            raise FrameError(f"frame seq={self.seq} of camera '{self.camera_id}': its fisheye lens has to be rectified")
-        _expect_range(self, "stamp_ns", self.stamp_ns, MAX_STAMP_NS)
-        _expect_range(self, "seq", self.seq, (1 << 63) - 1)
-        _expect_range(self, "world", self.world, (1 << 63) - 1)
-        _expect_range(self, "pose_sigma", self.pose_sigma, MAX_POSE_SIGMA_M)
-        _expect(self, "rgb", self.rgb, (*size, 3), np.uint8)
-        _expect(self, "T_world_camera", self.T_world_camera, (4, 4), np.float64)
-        if self.depth_m is not None:
-            _expect(self, "depth_m", self.depth_m, size, np.float32)
-        if self.depth_sigma_m is not None:
-            if self.depth_m is None:
-                raise FrameError(
-                    f"frame seq={self.seq} of camera '{self.camera_id}': depth_sigma_m is the spread of depth_m, "
-                    "which is missing; give both or neither"
+        k = self.intrinsics
+        if isinstance(k, FisheyeIntrinsics):
+            raise self._error("its fisheye lens has to be rectified")
+        for name, most in (
+            ("stamp_ns", MAX_STAMP_NS),
+            ("seq", (1 << 63) - 1),
+            ("world", (1 << 63) - 1),
+            ("pose_sigma", MAX_POSE_SIGMA_M),
+        ):
+            if not 0 <= (value := getattr(self, name)) <= most:  # NaN, too
+                raise self._error(f"{name} must be from 0 to {most}, got {value}")
+        if self.depth_m is None and self.depth_sigma_m is not None:
+            raise self._error("depth_sigma_m is the spread of depth_m, which is missing; give both or neither")
+        size = (k.height, k.width)
+        for name, shape, dtype in (
+            ("rgb", (*size, 3), "uint8"),
+            ("T_world_camera", (4, 4), "float64"),
+            ("depth_m", size, "float32"),
+            ("depth_sigma_m", size, "float32"),
+            ("label", size, "uint8"),
+        ):
+            array = getattr(self, name)
+            if array is not None and (array.shape != shape or array.dtype != dtype):
+                raise self._error(
+                    f"{name} must be {dtype} {shape} (the intrinsics say {k.width}x{k.height}), "
+                    f"got {array.dtype.name} {array.shape}"
                 )
-            _expect(self, "depth_sigma_m", self.depth_sigma_m, size, np.float32)
-        if self.label is not None:
-            _expect(self, "label", self.label, size, np.uint8)
 
-
-def _expect_range(frame: PosedFrame, name: str, value: float, most: float) -> None:
-    if not 0 <= value <= most:  # NaN, too
-        raise FrameError(
-            f"frame seq={frame.seq} of camera '{frame.camera_id}': {name} must be from 0 to {most}, got {value}"
-        )
-
-
-def _expect(
-    frame: PosedFrame, name: str, array: NDArray[np.generic], shape: tuple[int, ...], dtype: type[np.generic]
-) -> None:
-    if array.shape != shape or array.dtype != dtype:
-        raise FrameError(
-            f"frame seq={frame.seq} of camera '{frame.camera_id}': {name} must be {np.dtype(dtype).name} {shape} "
-            f"(the intrinsics say {frame.intrinsics.width}x{frame.intrinsics.height}), "
-            f"got {array.dtype.name} {array.shape}"
-        )
+    def _error(self, what: str) -> FrameError:
+        return FrameError(f"frame seq={self.seq} of camera '{self.camera_id}': {what}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceViews:
-    """The m images that a semantic field looks at, in one resolution.
+    """The m images that a semantic field looks at, in one resolution."""
 
-    Args:
-        rgb: (m, 3, H, W) float32 in [0, 1].
-        depth_m: (m, H, W) float32, 0 = no measurement; all 0 for a view without depth.
-        K: (m, 3, 3) float32 pinhole matrices in pixels of (H, W).
-        T_world_camera: (m, 4, 4) float32.
-        channel: (m, H, W) int64 class channels that are known of the views, -1 = none; None for views without labels.
-        depth_sigma_m: (m, H, W) float32 one-sigma spread of ``depth_m`` where it was computed from pictures, 0 where it
-            was measured; None where all of it was.
-    """
-
-    rgb: torch.Tensor
-    depth_m: torch.Tensor
-    K: torch.Tensor
-    T_world_camera: torch.Tensor
+    rgb: torch.Tensor  # (m, 3, H, W) float32 in [0, 1]
+    depth_m: torch.Tensor  # (m, H, W) float32, 0 = no measurement; all 0 for a view without depth
+    K: torch.Tensor  # (m, 3, 3) float32 pinhole matrices in pixels of (H, W)
+    T_world_camera: torch.Tensor  # (m, 4, 4) float32
+    # (m, H, W) int64 class channels that are known of the views, -1 = none; None for views without labels
     channel: torch.Tensor | None = None
+    # (m, H, W) float32 one-sigma spread of ``depth_m`` where it was computed from pictures, 0 where it was measured;
+    # None where all of it was
     depth_sigma_m: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayBatch:
-    """R query rays in world coordinates.
+    """R query rays in world coordinates."""
 
-    Args:
-        origin: (R, 3) float32 metres.
-        direction: (R, 3) float32, scaled so that ``origin + z * direction`` has camera depth z (not unit length).
-        near_m, far_m: (R,) float32 z bounds of the search.
-        prior_depth_m: (R,) float32 z from a sensor or a map, 0 = none.
-        measured: (R,) bool, where the prior is measured at the very pixel rather than filled in from others; None =
-            wherever there is a prior.
-        stamp_ns: When they are, for fields with things that move; None = such things are not there.
-    """
-
-    origin: torch.Tensor
-    direction: torch.Tensor
-    near_m: torch.Tensor
+    origin: torch.Tensor  # (R, 3) float32 metres
+    direction: torch.Tensor  # (R, 3) float32: ``origin + z * direction`` has camera depth z (not of unit length)
+    near_m: torch.Tensor  # (R,) float32 z bounds of the search
     far_m: torch.Tensor
-    prior_depth_m: torch.Tensor
+    prior_depth_m: torch.Tensor  # (R,) float32 z from a sensor or a map, 0 = none
+    # (R,) bool, where the prior is measured at the very pixel rather than filled in from others; None = wherever there
+    # is a prior
     measured: torch.Tensor | None = None
-    stamp_ns: int | None = None
+    stamp_ns: int | None = None  # when they are, for fields with things that move; None = such things are not there
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldRender:
-    """What a semantic field renders for R rays.
+    """What a semantic field renders for R rays."""
 
-    Args:
-        logits: (R, L) rendered class logits (S-Ray Eq. 13); zeros where ``known`` is False.
-        depth_m: (R,) expected z depth.
-        opacity: (R,) in [0, 1].
-        rgb: (R, 3) in [0, 1].
-        entropy: (R,) of the class distribution, nats; ln L where nothing is known.
-        known: (R,) bool, False where no source view sees the ray: an explicit "unknown", not a guess.
-    """
-
-    logits: torch.Tensor
-    depth_m: torch.Tensor
-    opacity: torch.Tensor
-    rgb: torch.Tensor
-    entropy: torch.Tensor
-    known: torch.Tensor
+    logits: torch.Tensor  # (R, L) rendered class logits (S-Ray Eq. 13); zeros where ``known`` is False
+    depth_m: torch.Tensor  # (R,) expected z depth
+    opacity: torch.Tensor  # (R,) in [0, 1]
+    rgb: torch.Tensor  # (R, 3) in [0, 1]
+    entropy: torch.Tensor  # (R,) of the class distribution, nats; ln L where nothing is known
+    known: torch.Tensor  # (R,) bool, False where no source view sees the ray: an explicit "unknown", not a guess
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
-    """What one ``MappingPipeline.step`` did.
+    """What one ``MappingPipeline.step`` did."""
 
-    Args:
-        stamp_ns, seq, camera_id: Of the frame.
-        fused: False where the frame was looked at but not fused.
-        is_keyframe: Whether the frame became a source view for later ones.
-        source_seqs: Sequence numbers of the source views that were rendered from.
-        label: (H, W) uint8 rendered class ids, the label set's ignore id where unknown.
-        confidence: (H, W) float32 probability of ``label``.
-        depth_m: (H, W) float32 depth that was fused; in ``moving`` pixels that which was left out.
-        blocks: Blocks in the map; ``blocks_touched``: visited by this frame.
-        rays: Rendered for this frame; ``samples``: of a ray, 0 where the field draws its own.
-        stage_ms: Wall time of each stage.
-        moving: (H, W) bool, what was left out of the map because it moves; None where that is off, and over sockets
-            also where nothing moves.
-        world: In which the frame's pose came; see ``PosedFrame``.
-        T_map_world: (4, 4) float64, where the map has that world: its cameras are at ``T_map_world @ T_world_camera``.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  # of the frame, as ``seq`` and ``camera_id``
     seq: int
     camera_id: str
-    fused: bool
-    is_keyframe: bool
-    source_seqs: tuple[int, ...]
-    label: UInt8
-    confidence: Float32
-    depth_m: Float32
-    blocks: int
-    blocks_touched: int
-    rays: int = 0
-    samples: int = 0
-    stage_ms: dict[str, float] = field(default_factory=dict[str, float])
+    fused: bool  # False where the frame was looked at but not fused
+    is_keyframe: bool  # whether the frame became a source view for later ones
+    source_seqs: tuple[int, ...]  # sequence numbers of the source views that were rendered from
+    label: UInt8  # (H, W) rendered class ids, the label set's ignore id where unknown
+    confidence: Float32  # (H, W) probability of ``label``
+    depth_m: Float32  # (H, W) depth that was fused; in ``moving`` pixels that which was left out
+    blocks: int  # in the map
+    blocks_touched: int  # visited by this frame
+    rays: int = 0  # rendered for this frame
+    samples: int = 0  # of a ray, 0 where the field draws its own
+    stage_ms: dict[str, float] = field(default_factory=dict[str, float])  # wall time of each stage
+    # (H, W), what was left out of the map because it moves; None where that is off, and over sockets also where nothing
+    # moves
     moving: Bool | None = None
-    world: int = 0
+    world: int = 0  # in which the frame's pose came; see ``PosedFrame``
+    # (4, 4), where the map has that world: its cameras are at ``T_map_world @ T_world_camera``
     T_map_world: Float64 = field(default_factory=lambda: np.eye(4))
