@@ -18,6 +18,7 @@ from semantic_mapper.nodes.cli.verb import (
     MaxFramesOption,
     WeightsOption,
     must_be_there,
+    refuse_options,
     results_file,
     verb,
 )
@@ -32,43 +33,39 @@ from semantic_mapper.replay.summary import notes, percent, read_summary, result_
 def evaluate(
     output: JsonOutput,
     mapper: MapperSettings,
-    # Folders that `replay` has written; logs, or folders with their parts
+    # Folders of `replay`; logs, or folders with their parts
     targets: Annotated[list[Path], typer.Argument(metavar="DIR_OR_LOG...")],
     *,
     weights: WeightsOption = None,
-    baselines: bool = False,  # LOG: also fit the baselines to the keyframes of the weights
-    seconds: AtLeastZero = 300.0,  # --baselines: training time of the U-Net
-    mesh: Path | None = None,  # DIR: also compare its map with this reference mesh (.npz)
-    # LOG: images of its frames' true objects, NNNNNN.png or CAMERA/NNNNNN.png (8 or 16 bits, 0 = none): also score the
-    # finished map with its things by panoptic quality, and so weights with boxes with theirs
+    baselines: bool = False,  # LOG: also fit baselines to the keyframes
+    seconds: AtLeastZero = 300.0,  # --baselines: to train the U-Net
+    mesh: Path | None = None,  # DIR: a reference mesh (.npz) to compare with
+    # LOG: its true objects, [CAMERA/]NNNNNN.png (0 = none), for panoptic quality
     instances: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     max_frames: MaxFramesOption = 0,
-    out: Path | None = None,  # JSON; else eval.json in the first DIR, or LOG.eval.json
+    out: Path | None = None,  # JSON [DIR/eval.json or LOG.eval.json]
 ) -> None:
     """Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML next to it.
 
-    A DIR gives the figures of its replay. A LOG is mapped and scored: with --weights that were finetuned on it, the
-    keyframes they were fitted to never count, and --baselines adds a per-image U-Net and labels carried over by depth,
-    both made from those same keyframes. --mesh takes an .npz with vertices, faces and (if there are any) labels.
-    `semantic-mapper-research suite` scores weights on rooms that nothing was trained on.
+    A DIR gives the figures of its replay. A LOG is mapped and scored; keyframes of its weights never count. --baselines
+    adds a per-image U-Net and labels carried over by depth, made from those keyframes.
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
     Example: semantic-mapper eval kitchen.mcap --instances kitchen/instance
     """
     out = results_file(out)
-    if baselines and seconds == 0:
-        raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
     must_be_there(*targets)
     for target in targets:
         if target.suffix == MAP_SUFFIX:
             raise ConfigError(f"{target}: is a map alone; give the folder with its summary.json, or a log")
     logs = [t for t in targets if is_log(t) or not t.is_dir()]
     folders = [t for t in targets if t not in logs]
-    if mesh is not None and not folders:
-        raise typer.BadParameter("goes with a DIR that `replay` has written", param_hint="--mesh")
-    if instances is not None and not logs:
-        raise typer.BadParameter("goes with a LOG", param_hint="--instances")
+    refuse_options(
+        (baselines and seconds == 0, "--seconds", "the U-Net needs time to learn"),
+        (mesh is not None and not folders, "--mesh", "goes with a DIR that `replay` has written"),
+        (instances is not None and not logs, "--instances", "goes with a LOG"),
+    )
     path = out or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     prepare_file(path)
     found: dict[str, Any] = {"replays": print_results(output, folders), "logs": {}}
@@ -96,11 +93,7 @@ def evaluate(
 
 
 def print_results(output: Output, folders: Sequence[Path]) -> dict[str, dict[str, Any]]:
-    """Show the tables of result folders side by side, and where the files are.
-
-    Raises:
-        ConfigError: see ``read_summary``.
-    """
+    """Show the tables of result folders side by side, and where the files are."""
     short = [f.resolve().name for f in folders]
     names = [s if short.count(s) == 1 else str(f) for s, f in zip(short, folders, strict=True)]
     summaries = dict(zip(names, map(read_summary, folders), strict=True))

@@ -87,11 +87,7 @@ def export(
 
 
 def export_recording(output: Output, source: Path, out: Path, name: LogFormat, camera: str, max_frames: int) -> None:
-    """Write a log in the format of another program, and say what was left out.
-
-    Raises:
-        LogError: the log cannot be read, or the result not be written.
-    """
+    """Write a log in the format of another program, and say what was left out."""
     prepare_folder(out.parent)
     with open_log(source) as log, frame_progress("export", min(len(log), max_frames or len(log))) as bar:
         report = export_log(log, out, name, camera=camera, max_frames=max_frames, on_frame=bar.advance)

@@ -9,7 +9,7 @@ import typer
 
 from semantic_mapper.config import AtLeastTwo, DepthSource, load_mapper_config
 from semantic_mapper.memory import keep_freed_memory
-from semantic_mapper.nodes.cli.verb import SettingOptions, must_be_there, verb
+from semantic_mapper.nodes.cli.verb import SettingOptions, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.summary import percent
@@ -30,45 +30,33 @@ def finetune(
     training: FinetuneSettings,
     *,
     out: Path,  # weights file to write (.safetensors)
-    keyframes: AtLeastTwo | None = None,  # how many labelled frames to use; none for --kind grid and panoptic
-    weights: Path | None = None,  # weights to start from; without it the small ones in the package
+    keyframes: AtLeastTwo | None = None,  # how many labelled frames to use
+    weights: Path | None = None,  # to start from, in place of the package's
     from_scratch: bool = False,  # start from random weights
-    # fit a field of this kind (irt, panoptic, grid) to the scene, from all frames; irt: classes of keyframes, panoptic:
-    # of boxes and pseudo labels, grid: none
+    # field of the scene, from all frames; irt: classes of keyframes, panoptic: of boxes and pseudo labels, grid: none
     kind: Literal["irt", "panoptic", "grid"] | None = None,
-    boxes: Path | None = None,  # --kind panoptic: boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360
-    # --kind panoptic: pseudo labels, a folder of NNNNNN.png or weights that make them; without it the log's own label
-    # images, else the small weights in the package
+    boxes: Path | None = None,  # panoptic: a file of boxes (docs/scenes.md)
+    # panoptic: pseudo labels, NNNNNN.png or weights, in place of the log's
     pseudo: Annotated[str | None, typer.Option(metavar="DIR|WEIGHTS")] = None,
-    # --kind panoptic: what is outside of all boxes. stuff: classes that are no things, or that no box has. empty:
-    # nothing
-    uncovered: Literal["stuff", "empty"] = "stuff",
-    # auto: the sensor's, and computed from the pictures where the log has none; computed: always; off: none
-    depth: DepthSource = "sensor",
-    # label images NNNNNN.png in place of the log's, as `label --serve` writes them; all of them without --keyframes.
-    # Unlabelled pixels count for nothing
+    uncovered: Literal["stuff", "empty"] = "stuff",  # panoptic: what is outside of all boxes
+    depth: DepthSource = "sensor",  # as of `replay`
+    # label images NNNNNN.png in place of the log's (`label --serve`); all of them without --keyframes
     labels: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
-    strokes: bool = False,  # labels are strokes: let each grow over what looks like it, as the labelling page shows
+    strokes: bool = False,  # labels are strokes: let each grow
 ) -> int:
     """Fit the field to a few labelled keyframes of a log.
 
-    The keyframes are those that together show most of what the log shows; no other label is trained on. The weights
-    remember them, so that `replay` and `eval` never score on them; of pseudo labels (`autolabel`), also the keyframes
-    of the weights that rendered these. With --depth computed the
-    keyframes have depth computed from the log's pictures. Ctrl-C writes the best weights so far (exit code 130).
+    The keyframes are those that together show most of what the log shows; no other label is trained on, and `replay`
+    and `eval` never score on them. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --strokes --out kitchen.safetensors
     Example: semantic-mapper finetune yard.mcap --kind panoptic --boxes boxes.json --out yard.safetensors
     """
     without_labels = kind in ("grid", "panoptic")
-    refused = (
+    refuse_options(
         (kind is not None and weights is not None, "--kind", "starts from nothing; leave out --weights"),
-        (
-            from_scratch and (weights is not None or kind is not None),
-            "--from-scratch",
-            "leave out --weights and --kind",
-        ),
+        (from_scratch and (weights or kind), "--from-scratch", "leave out --weights and --kind"),
         ((boxes is not None) != (kind == "panoptic"), "--boxes", "--kind panoptic and --boxes FILE go together"),
         (pseudo is not None and kind != "panoptic", "--pseudo", "goes with --kind panoptic only"),
         (
@@ -78,9 +66,6 @@ def finetune(
         ),
         (not without_labels and labels is None and keyframes is None, "--keyframes", "how many labelled frames?"),
     )
-    for wrong, option, why in refused:
-        if wrong:
-            raise typer.BadParameter(why, param_hint=option)
     must_be_there(log)
     settings = training.convert(FinetuneConfig)
     if settings.seconds == 0 and settings.steps == 0:

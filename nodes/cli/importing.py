@@ -15,11 +15,18 @@ from semantic_mapper.config import AtLeastOne, AtLeastZero, load_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.nodes.cli.calibrate import board_settings
-from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, verb
+from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import new_figure, rendered
-from semantic_mapper.replay.importers import ImportOptions, ImportReport, RenameConfig, import_recording, is_recording
+from semantic_mapper.replay.importers import (
+    FORMATS,
+    ImportOptions,
+    ImportReport,
+    RenameConfig,
+    import_recording,
+    is_recording,
+)
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.page import Section, picture, table_of, write_page
@@ -41,13 +48,13 @@ _STAGES = {
 class SourceOptions(Options, frozen=True):
     """Options of films, and of recordings whose unit of length is not known."""
 
-    rotate: Literal["0", "90", "180", "270"] = "0"  # turn every image clockwise by this many degrees
-    calibration: Path | None = None  # film: file of the camera, from `calibrate`. Without: found
-    focal_prior: AtLeastZero = 0.0  # film: about the focal length, in its pixels, where the lens is unusual
-    scale: AtLeastZero = 0.0  # film, transforms, colmap, opensfm: metres per unit of its map without scale. 0 = by GPS
-    distance: str = ""  # film: two marked points: "SECONDS:U,V SECONDS:U,V METRES" (pixels of the film)
-    square_mm: AtLeastZero = 0.0  # film: side of a square of the printed board that is seen in it
-    camera_height: AtLeastZero = 0.0  # film: median height of the camera over the floor, metres
+    rotate: Literal["0", "90", "180", "270"] = "0"  # turn images clockwise, degrees
+    calibration: Path | None = None  # film: the camera's file, of `calibrate`
+    focal_prior: AtLeastZero = 0.0  # film: focal length, some pixels
+    scale: AtLeastZero = 0.0  # metres per unit of poses without a scale
+    distance: str = ""  # film: "SECONDS:U,V SECONDS:U,V METRES"
+    square_mm: AtLeastZero = 0.0  # film: side of a board's square in it
+    camera_height: AtLeastZero = 0.0  # film: over the floor, metres
 
     @property
     def quarters(self) -> int:
@@ -57,7 +64,7 @@ class SourceOptions(Options, frozen=True):
     @property
     def given(self) -> bool:
         """Whether any of them is."""
-        return self != SourceOptions()
+        return self != type(self)()
 
     def film_options(self) -> FilmOptions:
         """As the import of films takes them.
@@ -92,55 +99,34 @@ class SourceOptions(Options, frozen=True):
 @verb
 def import_(
     output: Output,
-    # Folder of the recording, or ROS bag; film, or folder of pictures without poses; damaged log (.mcap)
+    # Recording, ROS bag, film, folder of pictures, or damaged log
     source: Annotated[Path, typer.Argument(metavar="SRC")],
     log: Path,  # log to write (.mcap)
     options: SourceOptions,
     *,
-    format_: Annotated[  # found out when not given
-        Literal[
-            "folder",
-            "tum",
-            "scannet",
-            "replica",
-            "kitti360",
-            "rosbag",
-            "polycam",
-            "record3d",
-            "transforms",
-            "colmap",
-            "opensfm",
-        ]
-        | None,
-        typer.Option("--format"),
-    ] = None,
+    # folder, tum, scannet, replica, kitti360, rosbag, polycam, record3d, transforms, colmap or opensfm [found out]
+    format_: str | None = None,
     max_frames: MaxFramesOption = 0,
     every: AtLeastOne = 1,  # only every N-th frame
-    rename: Path | None = None,  # TOML: [classes] couch = "sofa", ...; classes that get one name become one
-    # ROS bags: topic of the image, depth, info (calibration), depth_info or pose; several times. Found by type.
-    # depth=none: without depth, of every format
+    rename: Path | None = None,  # TOML: [classes] couch = "sofa", ...
+    # bags: of image, depth, info, depth_info or pose; repeated. depth=none (any format): without depth
     topic: Annotated[list[str] | None, typer.Option(metavar="ROLE=NAME")] = None,
-    world: str = "",  # ROS bags: frame of tf that poses are in; map, world or odom
-    body: str = "",  # ROS bags: frame whose pose the topic of poses tells
+    world: str = "",  # bags: frame of tf that poses are in
+    body: str = "",  # bags: frame that poses are of
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a log of a recording of another program, of a film, or of a damaged log.
 
-    Recordings: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360, ROS bag (1 or 2),
-    Polycam raw data, Record3D (EXR + RGB), transforms.json, COLMAP model with images, OpenSfM or OpenDroneMap project.
-    Frames that cannot be used are left out, each with its file and the reason. --rotate is for cameras that are mounted
-    on their side: the weights know upright rooms.
-
-    Of a film or a folder of pictures without poses these are found (structure from motion), and a report is written
-    next to the log (LOG with .html). Without GPS positions in the pictures, or one of --scale, --distance, --square-mm,
-    --camera-height, the lengths of its map are not metres.
-
-    Of a damaged or unfinished log every intact message is kept.
+    Frames that cannot be used are left out, with the reason. --rotate is for cameras mounted on their side. Poses of a
+    film or a folder of pictures are found, with a report (LOG with .html); its lengths are metres by GPS of the
+    pictures or by one of --scale, --distance, --square-mm, --camera-height. Of a damaged log every intact message is
+    kept. See docs/recordings.md.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
     Example: semantic-mapper import cut-off.mcap clean.mcap
     """
+    refuse_options((format_ not in (None, *FORMATS), "--format", f"there are {', '.join(FORMATS)}"))
     if format_ is None and source.suffix == LOG_SUFFIX and not is_bag(source):
         _recover(output, source, log)
         return
@@ -240,11 +226,7 @@ def _recover(output: Output, source: Path, log: Path) -> None:
 
 
 def _import_film(output: Output, source: Path, log: Path, options: FilmOptions, *, overwrite: bool) -> None:
-    """Import a film with progress, write its report next to the log, and say what became of it.
-
-    Raises:
-        SemanticMapperError: see ``import_film``.
-    """
+    """Import a film with progress, write its report next to the log, and say what became of it."""
     page = log.with_suffix(".html")
     if page.exists() and not overwrite:
         raise ConfigError(f"{page}: exists already; choose another name, or --overwrite it")
@@ -271,11 +253,7 @@ def _import_film(output: Output, source: Path, log: Path, options: FilmOptions, 
 
 
 def write_film_report(report: FilmReport, path: Path) -> None:
-    """Write the page on a film: path from above, frames, what is left out.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
+    """Write the page on a film: path from above, frames, what is left out."""
     spans = [(f"{p.start_s:.2f}", f"{p.end_s:.2f}", str(p.frames), p.reason) for p in report.left_out[:STRETCHES]]
     counts = [(reason, str(count)) for reason, count in report.left_out_counts.items()]
     frames = [picture(rgb, f"{seconds:.2f} s; rectified", photo=True) for seconds, rgb in report.pictures]

@@ -88,11 +88,7 @@ def _print_damage(output: Output, found: dict[str, Any]) -> None:
 
 
 def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[str, Any]:
-    """Read all messages of a log (or of the parts of one) and say what is in it.
-
-    Raises:
-        LogError: it cannot be opened.
-    """
+    """Read all messages of a log (or of the parts of one) and say what is in it."""
     topics, sizes, kinds = Counter[str](), Counter[str](), Counter[str]()
     stamps: dict[str, list[int]] = {}  # of frames, by camera; seqs likewise
     seqs: dict[str, list[int]] = {}
@@ -147,11 +143,7 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
 
 
 def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
-    """Who has rendered pseudo labels, for people: names and texts of rows.
-
-    Args:
-        note: As ``AutolabelNote.plain`` gives it.
-    """
+    """Who has rendered pseudo labels, for people: names and texts of rows of ``AutolabelNote.plain``."""
     by, frames = f"{note['weights']} ({note['kind']}, SHA-256 {note['digest'][:16]})", counted(note["frames"], "frame")
     counts = [f"{note['labelled']} of {frames} labelled"]
     for key, text in (("labelled_pixels", "of the pixels"), ("mean_confidence", "mean confidence")):
@@ -198,11 +190,7 @@ def _log_table(found: dict[str, Any]) -> Table:
 
 
 def _describe_map(path: Path) -> dict[str, Any]:
-    """Read a map's manifest, but not its blocks.
-
-    Raises:
-        MapError: no such file, not a map, or damaged where it says this.
-    """
+    """What a map's manifest says; its blocks are not read."""
     manifest = describe_map(path)
     labels = manifest.label_set
     return {
@@ -246,11 +234,7 @@ def _map_table(found: dict[str, Any]) -> Table:
 
 
 def _weights_info(output: Output, endpoint: str, remote: Remote) -> dict[str, Any]:
-    """The weights of a running mapper.
-
-    Raises:
-        TransportError: nobody answers there.
-    """
+    """The weights of a running mapper."""
     with MapClient(endpoint, identity=remote.identity()) as client:
         state = client.weights()
     rows = [
@@ -275,11 +259,7 @@ def _weights_info(output: Output, endpoint: str, remote: Remote) -> dict[str, An
 
 
 def _boxes_info(output: Output, file: Path, picture: Path | None, out: Path | None) -> dict[str, Any]:
-    """List the boxes of a file, or draw them.
-
-    Raises:
-        ConfigError: the file cannot be read, or the picture not be written.
-    """
+    """List the boxes of a file, or draw them."""
     boxes = load_boxes(file)
     found = _describe_boxes(boxes)
     if picture is None or out is None:

@@ -88,20 +88,12 @@ def suggest_for_log(
 
 
 def open_images(path: Path | None, log: Log) -> LabelFolder | None:
-    """Label images that are there already; None before the first.
-
-    Raises:
-        LabelError, LogError, ImportSourceError: as ``open_label_folder``.
-    """
+    """Label images that are there already; None before the first."""
     return open_label_folder(path, log) if path is not None and any(path.glob("*.png")) else None
 
 
 def choose_classes(log: Log, out: Path, classes: Path | None, weights: Path | None) -> LabelSet:
-    """Classes to label with: as named, or those of the folder, of named weights, of the log, of the shipped weights.
-
-    Raises:
-        ConfigError, ImportSourceError, LabelError, WeightsError: they cannot be read.
-    """
+    """Classes to label with: as named, or those of the folder, of named weights, of the log, of the shipped weights."""
     if classes is not None:
         return read_classes(classes)
     if (out / LABELS_FILE).exists():
@@ -114,19 +106,13 @@ def choose_classes(log: Log, out: Path, classes: Path | None, weights: Path | No
 def choose_keyframes(
     path: Path, count: int, images: Path | None, monitor: JobMonitor
 ) -> tuple[dict[int, PosedFrame], LabelSet]:
-    """Frames of a log with their labels, by their number in it.
+    """Frames of a log with their labels, by their number: those with an image NNNNNN.png in the folder ``images``.
 
-    Args:
-        path: The log.
-        count: Of its labelled frames, this many that together show most of what it shows, where there are no images.
-        images: Folder of label images NNNNNN.png in place of the log's, each named by the number of its frame, with a
-            labels.json or in the log's classes.
-        monitor: Shows how far it is, and ends it.
+    Without images, those ``count`` of its labelled frames that together show most of what it shows.
 
     Raises:
         LogError: the log, a frame or the labels of one are missing.
         LabelError: nobody knows what the labels mean.
-        ImportSourceError: a labels.json that is not of a label folder.
         KeyboardInterrupt: a stop request came.
     """
     with open_log(path) as log:

@@ -20,7 +20,15 @@ from semantic_mapper.files import write_json
 from semantic_mapper.mapping.map_types import ALWAYS, length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes import map_answers
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, must_be_there, results_file, verb
+from semantic_mapper.nodes.cli.verb import (
+    EXIT_FAILED,
+    JsonOutput,
+    Remote,
+    must_be_there,
+    refuse_options,
+    results_file,
+    verb,
+)
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.launcher.running import map_endpoint
 from semantic_mapper.plain_text import counted
@@ -38,8 +46,6 @@ from semantic_mapper.transport.messages import SCALE_UNKNOWN
 POLL_S = 0.2
 
 Up = tuple[float, float, float]
-
-
 Question = Literal["info", "at", "nearest", "instances", "graph", "correct", "relocalize"]
 ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "correct": "FILE", "relocalize": "LOG"}
 
@@ -47,53 +53,44 @@ ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "correc
 @verb
 def query(
     output: JsonOutput,
-    # Saved map, folder of results, `live` for the launch that runs here, ipc://PATH or tcp://HOST:PORT
+    # Saved map, folder of results, `live`, ipc://PATH or tcp://HOST:PORT
     source: Annotated[str, typer.Argument(metavar="MAP")],
     question: Question,
     remote: Remote,
     arguments: Annotated[list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [FILE]")] = None,
     *,
-    # instances, graph: which way is up in the world; without it away from the floor. Instances of a running mapper, or
-    # where no floor was seen: 0 0 1
-    up: Up | None = None,
-    min_confidence: Fraction = 0.0,  # nearest: places less sure of the class do not count
-    gone: bool = False,  # running mapper, instances: also those of earlier answers that have gone
-    picture: Path | None = None,  # graph: also draw rooms, doors and objects from above, as PNG
-    camera: str = "",  # correct: the camera of the poses; needed where the mapper has several
-    every: AtLeastOne = 1,  # relocalize: look for every n-th frame
-    out: Path | None = None,  # also write the answer to this file, as JSON
+    up: Up | None = None,  # instances, graph: in place of away from the floor
+    min_confidence: Fraction = 0.0,  # nearest: of the class, at least
+    gone: bool = False,  # instances, running mapper: gone ones, too
+    picture: Path | None = None,  # graph: also draw it from above (.png)
+    camera: str = "",  # correct: the camera of the poses, of several
+    every: AtLeastOne = 1,  # relocalize: every n-th frame
+    out: Path | None = None,  # also write the answer as JSON
 ) -> int:
     """Ask a saved map, or that of a running mapper, what is where.
 
-    info: size, classes and how much surface each has. at X Y Z: class and confidence of the surface at a point, and
-    whether the point is free, occupied or unknown. nearest CLASS X Y Z: the surface of a class that is nearest to a
-    point. instances: all things, that is, connected pieces of one class that is not wall, floor or the like, with
-    upright boxes. graph: floors, their rooms, which part at
-    doors, the doors between them, and the same things with their rooms.
+    info: size and classes. at X Y Z: class of the surface at a point, and whether it is free, occupied or unknown.
+    nearest CLASS X Y Z: the nearest surface of a class. instances: countable things with upright boxes. graph: floors,
+    rooms, doors, and things by room.
 
-    correct FILE moves the map of a running mapper to corrected poses (TUM: stamp tx ty tz qx qy qz qw), such as after a
-    loop closure. The mapper has to keep its frames (`history.max_frames` in its config). It goes on mapping, and
-    exchanges the map when the corrected one is ready. A pose goes to the frame nearest in time, within 5 ms.
-
-    relocalize LOG finds the frames of a log with measured depth in a saved map, each by itself, where features, depth
-    and brightness agree with the map; their poses are used only to see whether they agree. Exit code 1 where it is not
-    known where a world of the log lies: three frames, and most of those that are found, have to agree on it.
+    correct FILE moves the map of a running mapper that keeps its frames (`history.max_frames`) to corrected poses (TUM:
+    stamp tx ty tz qx qy qz qw); a pose goes to the frame nearest in time, within 5 ms. relocalize LOG finds the frames
+    of a log with measured depth in a saved map; exit code 1 where fewer than three, or not most, agree where it lies.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     Example: semantic-mapper query live correct optimised.tum
-    Example: semantic-mapper query runs/yesterday relocalize today.mcap
     """
     name, point = _read_arguments(question, arguments or [])
     endpoint = map_endpoint(source)
     if question == "correct":
         return _correct(output, source, endpoint, Path(name), camera, remote)
-    if gone and not (endpoint and question == "instances"):
-        raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
-    if picture is not None and question != "graph":
-        raise typer.BadParameter("goes with `graph`", param_hint="--picture")
+    refuse_options(
+        (gone and not (endpoint and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
+        (picture is not None and question != "graph", "--picture", "goes with `graph`"),
+    )
     written = [path for path in (results_file(out), picture) if path is not None]
     for path in written:
         prepare_file(path)
@@ -164,12 +161,7 @@ def answer(
     gone: bool = False,
     picture: Path | None = None,
 ) -> dict[str, Any]:
-    """The answer to a question, as plain data; the arguments are those of ``query``.
-
-    Raises:
-        TransportError: nobody answers.
-        MapError, LabelError: a question that cannot be answered.
-    """
+    """The answer to a question, as plain data; the arguments are those of ``query``."""
     match question:
         case "info":
             return map_answers.describe_map(answering.mirror().snapshot())
@@ -204,13 +196,7 @@ def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tupl
 
 
 def _correct(output: Output, source: str, endpoint: str, file: Path, camera: str, remote: Remote) -> int:
-    """Send corrected poses to a running mapper.
-
-    Raises:
-        ConfigError: it is a saved map.
-        ImportSourceError: the poses cannot be read.
-        MapError, TransportError: the mapper is not there, or refuses them.
-    """
+    """Send corrected poses to a running mapper."""
     if not endpoint:
         raise ConfigError(
             f"{source}: is no running mapper; a saved map keeps no frames to correct, so map its log again with "
@@ -242,12 +228,7 @@ def _follow(client: MapClient) -> Correction:
 
 
 def _relocalize(output: Output, source: str, endpoint: str, log: Path, every: int) -> dict[str, Any]:
-    """Find the frames of a log in a saved map.
-
-    Raises:
-        ConfigError: it is a running mapper.
-        LogError, MapError: there is no log, or nothing in the map to be found by.
-    """
+    """Find the frames of a log in a saved map."""
     if endpoint:
         raise ConfigError(
             f"{source}: is a running mapper, and frames are found in a saved map; `up --set map=FILE` goes on in one"

@@ -90,11 +90,7 @@ def record(
 
 
 def _report(output: Output, log: Path, recorder: Recorder) -> int:
-    """Say what is recorded, and what is not; the exit code.
-
-    Raises:
-        LogError: nothing is.
-    """
+    """Say what is recorded, and what is not; the exit code."""
     done = recorder.recording
     if done is None:
         raise LogError(
@@ -117,12 +113,7 @@ def _report(output: Output, log: Path, recorder: Recorder) -> int:
 def _join(
     folder: Path, sources: tuple[str, ...], wanted: dict[str, Any], stop: StopRequest
 ) -> tuple[NodeContext, RecorderOptions]:
-    """A recorder node in a launch that runs, but without its launcher.
-
-    Raises:
-        TransportError: no launch runs there.
-        ConfigError: a source is no node of the launch, no camera is among them, or options that do not go together.
-    """
+    """A recorder node in a launch that runs, but without its launcher."""
     note = read_launch_note(folder)
     names = [node.name for node in note.nodes]
     for name in sources:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import typer
 
@@ -26,13 +26,19 @@ from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, is_log, p
 from semantic_mapper.replay.summary import dig, notes, result_lines, summary_table
 
 
+class FilmSourceOptions(SourceOptions, frozen=True):
+    """The same; the help of `import` says what they are."""
+
+    hidden: ClassVar = True
+
+
 @verb
 def replay(
     output: JsonOutput,
     # Recorded log (.mcap), its parts, or a folder with them; or a film, pictures or recording that `import` takes
     source: list[Path],
     mapper: MapperSettings,
-    options: SourceOptions,
+    options: FilmSourceOptions,
     *,
     out: Path,  # folder for the results; made if missing
     weights: WeightsOption = None,
@@ -40,12 +46,12 @@ def replay(
     rerun: Path | None = None,  # also write a Rerun recording (.rrd)
     # corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end
     corrections: Path | None = None,
-    accept_contradictions: bool = False,  # exit code 0 although poses and depth contradict each other (else 3)
+    accept_contradictions: bool = False,  # exit code 0 in place of 3
 ) -> int:
     """Map a recording: a log, a film, or a folder or bag that `import` takes.
 
     Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first, to a log in
-    OUT; one without depth images is mapped with the weights that have learned from computed depth.
+    OUT, with the options of `import` (--rotate, --calibration, --scale, ...).
 
     Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
     with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).

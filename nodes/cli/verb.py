@@ -25,6 +25,7 @@ from typer.models import ParameterInfo
 from semantic_mapper.config import (
     Config,
     MapperConfig,
+    NotNegative,
     assign,
     convert_config,
     load_mapper_config,
@@ -35,7 +36,7 @@ from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.nodes.console import Output, stderr_console
 from semantic_mapper.nodes.process import failure_message, prepare_process
 from semantic_mapper.plain_text import visible, without_secrets
-from semantic_mapper.setting_docs import comments_of, comments_of_parameters, settings_of, without_bounds
+from semantic_mapper.setting_docs import BOUNDLESS, comments_of, comments_of_parameters, settings_of, without_bounds
 
 if TYPE_CHECKING:
     from semantic_mapper.transport.keys import ServerIdentity
@@ -44,7 +45,6 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_UNTRUSTED = 3  # poses and depth of a recording contradict each other, so that its map cannot be trusted
 EXIT_INTERRUPTED = 130
-MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
 LISTED = 10  # lines of one kind that are shown one by one
 
 _log = structlog.get_logger(__name__)
@@ -56,11 +56,11 @@ WeightsOption = Annotated[
     Path | None,
     typer.Option(
         "--weights",
-        help="Weights file, or `rooms-computed-depth` for cameras without a depth sensor; without it the small one in "
-        "the package.",
+        help="Weights; `rooms-computed-depth`: for cameras without depth",
     ),
 ]
-MaxFramesOption = Annotated[int, typer.Option("--max-frames", min=0, help="Stop after this many; 0 = all.")]
+MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all.")]
+Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; may be repeated.")
@@ -79,12 +79,14 @@ class Settings:
 class Options(msgspec.Struct, frozen=True):
     """Options that several verbs share: a field each, with its help in the comment there."""
 
+    hidden: ClassVar[bool] = False  # from the help
+
     @classmethod
     def parameters(cls) -> list[inspect.Parameter]:
         """The options, as parameters of a command."""
         hints, texts = get_type_hints(cls, include_extras=True), comments_of(cls)
         return [
-            _option(field.name, hints[field.name], field.default, texts[field.name])
+            _option(field.name, hints[field.name], field.default, texts[field.name], hidden=cls.hidden)
             for field in msgspec.structs.fields(cls)
         ]
 
@@ -92,7 +94,7 @@ class Options(msgspec.Struct, frozen=True):
 class SettingOptions:
     """Options that set settings of ``kind``, with ``--config`` and ``--set`` for the others.
 
-    What they say, their bounds and their defaults are those of the declaration. Made with their values by name.
+    What they say and their defaults are those of the declaration. Made with their values by name.
     """
 
     kind: ClassVar[type[Config]]
@@ -112,10 +114,9 @@ class SettingOptions:
         for option, name in cls.options.items():
             setting = declared[name]
             default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
-            text = f"{_sentence(setting.text)}  [default: {default}]"
-            info = typer.Option(option, help=text, show_default=False, min=setting.low, max=setting.high)
+            info = typer.Option(option, help=f"{_sentence(setting.text)}  [default: {default}]", show_default=False)
             found.append(_parameter(_parameter_name(option), setting.type | None, info, None))
-        listed = typer.Option("--config", help="TOML file with settings; docs/settings.md lists all.")
+        listed = typer.Option("--config", help="TOML file of settings (docs/settings.md)")
         return [
             *found,
             _parameter("config", Path | None, listed, None),
@@ -159,7 +160,6 @@ class MapperSettings(SettingOptions):
         "--voxel-size": "voxel_map.voxel_size_m",
         "--quality": "quality",
         "--depth": "depth.source",
-        "--seed": "seed",
     }
 
     def load(self, defaults: Mapping[str, Any] | None = None) -> MapperConfig:
@@ -174,8 +174,8 @@ class MapperSettings(SettingOptions):
 class Remote(Options, frozen=True):
     """By which a verb knows a mapper on another machine."""
 
-    server: str = ""  # name, among the peers of `semantic-mapper keys`, of the machine of a mapper with keys
-    keys: Path | None = None  # with --server: folder of the keys; without it this user's
+    server: str = ""  # mapper with keys: its machine, as `semantic-mapper keys` calls it
+    keys: Path | None = None  # --server: folder of the keys, in place of this user's
 
     def identity(self) -> ServerIdentity | None:
         """Whom to expect at the other end; None where no server is named.
@@ -200,6 +200,7 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     texts = comments_of_parameters(function)
     groups: dict[str, type[Options | SettingOptions]] = {}
     parameters: list[inspect.Parameter] = []
+    bounds = {name: without_bounds(parameter.annotation)[1:] for name, parameter in signature.parameters.items()}
     for name, parameter in signature.parameters.items():
         kind = parameter.annotation
         if isinstance(kind, type) and issubclass(kind, Options | SettingOptions):
@@ -216,7 +217,8 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     @functools.wraps(function)
     def command(**values: Any) -> None:
         prepare_process(verbose=Settings.verbose)
-        _check_values(values)
+        for name, value in values.items():
+            _check_bounds(name, value, *bounds.get(name, (None, None)))
         try:
             for name, group in groups.items():
                 values[name] = group(**{option.name: values.pop(option.name) for option in group.parameters()})
@@ -251,12 +253,23 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     return command
 
 
-def _option(name: str, kind: Any, default: Any, text: str) -> inspect.Parameter:
-    declared, low, high = without_bounds(kind)
+def refuse_options(*rules: tuple[object, str, str]) -> None:
+    """Refuse options that do not go together: whether they are wrong, their names, and why.
+
+    Raises:
+        typer.BadParameter: the first that are wrong.
+    """
+    for wrong, options, why in rules:
+        if wrong:
+            raise typer.BadParameter(why, param_hint=options)
+
+
+def _option(name: str, kind: Any, default: Any, text: str, *, hidden: bool = False) -> inspect.Parameter:
     said = "--" + name.rstrip("_").replace("_", "-")
-    if declared is bool and default:
+    if without_bounds(kind)[0] is bool and default:
         said += f"/--no-{said[2:]}"
-    return _parameter(name, kind, typer.Option(said, help=_sentence(text), min=low, max=high), default)
+    info = typer.Option(said, help=_sentence(text), show_default=default not in (0, "0"), hidden=hidden)
+    return _parameter(name, kind, info, default)
 
 
 def _argument(name: str, kind: Any, default: Any, text: str) -> inspect.Parameter:
@@ -267,7 +280,7 @@ def _parameter(name: str, kind: Any, info: ParameterInfo, default: Any) -> inspe
     """A parameter as Typer wants it; what its type says to Typer goes before ``info``."""
     given = next((note for note in get_args(kind) if isinstance(note, ParameterInfo)), None)
     if given is not None:
-        given.help = given.help or info.help
+        given.help, given.show_default = given.help or info.help, info.show_default
     else:
         declared = without_bounds(kind)[0]
         kind = Annotated[declared | None if default is None else declared, info]
@@ -295,29 +308,24 @@ def results_file(out: Path | None) -> Path | None:
 
 
 def must_be_there(*paths: Path) -> None:
-    """Refuse what is missing at once, before the packages that read it are loaded.
+    """Refuse what is missing, or neither a file nor a folder, before the packages that read it are loaded.
 
     Raises:
-        LogError: one of them is missing, or neither a file nor a folder.
+        LogError: one of them is.
     """
     for path in paths:
-        if not path.exists():
-            raise LogError(f"{path}: cannot be read: no such file or folder")
         if not path.is_file() and not path.is_dir():
-            raise LogError(f"{path}: cannot be read: it is no regular file; copy its content to one")
+            what = "no regular file; copy its content to one" if path.exists() else "no such file or folder"
+            raise LogError(f"{path}: cannot be read: {what}")
 
 
-def _check_values(options: Mapping[str, object]) -> None:
-    """Options know lower bounds only, and NaN passes these.
-
-    Raises:
-        typer.BadParameter: a number that nothing can be computed with.
-    """
-    for name, value in options.items():
-        for item in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(item, float) and not -MAX_OPTION <= item <= MAX_OPTION:
-                hint = f"--{name.replace('_', '-')}"
-                raise typer.BadParameter(f"{item:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
+def _check_bounds(name: str, value: object, low: float | None, high: float | None) -> None:
+    """Refuse numbers beyond what the declaration allows, and those that nothing can be computed with, as NaN."""
+    low, high = -BOUNDLESS if low is None else low, BOUNDLESS if high is None else high
+    for item in value if isinstance(value, tuple | list) else (value,):
+        if isinstance(item, int | float) and not low <= item <= high:
+            hint = f"--{name.rstrip('_').replace('_', '-')}"
+            raise typer.BadParameter(f"{item:g}: give a number from {low:g} to {high:g}", param_hint=hint)
 
 
 def show_error(message: str) -> None:
