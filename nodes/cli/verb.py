@@ -90,6 +90,11 @@ class Options(msgspec.Struct, frozen=True):
             for field in msgspec.structs.fields(cls)
         ]
 
+    @classmethod
+    def bounds(cls) -> dict[str, tuple[float | None, float | None]]:
+        """The least and the largest value of each, by parameter."""
+        return {name: without_bounds(kind)[1:] for name, kind in get_type_hints(cls, include_extras=True).items()}
+
 
 class SettingOptions:
     """Options that set settings of ``kind``, with ``--config`` and ``--set`` for the others.
@@ -122,6 +127,12 @@ class SettingOptions:
             _parameter("config", Path | None, listed, None),
             _parameter("set", SetOption, typer.Option(), None),
         ]
+
+    @classmethod
+    def bounds(cls) -> dict[str, tuple[float | None, float | None]]:
+        """As of ``Options``."""
+        declared = {setting.name: (setting.low, setting.high) for setting in settings_of(cls.kind)}
+        return {_parameter_name(option): declared[name] for option, name in cls.options.items()}
 
     @property
     def given(self) -> dict[str, Any]:
@@ -206,6 +217,7 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
         if isinstance(kind, type) and issubclass(kind, Options | SettingOptions):
             groups[name] = kind
             parameters += kind.parameters()
+            bounds |= kind.bounds()
         elif name != "output":
             make = _option if parameter.kind is inspect.Parameter.KEYWORD_ONLY else _argument
             parameters.append(make(name, kind, parameter.default, texts.get(name, "")))
