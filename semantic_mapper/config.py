@@ -560,8 +560,8 @@ def _explain(message: str, kind: type[msgspec.Struct]) -> str:
         places = _types_at(path, kind)
         keys = {item.encode_name for at in places for item in getattr(at, "fields", ())}
         values = {str(value) for at in places for value in getattr(at, "values", ())}
-        word = "key" if "unknown field" in text else "value"
-        return f"{at}unknown {word} `{name}`{nearest(name[:_MESSAGE], sorted(keys | values))}"
+        wrong = f"unknown key `{name}`" if "unknown field" in text else f"'{name}' is not valid"
+        return f"{at}{wrong}{nearest(name[:_MESSAGE], sorted(keys | values))}"
     if actual is not None:
         wanted = " or ".join(_TOML_WORDS.get(word, word) for word in name.split(" | "))
         return f"{at}must be {wanted}, not {_TOML_WORDS.get(actual, actual)}"

@@ -74,7 +74,8 @@ class CameraIntrinsics:
         _check_lens(self)
         if len(self.distortion) not in COEFFICIENTS or any(abs(d) > MAX_DISTORTION for d in self.distortion):
             raise FrameError(
-                f"distortion: {COEFFICIENTS} coefficients up to {MAX_DISTORTION:g}, {got}; calibrate again"
+                f"distortion has {len(self.distortion)} coefficients, {got}; give {COEFFICIENTS} of at most "
+                f"{MAX_DISTORTION:g}: calibrate again"
             )
 
 

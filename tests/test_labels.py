@@ -68,7 +68,7 @@ def test_classes_that_get_one_name_become_one_class() -> None:
     [
         ((1, 1), ("a", "b"), 0, "twice"),
         ((1, 2), ("a", "a"), 0, "twice"),
-        ((0, 1), ("a", "b"), 0, "both a class and the ignore id"),
+        ((0, 1), ("a", "b"), 0, "needs an ignore id that is no class"),
         ((1, 256), ("a", "b"), 0, "0..255"),
         ((1, -1), ("a", "b"), 0, "0..255"),
         ((1, 2), ("a", "b"), 300, "0..255"),

@@ -327,7 +327,7 @@ def must_be_there(*paths: Path) -> None:
     """
     for path in paths:
         if not path.is_file() and not path.is_dir():
-            what = "no regular file; copy its content to one" if path.exists() else "no such file or folder"
+            what = "it is no regular file; copy its content to one" if path.exists() else "no such file or folder"
             raise LogError(f"{path}: cannot be read: {what}")
 
 

@@ -189,7 +189,7 @@ class Running:
         return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
 
     def all_pids(self) -> list[int]:
-        """Of nodes, and of the process that forks them."""
+        """Of nodes."""
         return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
 
     def node_pid(self, name: str) -> int:
