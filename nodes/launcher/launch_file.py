@@ -106,12 +106,13 @@ def find_launch(path: Path) -> Path:
     Raises:
         ConfigError: neither is there; lists those of the package.
     """
-    if path.is_file():
+    if path.exists() and not path.is_dir():
         return path
     files = launch_files()
     name = path.name.removesuffix(".toml")
     if path.parent != Path() or name not in files:
-        raise ConfigError(f"{path}: no such file; launch files that come with the package: {', '.join(files)}")
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise ConfigError(f"{path}: {what}; launch files that come with the package: {', '.join(files)}")
     return files[name]
 
 

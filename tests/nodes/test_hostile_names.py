@@ -147,7 +147,7 @@ def test_what_is_no_file_is_refused_by_its_name(tmp_path: Path) -> None:
     os.mkfifo(pipe := tmp_path / "pipe")
     (big := tmp_path / "big.json").write_text('{"boxes": [{"id": ' + "9" * 5000 + "}]}", encoding="utf-8")
     for words, said in (
-        (("up", folder), f"{folder}: is a folder; name a launch file in it"),
+        (("up", folder), f"{folder}: is a folder; launch files"),
         (("info", "/proc/self/mem"), "/proc/self/mem: cannot be read: Input/output error"),
         (("replay", pipe, "--out", tmp_path / "o"), f"{pipe}: cannot be read: it is no regular file"),
         (("import", pipe, tmp_path / "o.mcap"), f"{pipe}: is neither a file nor a folder"),
