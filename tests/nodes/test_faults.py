@@ -162,8 +162,9 @@ def test_log_that_is_at_its_end_ends_a_live_launch_in_order(log: Path, tmp_path:
 
 @pytest.mark.slow
 def test_node_that_never_was_ready_and_says_why_is_not_tried_again(tmp_path: Path) -> None:
-    done = run("up", alone(tmp_path, tmp_path / "none.mcap"))
-    assert done.returncode == 1 and "none.mcap" in error_line(done.stderr)
+    (tmp_path / "no-log.mcap").touch()
+    done = run("up", alone(tmp_path, tmp_path / "no-log.mcap"))
+    assert done.returncode == 1 and "no-log.mcap" in error_line(done.stderr)
     assert done.stderr.count("node_started") == 1
 
 

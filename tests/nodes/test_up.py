@@ -89,7 +89,8 @@ def test_nodes_of_a_killed_launcher_write_their_results_and_end(
         running.process.kill()
         assert eventually(lambda: not any(is_alive(pid) for pid in pids))
     assert sockets.exists()  # who could have removed it?
-    again = run("up", REPLAY_LAUNCH, *_settings(tmp_path / "none.mcap", weights, config), "--out", tmp_path / "again")
+    (tmp_path / "no-log.mcap").touch()
+    again = run("up", REPLAY_LAUNCH, *_settings(tmp_path / "no-log.mcap", weights, config), "--out", tmp_path / "again")
     assert again.returncode == 1 and not sockets.exists()  # the next launch
     summary = json.loads((tmp_path / "up" / "summary.json").read_text())
     assert summary["stopped_by"]
