@@ -215,7 +215,7 @@ def guess_intrinsics(width: int, height: int) -> CameraIntrinsics:
 
 
 class Rectifier:
-    """Makes the RGB image of an ideal pinhole camera of what a lens gives; ``ConfigError`` where there is none.
+    """Makes the RGB image of an ideal pinhole camera of what a lens gives; ``ConfigError`` without one.
 
     The image keeps its size; its edges are cut so far that no pixel is made up.
     """

@@ -103,7 +103,7 @@ def _usable(lens: CameraIntrinsics, fx: float, fy: float, cx: float, cy: float) 
 
 
 def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float32, Float32]:
-    """The ideal pinhole camera of a lens (``ConfigError``: there is none), and where its pixels lie in the image of the
+    """The ideal pinhole camera of a lens (``ConfigError`` without one), and where its pixels lie in the image of the
     lens: (H, W) x and y."""
     K, lens = camera_matrix(measured), np.array(measured.distortion, np.float64)
     size = (measured.width, measured.height)

@@ -31,7 +31,7 @@ class FoundCamera:
 
 
 def load_driver(kind: str) -> Any:
-    """The package of a kind; ``ConfigError``: there is none, ``DependencyError``: something is not installed."""
+    """The package of a kind; ``ConfigError``: unknown, ``DependencyError``: something is not installed."""
     if kind not in KINDS:
         near = difflib.get_close_matches(kind, KINDS, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(KINDS)}"

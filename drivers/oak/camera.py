@@ -100,7 +100,7 @@ class OakDevice(Device):
             self._odometry.close()
 
     def _with_pose(self) -> CameraImage | None:
-        """The oldest image that waits, as it can go on; None where there is none, or it has to wait for its pose."""
+        """The oldest image that waits, as it can go on; None without one, or where it has to wait for its pose."""
         if not self._waiting:
             return None
         image, odometry = self._waiting[0], self._odometry
@@ -209,7 +209,7 @@ def rgb_pixels(frame: Any) -> UInt8:
 
 
 def depth_metres(frame: Any) -> Float32:
-    """Depth (H, W) of a depth message, 0 where nothing was measured; raises ``CameraError`` where it is none."""
+    """Depth (H, W) of a depth message, 0 where nothing was measured; raises ``CameraError`` where it is another message."""
     raw = frame.getFrame()
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise CameraError(f"the OAK's depth must be 16 bits a pixel, got {raw.dtype} {raw.shape}")

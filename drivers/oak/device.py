@@ -70,7 +70,7 @@ class Sources:
 
 
 def connect_device(config: Config) -> Sources:
-    """Open the device and build its part of the pipeline; ``CameraError``: there is none, or it cannot do that."""
+    """Open the device and build its part of the pipeline; ``CameraError``: without one, or where it cannot do that."""
     dai = load_depthai()
     info = find_device(config.device, SEARCH_S)
     name = f"the OAK {info.getDeviceId()} ({info.name})"
@@ -91,7 +91,7 @@ def connect_device(config: Config) -> Sources:
 
 
 def load_calibration(device: Any, path: str) -> Any:
-    """The ``dai.CalibrationHandler`` of a file (``CameraError``: it is none), or of the device where there is none."""
+    """The ``dai.CalibrationHandler`` of a file (``CameraError``: it is another file), or of the device without one."""
     if not path:
         return device.readCalibration()
     try:

@@ -140,7 +140,7 @@ class LiveWeights:
             return Weights(self._in_use, before, requested, **self._counts, versions=versions)
 
     def return_to(self, number: int) -> Weights:
-        """Request weights that were in use before; for any thread. ``MapError`` where there are none of this number."""
+        """Request weights that were in use before; for any thread. ``MapError`` for an unknown number."""
         with self._lock:
             usable = [n for n, v in self._versions.items() if v.state != "refused"]
             if number not in usable:

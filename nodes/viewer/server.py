@@ -50,7 +50,7 @@ class WebViewer(ExitStack):
 
     def __init__(self, web_port: int = WEB_PORT, data_port: int = DATA_PORT, memory_mb: int = 512) -> None:
         super().__init__()
-        self._asked = web_port, data_port
+        self._requested = web_port, data_port
         self._memory_mb = memory_mb
         self.data_url = ""  # where to send what is to be shown
         self.page_url = ""  # what to open in a browser
@@ -86,8 +86,8 @@ class WebViewer(ExitStack):
             raise DependencyError(f"{program}: analytics cannot be switched off: {result.stderr.decode().strip()}")
         # Ports are held until all are chosen: one that was let go may be given out again. The page answers before there
         # is anything to show, and so keeps its own.
-        with _hold_port(self._asked[1]) as data, _hold_port(0) as web:
-            page = self.enter_context(quiet_page(self._asked[0], web, f"http://{HOST}:{data}"))
+        with _hold_port(self._requested[1]) as data, _hold_port(0) as web:
+            page = self.enter_context(quiet_page(self._requested[0], web, f"http://{HOST}:{data}"))
         self.data_url = f"rerun+http://{HOST}:{data}/proxy"
         shown = f"url={quote(self.data_url, safe='')}&hide_welcome_screen=1&persist=0&theme=dark"
         self.page_url = f"http://{HOST}:{page.port}/?{shown}"

@@ -149,7 +149,7 @@ def computed_trust(depth_m: Float32, sigma_m: Float32) -> Float32:
 
 
 def rendered_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) -> Float32:
-    """Fraction (h, w) of its full weight that depth has which a field rendered; 0 where nothing is to be fused.
+    """Fraction (h, w) of its full weight that depth has which a field rendered; 0 where there is nothing to fuse.
 
     It is a mean along each ray: where its samples disagree, at edges and where it guesses, it leaves the smooth surface
     of its neighbours; and where the map has a surface, it has to lie near that. So trust falls with both differences:

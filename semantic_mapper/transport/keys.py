@@ -96,8 +96,8 @@ def load_keys(folder: Path) -> Keys:
 
 
 def allow(folder: Path, name: str, public: str) -> None:
-    """Add a peer by its public key, or change its key; servers that run let it in from now on. ``TransportError`` where
-    the name is none for a file, or the key none."""
+    """Add a peer by its public key, or change its key; servers that run let it in from now on. ``TransportError`` for
+    a name or a key that cannot be used."""
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,47}", name):
         raise TransportError(f"'{name}' cannot name a peer: use letters, digits and any of _ . -")
     if not _is_key(public.encode()):
@@ -111,7 +111,7 @@ def allow(folder: Path, name: str, public: str) -> None:
 
 
 def forget(folder: Path, name: str) -> None:
-    """Remove a peer (``TransportError`` where there is none); connections that it has already stay until they end."""
+    """Remove a peer (``TransportError`` for an unknown one); connections that it has already stay until they end."""
     path = folder / _PEERS / f"{Path(name).name}.key"  # never the key of this machine itself
     try:
         path.unlink()

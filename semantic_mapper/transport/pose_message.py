@@ -62,7 +62,7 @@ def encode_pose(message: PoseMessage, topic: str = "pose") -> list[bytes]:
 
 
 def decode_pose(parts: Parts) -> PoseMessage:
-    """Inverse of ``encode_pose``; takes JSON, and a payload without topic, too. ``CodecError`` where it is none, or
+    """Inverse of ``encode_pose``; takes JSON, and a payload without topic, too. ``CodecError`` where it is no pose, or
     longer than ``MAX_POSE_BYTES``."""
     if not 1 <= len(parts) <= 2:
         raise CodecError(f"{_WHAT}: has one part, or topic and payload; got {len(parts)} parts")
