@@ -247,7 +247,8 @@ def _read_json(text: bytes, path: Path) -> BoxFile:
     try:
         data: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} is neither JSON nor XML: {error!s:.200}") from error
+        reason = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
+        raise ConfigError(f"{path} is neither JSON nor XML: {reason:.200}") from error
     table = cast("dict[str, Any]", data) if isinstance(data, dict) else {}
     of_query = table.get("question") == "instances"
     if of_query:

@@ -209,7 +209,7 @@ def rgb_pixels(frame: Any) -> UInt8:
 
 
 def depth_metres(frame: Any) -> Float32:
-    """Depth (H, W) of a depth message, 0 where nothing was measured; raises ``CameraError`` where it is another message."""
+    """Depth (H, W) of a depth message, 0 where nothing was measured; ``CameraError``: another message."""
     raw = frame.getFrame()
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise CameraError(f"the OAK's depth must be 16 bits a pixel, got {raw.dtype} {raw.shape}")

@@ -154,7 +154,7 @@ def rendered_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) 
     It is a mean along each ray: where its samples disagree, at edges and where it guesses, it leaves the smooth surface
     of its neighbours; and where the map has a surface, it has to lie near that. So trust falls with both differences:
     to 1 / e half a truncation away from the map's surface. Beyond the map a field mostly guesses: there many looks have
-    to agree. Depths are 0 where there is none."""
+    to agree. Depths are 0 where nothing is known."""
     roughness = np.maximum(_bend(depth_m, 0), _bend(depth_m, 1)) / np.maximum(depth_m, np.float32(1e-3))
     cost = (roughness / ROUGHNESS) ** 2
     off = 2 * (depth_m - map_depth_m) / truncation_m

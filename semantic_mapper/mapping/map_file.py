@@ -116,7 +116,7 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 def parse_manifest(content: bytes, where: str) -> MapManifest:
-    """Read a manifest and check it: ``MapError`` where it is no manifest, of another version, or says what cannot be."""
+    """Read a manifest and check it: ``MapError`` where it is another file, another version, or impossible."""
     try:
         plain = msgspec.json.decode(content, type=dict[str, Any])
         kind, version = plain["format"], plain["version"]
