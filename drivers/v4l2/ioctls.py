@@ -180,7 +180,7 @@ def list_controls(fd: int) -> dict[str, Control]:
     """Its controls by name."""
     found: dict[str, Control] = {}
     last = 0
-    for row in _rows(fd, QUERYCTRL, lambda _: _QueryControl(id=last | _CTRL_FLAG_NEXT)):  # noqa: B023 -- asked anew each time
+    for row in _rows(fd, QUERYCTRL, lambda _: _QueryControl(id=last | _CTRL_FLAG_NEXT)):  # noqa: B023 -- requested again each time
         last = row.id
         name = re.sub(r"[^a-z0-9]+", "_", _text(row.name).lower()).strip("_")
         if not row.flags & _CTRL_FLAG_DISABLED:

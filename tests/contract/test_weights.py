@@ -34,7 +34,8 @@ FITTED = {
 }
 FRAMES, STEPS = 3, 20
 TOLD = {"loss": r"held-out loss (\d+\.\d+)", "db": r"held-out views (\d+\.\d+) dB"}
-ROUNDING = {"labels": 40, "depth_m": 1e-4, "confident": 5}  # 40: an AMD EPYC gives 29 other pixels than an Intel Xeon
+ROUNDING = {"labels": 5, "depth_m": 1e-4, "confident": 5}
+ROUNDING_OF_SMALL = {**ROUNDING, "labels": 40}  # half trained: an AMD EPYC gives 29 other pixels than an Intel Xeon
 ROUNDING_OF_FITS = {
     "labels": 70,
     "depth_m": 0.01,
@@ -97,7 +98,8 @@ def observe(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("weights", RENDERED)
 def test_weights_of_the_package_render_what_they_rendered(weights: str, tmp_path: Path) -> None:
-    assert unlike(read("weights")["rendered"][Path(weights).stem], rendered(weights, tmp_path), ROUNDING) == []
+    allowed = ROUNDING_OF_SMALL if weights == str(WEIGHTS) else ROUNDING
+    assert unlike(read("weights")["rendered"][Path(weights).stem], rendered(weights, tmp_path), allowed) == []
 
 
 @pytest.mark.gate

@@ -133,7 +133,7 @@ class Sender:
                     % (len(self._jpeg), self._jpeg)
                 )
         except OSError:
-            return  # whoever listened has gone
+            return  # the client has gone
 
     def close(self) -> None:
         self.break_off.set()

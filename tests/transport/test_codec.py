@@ -1,4 +1,4 @@
-"""Messages as bytes: exact round trips, and one clear error for whatever is none, before anything is allocated."""
+"""Messages as bytes: exact round trips, and one clear error for anything else, before anything is allocated."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Heard:
-    """What a finetuner says, and what it is told."""
+    """What a finetuner says, and what it receives."""
 
     def __init__(self, endpoints: dict[str, str], weights: LosslessSubscriber, status: NewestSubscriber) -> None:
         self.endpoints = endpoints
