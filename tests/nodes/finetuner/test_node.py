@@ -323,5 +323,5 @@ def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(given: 
     assert {"labels", "query", "finetuner"} <= set(launch.sockets()) and launch.listeners("camera") == 1
     other = path.read_text(encoding="utf-8").replace('learner = "finetuner"', 'learner = "finetunes"')
     (tmp_path / "other.toml").write_text(other, encoding="utf-8")
-    with pytest.raises(ConfigError, match="did you mean 'finetuner'"):
+    with pytest.raises(ConfigError, match="did you mean `finetuner`"):
         load_launch(tmp_path / "other.toml", given, tmp_path)
