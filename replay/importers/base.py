@@ -122,8 +122,7 @@ class BadFrameError(ImportSourceError):
 def read_bytes(file: Path) -> bytes:
     """All of one file of a recording.
 
-    Raises:
-        BadFrameError: missing, no regular file (a pipe may never end), or larger than any image or list of poses.
+    Raises BadFrameError: missing, no regular file (a pipe may never end), or larger than any image or list of poses.
     """
     try:
         return read_regular(file, MAX_FILE_BYTES)
@@ -136,8 +135,7 @@ def read_bytes(file: Path) -> bytes:
 def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
     """Colour image (H, W, 3) and the file's bytes, which the log keeps as they are.
 
-    Raises:
-        BadFrameError: missing, damaged, cut off, or neither PNG nor JPEG.
+    Raises BadFrameError: missing, damaged, cut off, or neither PNG nor JPEG.
     """
     data = read_bytes(file)
     try:
@@ -161,8 +159,7 @@ def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
 def read_depth(file: Path, scale: DepthScale) -> Float32:
     """Depth image (H, W) in metres, of a 16-bit PNG, or of NumPy's file of one matrix.
 
-    Raises:
-        BadFrameError: missing, damaged, or not 16-bit.
+    Raises BadFrameError: missing, damaged, or not 16-bit.
     """
     if file.suffix.lower() == ".png":
         return depth_from_uint16(read_plane(file, "uint16", None, "depth").astype(np.uint16), scale.units_per_m)
@@ -196,14 +193,13 @@ def read_plane(
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Single-channel PNG as it is: (H, W) uint8 or uint16.
 
+    Raises BadFrameError: missing, damaged, of another type or size.
+
     Args:
         file: To read.
         kind: "uint8", "uint16", or "any" of the two.
         size: (height, width) that it must have; None = any.
         what: It shows, for errors.
-
-    Raises:
-        BadFrameError: missing, damaged, of another type or size.
     """
     data = read_bytes(file)
     try:
@@ -228,11 +224,7 @@ def read_plane(
 
 
 def check_label(image: UInt8, labels: LabelSet, file: Path) -> UInt8:
-    """Refuse a label image (H, W) with ids that are not in ``labels``.
-
-    Raises:
-        BadFrameError: naming them.
-    """
+    """Refuse a label image (H, W) with ids that are not in ``labels``. Raises BadFrameError: naming them."""
     try:
         labels.to_channels(image, "label image")
     except LabelError as error:
@@ -243,8 +235,7 @@ def check_label(image: UInt8, labels: LabelSet, file: Path) -> UInt8:
 def read_label(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt8:
     """Label image (H, W) of class ids that are all in ``labels``.
 
-    Raises:
-        BadFrameError: missing, damaged, of another type or size, or an id that is not in the set.
+    Raises BadFrameError: missing, damaged, of another type or size, or an id that is not in the set.
     """
     return check_label(read_plane(file, "uint8", size, "label").astype(np.uint8, copy=False), labels, file)
 
@@ -255,11 +246,7 @@ def same_view(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 def check_frame_pose(T_world_camera: Float64, file: Path, line: int | None = None) -> Float64:
-    """Refuse a pose that is no rigid transform.
-
-    Raises:
-        BadFrameError: with the reason and the line of the file.
-    """
+    """Refuse a pose that is no rigid transform. Raises BadFrameError: with the reason and the line of the file."""
     try:
         check_pose(T_world_camera, f"line {line}" if line is not None else "pose")
     except FrameError as error:

@@ -82,8 +82,7 @@ class _Labels(msgspec.Struct):
 def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
     """A sequence folder, opened.
 
-    Raises:
-        ImportSourceError: a file that concerns all frames is missing or cannot be understood.
+    Raises ImportSourceError: a file that concerns all frames is missing or cannot be understood.
     """
     notices: list[str] = []
     color = numbered_files(folder / "color", PICTURES, notices)
@@ -131,11 +130,7 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
 
 
 def _read_stamps(file: Path, count: int, notices: list[str]) -> Sequence[int | BadFrameError]:
-    """Of each frame its stamp, or why it is missing.
-
-    Raises:
-        ImportSourceError: too few rows, or in another unit.
-    """
+    """Of each frame its stamp, or why it is missing."""
     if not file.exists():
         notices.append(f"no timestamps.txt: stamps are made up at {DEFAULT_HZ:g} frames a second")
         return [round(number * 1e9 / DEFAULT_HZ) for number in range(count)]
@@ -168,12 +163,11 @@ def _whole_ns(row: str) -> int:
 def read_label_set(file: Path, notices: list[str] | None = None) -> LabelSet:
     """``labels.json`` -> label set; one that says nothing else is called as its folder.
 
+    Raises ImportSourceError: missing, or no label set.
+
     Args:
         file: To read.
         notices: Gets a sentence on what had to be assumed of the id that means unknown.
-
-    Raises:
-        ImportSourceError: missing, or no label set.
     """
     labels = convert_known(read_plain_json(file), _Labels, file)
     try:
@@ -191,11 +185,7 @@ def read_label_set(file: Path, notices: list[str] | None = None) -> LabelSet:
 
 
 def _label_set(labels: _Labels, folder_name: str) -> LabelSet:
-    """Label set of a recording: its own ids, names and colours; those of a known set where it draws its ids from one.
-
-    Raises:
-        LabelError, ValueError: ids that are no numbers of 0 to 255, a class twice, or colours beyond 255.
-    """
+    """Ids, names and colours of a recording; colours are those of a known set where it draws its ids from one."""
     if any(not 0 <= value <= 255 for color in labels.colors.values() for value in color):
         raise ValueError("colors must be three numbers of 0 to 255")
     classes = {int(key): name for key, name in labels.classes.items()}
@@ -217,13 +207,12 @@ def read_intrinsics(
 ) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
     """``intrinsics.json`` -> intrinsics, the scale of depth images where given, and whether poses are in metres.
 
+    Raises ImportSourceError: missing, or a value that cannot be.
+
     Args:
         file: To read.
         notices: Gets a sentence on keys that are not read.
         pictures: The first that can be read tells the size where the file does not.
-
-    Raises:
-        ImportSourceError: missing, or a value that cannot be.
     """
     plain = read_plain_json(file)
     i = convert_known(plain, _Intrinsics, file)

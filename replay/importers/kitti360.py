@@ -74,12 +74,11 @@ LABELS = _label_set()
 def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
     """A drive, opened; a frame for each image of the left camera and, where they are there, of the right one.
 
+    Raises ImportSourceError: calibration, images or poses are missing or cannot be understood.
+
     Args:
         folder: The root with one drive, or the drive's folder in ``data_2d_raw``.
         options: See ``ImportOptions``; cameras are called as their folders are.
-
-    Raises:
-        ImportSourceError: calibration, images or poses are missing or cannot be understood.
     """
     notices: list[str] = []
     root, drive = find_drive(folder)
@@ -181,8 +180,7 @@ def _read_stamps(file: Path, count: int, notices: list[str]) -> list[int | BadFr
 def find_drive(folder: Path) -> tuple[Path, str]:
     """Root of the data set and name of the drive.
 
-    Raises:
-        ImportSourceError: several drives, none, or a folder of another kind.
+    Raises ImportSourceError: several drives, none, or a folder of another kind.
     """
     folder = folder.resolve()
     if folder.parent.name == "data_2d_raw":
@@ -199,11 +197,7 @@ def find_drive(folder: Path) -> tuple[Path, str]:
 
 
 def _calibrated(file: Path, name: str, count: int) -> Float64:
-    """Numbers of the line of a calibration file that begins with a name, or of the only line, without one.
-
-    Raises:
-        ImportSourceError: it is missing, or has another count of finite numbers.
-    """
+    """Numbers of the line of a calibration file that begins with a name, or of the only line, without one."""
     for _, text in read_lines(file):
         label, colon, numbers = text.rpartition(":")
         if label.strip() == name and (colon or not name):
@@ -216,11 +210,7 @@ def _calibrated(file: Path, name: str, count: int) -> Float64:
 
 
 def _rectified_camera(file: Path, which: str) -> tuple[CameraIntrinsics, Float64]:
-    """Intrinsics of the rectified camera "00" or "01", and ``T_cam0_camera`` (4, 4): where it stands next to the left.
-
-    Raises:
-        ImportSourceError: the file lacks it.
-    """
+    """Intrinsics of the rectified camera "00" or "01", and ``T_cam0_camera`` (4, 4)."""
     P = _calibrated(file, f"P_rect_{which}", 12).reshape(3, 4)
     width, height = _calibrated(file, f"S_rect_{which}", 2)
     T_cam0_camera = np.eye(4)
@@ -233,11 +223,7 @@ def _rectified_camera(file: Path, which: str) -> tuple[CameraIntrinsics, Float64
 
 
 def _scanner_pose(file: Path) -> Float64:
-    """T_cam0_scanner (4, 4): the scanner in the rectified left camera.
-
-    Raises:
-        ImportSourceError: files or lines are missing, or of another form.
-    """
+    """T_cam0_scanner (4, 4): the scanner in the rectified left camera."""
     T_scanner_camera, T_cam0_raw = np.eye(4), np.eye(4)
     T_scanner_camera[:3] = _calibrated(file.with_name("calib_cam_to_velo.txt"), "", 12).reshape(3, 4)
     T_cam0_raw[:3, :3] = _calibrated(file, "R_rect_00", 9).reshape(3, 3)
@@ -245,22 +231,14 @@ def _scanner_pose(file: Path) -> Float64:
 
 
 def _read_semantics(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt8:
-    """Label image (H, W) with the ids of the data set; those of its category "void" become 0.
-
-    Raises:
-        BadFrameError: missing, damaged, of another size, or an id that the data set does not have.
-    """
+    """Label image (H, W) with the ids of the data set; those of its category "void" become 0."""
     ids = read_plane(file, "uint8", size, "label").astype(np.uint8)
     ids[np.isin(ids, _VOID)] = labels.ignore_id
     return check_label(ids, labels, file)
 
 
 def _read_scan(file: Path) -> Float64:
-    """Points (N, 3) of a scan, metres, in the scanner's axes.
-
-    Raises:
-        BadFrameError: it cannot be read, or does not hold four numbers a point.
-    """
+    """Points (N, 3) of a scan, metres, in the scanner's axes."""
     data = read_bytes(file)
     if len(data) % 16:
         raise BadFrameError(file, f"a scan has 16 bytes a point, this one {len(data)} bytes; download it again")

@@ -49,8 +49,7 @@ _LOOKED_AT, _POINTS = 20, 5000  # cameras and points whose depth is looked at
 def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     """A folder with a COLMAP model, opened.
 
-    Raises:
-        ImportSourceError: no model, one that cannot be read, or no folder of pictures.
+    Raises ImportSourceError: no model, one that cannot be read, or no folder of pictures.
     """
     notices: list[str] = []
     place, model = _largest(folder, notices)
@@ -69,11 +68,7 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
 
 
 def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:
-    """The model of most images; the others are named.
-
-    Raises:
-        ImportSourceError: none that can be read and has an image.
-    """
+    """The model of most images; the others are named."""
     places = find_models(folder)
     if not places:
         raise ImportSourceError(f"{folder}: no COLMAP model (cameras, images and points3D, .bin or .txt) in it")
@@ -148,8 +143,8 @@ def find_opensfm(folder: Path) -> Path | None:
 def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     """The largest reconstruction of a folder, opened.
 
-    Raises:
-        ImportSourceError: none, one that cannot be read, no folder of pictures, or a lens that is no pinhole camera's.
+    Raises ImportSourceError: none, one that cannot be read, no folder of pictures, or a lens that is no pinhole
+    camera's.
     """
     file = find_opensfm(folder)
     if file is None:
@@ -225,11 +220,7 @@ def _opensfm_intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
 
 
 def _root(folder: Path, roots: tuple[Path, ...], names: list[str]) -> Path:
-    """The folder that most of a model's pictures are in.
-
-    Raises:
-        ImportSourceError: none has any.
-    """
+    """The folder that most of a model's pictures are in."""
     found = {root: sum(_is_picture(root, name) for name in names) for root in roots}
     root = max(roots, key=lambda root: found[root])
     if not found[root]:
@@ -254,17 +245,7 @@ def _opened(
     notices: list[str],
     origin: GpsPosition | None = None,
 ) -> PosedPictures:
-    """Pictures posed in a model's world and unit, in the world of a log.
-
-    Args:
-        source: The format.
-        folder: That was named.
-        pictures: Those with a pose.
-        points: (N, 3) in the model's world.
-        options: See ``ImportOptions``.
-        notices: What is to be said of the model.
-        origin: Of a world that is metric, east, north and up already.
-    """
+    """Pictures posed in a model's world and unit, in the world of a log."""
     names = {picture.file for picture in pictures}
     there = (file for place in {file.parent for file in names} for file in place.iterdir())
     unposed = sorted(str(file) for file in there if file.suffix.lower() in PICTURES and file not in names)

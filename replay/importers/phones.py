@@ -72,11 +72,7 @@ class _Camera(msgspec.Struct):
 
 
 def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
-    """A capture of Polycam, opened.
-
-    Raises:
-        ImportSourceError: no pictures, or none with a camera that can be used.
-    """
+    """A capture of Polycam, opened. Raises ImportSourceError: no pictures, or none with a camera that can be used."""
     keyframes = folder / "keyframes"
     notices: list[str] = []
     images = numbered_files(keyframes / "corrected_images", PICTURES, notices)
@@ -135,8 +131,7 @@ class _Metadata(msgspec.Struct, rename={"per_frame_k": "perFrameIntrinsicCoeffs"
 def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     """An export of Record3D, opened.
 
-    Raises:
-        ImportSourceError: metadata or pictures are missing or cannot be understood.
+    Raises ImportSourceError: metadata or pictures are missing or cannot be understood.
     """
     file = folder / "metadata.json"
     plain = read_plain_json(file)

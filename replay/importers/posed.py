@@ -69,6 +69,8 @@ class LoadedFrame:
 class PosedPictures:
     """The pictures of a recording; ``load`` may be called in any order.
 
+    Raises ImportSourceError: there is no picture.
+
     Args:
         source: What the log names as its source.
         pictures: In their order; where each has a time, in that of the times.
@@ -82,9 +84,6 @@ class PosedPictures:
         read_depth: Reads the depth image of a picture, in metres and in the pixels of its rectified image; None = by
             ``depth_scale``, where its file is there.
         read_label: Reads a label image of a size (height, width).
-
-    Raises:
-        ImportSourceError: there is no picture.
     """
 
     def __init__(
@@ -135,11 +134,7 @@ class PosedPictures:
         return len(self._pictures)
 
     def load(self, number: int) -> LoadedFrame:
-        """Read one frame.
-
-        Raises:
-            BadFrameError: it cannot be used.
-        """
+        """Read one frame. Raises BadFrameError: it cannot be used."""
         picture = self._pictures[number]
         if isinstance(picture.pose, BadFrameError):
             raise picture.pose
@@ -219,8 +214,7 @@ def _at_size(picture: PosedPicture, size: tuple[int, int]) -> CameraIntrinsics:
 def depth_of_size(depth_m: Float32, size: tuple[int, int], file: Path) -> Float32:
     """Depth (H, W) of the size (height, width) of its picture, each pixel from the nearest one.
 
-    Raises:
-        BadFrameError: it shows another part of the view.
+    Raises BadFrameError: it shows another part of the view.
     """
     if depth_m.shape == size:
         return depth_m

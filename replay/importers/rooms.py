@@ -67,8 +67,7 @@ _TABLE = "scannetv2-labels.combined.tsv"
 def open_scannet(folder: Path, options: ImportOptions) -> PosedPictures:
     """An exported scene, opened; one frame for each colour image.
 
-    Raises:
-        ImportSourceError: intrinsics or images are missing.
+    Raises ImportSourceError: intrinsics or images are missing.
     """
     notices: list[str] = []
     color = numbered_files(folder / "color", PICTURES, notices)
@@ -178,11 +177,7 @@ class _Info(msgspec.Struct):
 
 
 def open_replica(folder: Path, options: ImportOptions) -> PosedPictures:
-    """A sequence, opened; one frame for each colour image.
-
-    Raises:
-        ImportSourceError: images or poses are missing.
-    """
+    """A sequence, opened; one frame for each colour image. Raises ImportSourceError: images or poses are missing."""
     notices: list[str] = []
     color = numbered_files(folder / "rgb", (".png",), notices)
     depth = numbered_files(folder / "depth", DEPTHS, notices)

@@ -135,11 +135,7 @@ def _holds_ros2(file: Path) -> bool:
 
 
 def _readable(src: Path) -> tuple[list[Path], tempfile.TemporaryDirectory[str] | None]:
-    """What rosbags is to open, and the folder of what had to be made for that.
-
-    Raises:
-        ImportSourceError: a packed file is damaged.
-    """
+    """What rosbags is to open, and the folder of what had to be made for that."""
     if src.is_dir() and (src / "metadata.yaml").exists():
         return [src], None
     files = [src] if src.is_file() else _storage_files(src)
@@ -232,8 +228,8 @@ class Calibration:
     def intrinsics(self, *, rectified: bool) -> CameraIntrinsics:
         """Of the raw image, or of one whose lens distortion has been removed already.
 
-        Raises:
-            ImportSourceError: not calibrated, a lens model that is not OpenCV's, skew, binning or a region of interest.
+        Raises ImportSourceError: not calibrated, a lens model that is not OpenCV's, skew, binning or a region of
+        interest.
         """
         where = "its camera_info"
         if not self.whole:
@@ -263,9 +259,7 @@ class Calibration:
 class Bag:
     """A bag that is open, by the names of its topics.
 
-    Raises:
-        ImportSourceError: it cannot be read.
-        DependencyError: the package is missing.
+    Raises ImportSourceError: it cannot be read. DependencyError: the package is missing.
     """
 
     def __init__(self, src: Path) -> None:
@@ -320,13 +314,12 @@ class Bag:
     def message(self, name: str, series: list[tuple[int, int]], index: int) -> Any:
         """One message of a topic; quick where they are read in order.
 
+        Raises CodecError: it cannot be read.
+
         Args:
             name: Of the topic.
             series: Stamp and time of recording of all its messages, in the order of recording.
             index: In ``series``.
-
-        Raises:
-            CodecError: it cannot be read.
         """
         position, stream = self._streams.pop(name, (-1, iter(())))
         try:
@@ -400,8 +393,7 @@ def is_grey(encoding: str) -> bool:
 def color_image(message: Any) -> UInt8:
     """RGB (H, W, 3) of a ``sensor_msgs/Image``.
 
-    Raises:
-        CodecError: another encoding, or fewer bytes than its size needs.
+    Raises CodecError: another encoding, or fewer bytes than its size needs.
     """
     if message.encoding not in COLOR_ENCODINGS:
         raise CodecError(f"images of encoding '{message.encoding}' are not read, only {', '.join(COLOR_ENCODINGS)}")
@@ -421,8 +413,7 @@ def color_image(message: Any) -> UInt8:
 def compressed_color_image(message: Any) -> tuple[UInt8, EncodedImage]:
     """RGB (H, W, 3) of a ``sensor_msgs/CompressedImage``, and its file as it is.
 
-    Raises:
-        CodecError: neither JPEG nor PNG, or damaged.
+    Raises CodecError: neither JPEG nor PNG, or damaged.
     """
     data = message.data.tobytes()
     rgb, encoding = decode_image_file(data)
@@ -432,8 +423,7 @@ def compressed_color_image(message: Any) -> tuple[UInt8, EncodedImage]:
 def depth_image(message: Any) -> Float32:
     """Depth (H, W) in metres of a ``sensor_msgs/Image``, 0 where nothing was measured.
 
-    Raises:
-        CodecError: another encoding, or fewer bytes than its size needs.
+    Raises CodecError: another encoding, or fewer bytes than its size needs.
     """
     if message.encoding not in DEPTH_ENCODINGS:
         known = ", ".join(DEPTH_ENCODINGS)
@@ -446,8 +436,7 @@ def depth_image(message: Any) -> Float32:
 def compressed_depth_image(message: Any) -> Float32:
     """Depth (H, W) in metres of a ``sensor_msgs/CompressedImage`` of transport compressedDepth, or a 16-bit PNG.
 
-    Raises:
-        CodecError: another compression than PNG, or damaged.
+    Raises CodecError: another compression than PNG, or damaged.
     """
     data = message.data.tobytes()
     quantised = None

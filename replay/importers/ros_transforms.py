@@ -202,8 +202,7 @@ class TransformTree:
     def check(self, target: str, source: str) -> None:
         """Refuse two truths about a transform between two frames.
 
-        Raises:
-            ImportSourceError: two programs publish one transform and differ.
+        Raises ImportSourceError: two programs publish one transform and differ.
         """
         up, down = self.way_up(source), self.way_up(target)
         for child in set(up) ^ set(down):
@@ -241,8 +240,7 @@ class TransformTree:
     def way_up(self, frame: str) -> list[str]:
         """The frame, the one it sits on, and so on to the root.
 
-        Raises:
-            ImportSourceError: a frame sits on two others, or the frames go round in a circle.
+        Raises ImportSourceError: a frame sits on two others, or the frames go round in a circle.
         """
         way = [frame]
         while way[-1] in self._parents:

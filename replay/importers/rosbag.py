@@ -75,13 +75,12 @@ _VIEWER = (
 def open_rosbag(src: Path, options: ImportOptions) -> PosedPictures:
     """A bag, opened; one frame for each image of one camera.
 
+    Raises ImportSourceError: damaged, no image, several cameras where none is named, no calibration, or no poses.
+    DependencyError: the package ``rosbags`` is not installed.
+
     Args:
         src: ``.bag``, ``.mcap`` or ``.db3`` file, or folder of ROS 2.
         options: See ``ImportOptions``.
-
-    Raises:
-        ImportSourceError: damaged, no image, several cameras where none is named, no calibration, or no poses.
-        DependencyError: the package ``rosbags`` is not installed.
     """
     return _BagReader(src, options).pictures()
 
@@ -176,11 +175,7 @@ class _BagReader:
         return ImportSourceError(f"{self._src}: {text}")
 
     def _find_images(self) -> tuple[Topic, Topic | None]:
-        """The topics of colour and of depth.
-
-        Raises:
-            ImportSourceError: none or several fit, or a named one does not.
-        """
+        """The topics of colour and of depth."""
         topics, wanted = self._bag.image_topics(), self._options.topics
         depths = [t for t in topics if is_depth(t.name, t.encoding)]
         colors = [t for t in topics if t not in depths]
@@ -268,11 +263,7 @@ class _BagReader:
         self._series = {name: list(zip(stamps[name], received[name], strict=True)) for name in images}
 
     def _intrinsics(self, topic: Topic, info: str) -> CameraIntrinsics:
-        """Of the images of a topic.
-
-        Raises:
-            ImportSourceError: they change, or cannot be used.
-        """
+        """Of the images of a topic."""
         try:
             found = [c.intrinsics(rectified=topic.rectified) for c in _unlike(self._calibrations[info])]
         except ImportSourceError as error:
@@ -316,11 +307,7 @@ class _BagReader:
                 )
 
     def _link_depth(self, depth: Topic, info: str) -> tuple[CameraIntrinsics, Float64] | None:
-        """What brings depth to the pixels of colour: its intrinsics and ``T_color_depth``; None = it has them already.
-
-        Raises:
-            ImportSourceError: it is of another camera, and nobody says where that one sits.
-        """
+        """Intrinsics of depth and ``T_color_depth``, by which it is registered; None = it is registered already."""
         if not info:
             self.notices.append(f"{depth.name} has no calibration: it is taken as registered to {self._color.name}")
             return None
@@ -357,11 +344,7 @@ class _BagReader:
         return own, invert_pose(self._T_frame_image) @ T_color_depth
 
     def _pose_source(self) -> Callable[[int], Float64 | None]:
-        """What tells the pose of a time.
-
-        Raises:
-            ImportSourceError: nothing does.
-        """
+        """What tells the pose of a time."""
         topic, frame, tree = self._pose_topic(), self._frame, self._tree
         if not topic:
             world = self._world()
@@ -398,11 +381,7 @@ class _BagReader:
         return from_topic
 
     def _pose_topic(self) -> str:
-        """The topic that poses come from; empty = tf.
-
-        Raises:
-            ImportSourceError: the named one is not there, or several fit.
-        """
+        """The topic that poses come from; empty = tf."""
         found, name = self._bag.topics(*POSES), self._options.topics.get("pose", "")
         if name and name not in found:
             raise self._refusal(f"no topic '{name}' of poses; there are {', '.join(found[:LISTED]) or 'none'}")

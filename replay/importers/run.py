@@ -94,8 +94,7 @@ _DEFAULTS = ImportOptions()
 def detect_format(src: Path) -> str:
     """Format of a recording by its file, or by the files in its folder.
 
-    Raises:
-        ImportSourceError: no such file or folder, or none of the formats.
+    Raises ImportSourceError: no such file or folder, or none of the formats.
     """
     if not src.exists():
         raise ImportSourceError(f"{src}: no such file or folder")
@@ -179,7 +178,9 @@ def import_recording(
     """Write the recording ``src`` (folder or ROS bag) to the log ``dst``, which is there once the import is complete.
 
     Images that are JPEG or PNG files stay what they are, and depth loses nothing. A frame that cannot be used is left
-    out and reported; a bad label image costs the frame its label only.
+    out and reported; a bad label image costs the frame its label only. Raises ImportSourceError: not such a recording,
+    or not one good frame in it. LabelError: a class to rename that the recording does not have. LogError: ``dst`` is
+    there already, or cannot be written.
 
     Args:
         src: Folder of the recording, or its file.
@@ -189,11 +190,6 @@ def import_recording(
         options: How to read.
         renames: New names of classes by their present ones; classes of one name become one class.
         overwrite: Whether a log that is there may be replaced.
-
-    Raises:
-        ImportSourceError: not such a recording, or not one good frame in it.
-        LabelError: a class to rename that the recording does not have.
-        LogError: ``dst`` is there already, or cannot be written.
     """
     if dst.exists() and not overwrite:
         raise LogError(f"{dst}: exists already; choose another name, or --overwrite it")
@@ -242,11 +238,7 @@ def import_recording(
 
 
 def _attach_note(file: Path, writer: LogWriter) -> None:
-    """Who has rendered a folder's pseudo labels, and from which frames' labels: these must not be scored.
-
-    Raises:
-        ImportSourceError: it cannot be read, or is no such note.
-    """
+    """Who has rendered a folder's pseudo labels, and from which frames' labels: these must not be scored."""
     note = LogAttachment(file.name, "application/json", read_bytes(file))
     if read_note({file.name: note}) is None:
         raise ImportSourceError(f"{file}: does not say who rendered the pseudo labels; export the log again")

@@ -67,8 +67,7 @@ def without_picture(kind: str, numbers: Iterable[int], pictures: Iterable[int], 
 def inside(folder: Path, name: str) -> Path:
     """A file that a recording names. Links of the user's own are followed.
 
-    Raises:
-        ImportSourceError: the name leads out of the folder.
+    Raises ImportSourceError: the name leads out of the folder.
     """
     if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
         raise ImportSourceError(
@@ -82,8 +81,7 @@ def inside(folder: Path, name: str) -> Path:
 def read_lines(file: Path) -> list[tuple[int, str]]:
     """Lines of a text file that are not empty and no comment, with their numbers from 1.
 
-    Raises:
-        ImportSourceError: missing, or not text.
+    Raises ImportSourceError: missing, or not text.
     """
     try:
         lines = decode_text(read_bytes(file)).splitlines()
@@ -96,10 +94,7 @@ def read_rows(file: Path, count: int) -> list[tuple[int, str]]:
     """Rows of a file whose i-th row belongs to the i-th of ``count`` images, with their lines.
 
     A header does not count. An empty line or a comment between the rows is a row without text, unless there are as many
-    rows without these as images.
-
-    Raises:
-        ImportSourceError: missing, or not text.
+    rows without these as images. Raises ImportSourceError: missing, or not text.
     """
     rows = read_lines(file)
     if len(rows) > count and not any(map(_is_number, split_row(rows[0][1]))):
@@ -127,22 +122,14 @@ def split_row(text: str) -> list[str]:
 
 
 def read_numbers(text: str) -> list[float]:
-    """Numbers of a row.
-
-    Raises:
-        ValueError: a word is no number, or there are no words.
-    """
+    """Numbers of a row. Raises ValueError: a word is no number, or there are no words."""
     if not text.strip():
         raise ValueError("is empty or a comment")
     return [float(word) for word in split_row(text)]
 
 
 def read_matrix(file: Path) -> Float64:
-    """A 4x4 (or 3x3, then padded) matrix as text.
-
-    Raises:
-        BadFrameError: missing, or not such a matrix.
-    """
+    """A 4x4 (or 3x3, then padded) matrix as text. Raises BadFrameError: missing, or not such a matrix."""
     try:
         numbers = [number for _, line in read_lines(file) for number in read_numbers(line)]
     except ValueError as error:
@@ -158,11 +145,10 @@ def read_matrix(file: Path) -> Float64:
 def read_pose_rows(file: Path, pictures: Collection[int]) -> dict[int, Float64 | BadFrameError]:
     """Poses (4, 4) of numbered pictures, by a file whose i-th row, 16 numbers row by row, belongs to picture i.
 
+    Raises ImportSourceError: missing, not text, or without a row.
+
     Returns:
         Of each picture and each row the pose, or why it is missing.
-
-    Raises:
-        ImportSourceError: missing, not text, or without a row.
     """
     rows = read_rows(file, max(pictures, default=-1) + 1)
     if not rows:
@@ -185,8 +171,7 @@ def read_pose_rows(file: Path, pictures: Collection[int]) -> dict[int, Float64 |
 def seconds_to_ns(text: str) -> int:
     """Seconds as text -> nanoseconds, exactly (a float would lose them), in any form of a number.
 
-    Raises:
-        ValueError: no number, or too large for a stamp.
+    Raises ValueError: no number, or too large for a stamp.
     """
     try:
         seconds = Decimal(text.strip()) if len(text) <= _NUMBER_LENGTH else None
@@ -204,8 +189,7 @@ def seconds_to_ns(text: str) -> int:
 def read_plain_json(file: Path, kind: type[Any] = dict) -> Any:
     """JSON of another program, as plain data: a ``dict`` or ``list``. NaN, which Python's programs write, becomes None.
 
-    Raises:
-        ImportSourceError: missing, no JSON, or too large.
+    Raises ImportSourceError: missing, no JSON, or too large.
     """
     try:
         plain = json.loads(decode_text(read_regular(file, MAX_JSON_BYTES)), parse_constant=lambda _: None)
@@ -223,8 +207,7 @@ def read_plain_json(file: Path, kind: type[Any] = dict) -> Any:
 def convert_known(plain: Any, kind: type[StructT], where: object) -> StructT:
     """Plain data -> struct; keys that the struct does not have are left out.
 
-    Raises:
-        ImportSourceError: a key is missing or of another type.
+    Raises ImportSourceError: a key is missing or of another type.
     """
     try:
         return msgspec.convert(plain, kind)
@@ -275,8 +258,7 @@ def _tells(key: str, value: Any) -> bool:
 def refuse_keys(table: Mapping[str, Any], names: re.Pattern[str], where: object) -> None:
     """Refuse keys that nothing here reads and that change what other numbers mean.
 
-    Raises:
-        ImportSourceError: one of them is there and not neutral.
+    Raises ImportSourceError: one of them is there and not neutral.
     """
     for key, value in table.items():
         if names.fullmatch(key) and not _is_neutral(key, value):

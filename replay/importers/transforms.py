@@ -96,8 +96,7 @@ class _Transforms(_Lens, kw_only=True):
 def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     """A data set of nerfstudio or instant-ngp, opened.
 
-    Raises:
-        ImportSourceError: the file is missing or of another form, or a lens that cannot be undone.
+    Raises ImportSourceError: the file is missing or of another form, or a lens that cannot be undone.
     """
     file = folder / FILE
     plain = {key: value for key, value in read_plain_json(file).items() if value not in _OUR_AXES}
@@ -169,11 +168,7 @@ def _image(folder: Path, name: str) -> Path:
 
 
 def _metres_per_unit(found: _Transforms, file: Path, notices: list[str]) -> float:
-    """What makes positions those that they were before nerfstudio has scaled them.
-
-    Raises:
-        ImportSourceError: a scale that cannot be.
-    """
+    """What makes positions those that they were before nerfstudio has scaled them."""
     scale = found.applied_scale or 1.0
     if found.applied_transform is not None:
         try:

@@ -45,8 +45,7 @@ _DEFAULT = CameraIntrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 def open_tum(folder: Path, options: ImportOptions) -> PosedPictures:
     """A TUM sequence, opened; one frame for each line of ``rgb.txt``.
 
-    Raises:
-        ImportSourceError: a list is missing or holds nothing that can be used.
+    Raises ImportSourceError: a list is missing or holds nothing that can be used.
     """
     notices: list[str] = []
     intrinsics, depth_scale = _intrinsics(folder, notices)
@@ -102,11 +101,10 @@ def _read_list(file: Path, notices: list[str]) -> list[tuple[int, Path]]:
 def read_trajectory(file: Path) -> tuple[NDArray[np.int64], Float64, list[str]]:
     """Read lines ``stamp tx ty tz qx qy qz qw``, stamps in seconds.
 
+    Raises ImportSourceError: the file is missing or holds no pose.
+
     Returns:
         Stamps (N,) in nanoseconds, rising, rows (N, 7) tx ty tz qx qy qz qw, and why other lines are left out.
-
-    Raises:
-        ImportSourceError: the file is missing or holds no pose.
     """
     found: dict[int, list[float]] = {}
     left_out: list[str] = []
