@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.config import Config
+from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, ImportSourceError, LabelError
 from semantic_mapper.files import read_regular
 from semantic_mapper.geometry import check_pose
@@ -22,7 +23,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 PICTURES = (".jpg", ".jpeg", ".png")
 DEPTHS = (".png", ".npy", ".npz")
@@ -145,15 +146,32 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
     return rgb, EncodedImage(encoding, data)
 
 
-def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
-    """(width, height) of the first picture that can be read, for files that do not tell it; None = none can."""
+def camera_of(
+    where: object,
+    k: tuple[float, float, float, float],
+    size: tuple[float, float],
+    model: str = "",
+    coefficients: Sequence[float] = (),
+) -> CameraIntrinsics:
+    """Intrinsics by fx fy cx cy, (width, height) and a lens, see ``lens_intrinsics``.
+
+    Raises ImportSourceError: they cannot be; ``where`` they stand.
+    """
+    try:
+        return lens_intrinsics(model, coefficients, k, (int(size[0]), int(size[1])))
+    except (ValueError, OverflowError) as error:  # ConfigError and FrameError, too
+        raise ImportSourceError(f"{where}: {error}") from error
+
+
+def first_size(pictures: Iterable[Path], where: Path) -> tuple[int, int]:
+    """(width, height) of the first picture that can be read. Raises ImportSourceError: none can."""
     for picture in pictures:
         try:
             rgb, _ = read_rgb(picture)
         except BadFrameError:  # reported when its turn comes
             continue
         return rgb.shape[1], rgb.shape[0]
-    return None
+    raise ImportSourceError(f"{where}: no image that can be read, which would tell width and height")
 
 
 def read_depth(file: Path, scale: DepthScale) -> Float32:

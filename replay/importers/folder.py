@@ -22,8 +22,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from semantic_mapper.drivers.lens import lens_intrinsics
-from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
+from semantic_mapper.errors import ImportSourceError, LabelError
 from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
 from semantic_mapper.replay.importers.base import (
     DEPTHS,
@@ -31,6 +30,7 @@ from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
+    camera_of,
     first_size,
 )
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
@@ -224,12 +224,7 @@ def read_intrinsics(
             f"write {1 / i.depth_scale:g}"
         )
     scale = DepthScale(i.depth_scale, file) if i.depth_scale is not None else None
-    size = (i.width, i.height) if i.width and i.height else first_size(pictures)
-    if size is None:
-        raise ImportSourceError(f"{file}: has no width and height, and no image that tells them")
-    model, k = "fisheye" if i.fisheye else i.camera_model, (i.fx, i.fy, i.cx, i.cy)
-    try:
-        lens = lens_intrinsics(model, i.distortion or (), k, (int(size[0]), int(size[1])))
-    except (ConfigError, FrameError) as error:
-        raise ImportSourceError(f"{file}: {error}") from error
+    size = (i.width, i.height) if i.width and i.height else first_size(pictures, file)
+    model = "fisheye" if i.fisheye else i.camera_model
+    lens = camera_of(file, (i.fx, i.fy, i.cx, i.cy), size, model, i.distortion or ())
     return lens, scale, i.scale != SCALE_UNKNOWN

@@ -21,21 +21,21 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.drivers.lens import lens_intrinsics
-from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
+from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import numeric_order
 from semantic_mapper.geometry import invert_pose, transform
-from semantic_mapper.replay.importers.base import PICTURES, BadFrameError, DepthScale, ImportOptions
+from semantic_mapper.replay.importers.base import PICTURES, BadFrameError, DepthScale, ImportOptions, camera_of
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import (
     convert_known,
     inside,
+    keep_good,
     left_out_notice,
     read_plain_json,
     unknown_notice,
 )
-from semantic_mapper.replay.sfm.colmap import ColmapModel, find_models, read_model
+from semantic_mapper.replay.sfm.colmap import ColmapImage, ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition, place_by_gps, read_position
 from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, scene_depth, upright
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
@@ -55,14 +55,12 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     place, model = _largest(folder, notices)
     roots = (folder / "images", *(parent / "images" for parent in place.parents[:3]), folder)
     root = _root(folder, roots, [image.name for image in model.images])
-    pictures: list[PosedPicture] = []
     left_out = [*model.left_out]
-    for image in model.images:
-        try:
-            lens = model.cameras[image.camera_id]
-            pictures.append(PosedPicture(inside(root, image.name), lens, image.T_world_camera))
-        except ImportSourceError as error:
-            left_out.append(str(error))
+
+    def picture_of(image: ColmapImage) -> PosedPicture:
+        return PosedPicture(inside(root, image.name), model.cameras[image.camera_id], image.T_world_camera)
+
+    pictures = keep_good(picture_of, model.images, left_out)
     notices += left_out_notice("image", left_out)
     return _opened("colmap", folder, pictures, model.xyz, options, notices)
 
@@ -162,15 +160,8 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         )
     names = sorted(model.shots, key=numeric_order)
     root = _root(folder, (file.parent / "images", folder / "images", file.parent.parent / "images"), names)
-    pictures: list[PosedPicture] = []
     left_out: list[str] = []
-    for name in names:
-        try:
-            pictures.append(_opensfm_picture(root, name, model, f"{file}, shot '{name}'"))
-        except ImportSourceError as error:
-            left_out.append(str(error))
-    if not pictures:
-        raise ImportSourceError(left_out[0])
+    pictures = keep_good(lambda name: _opensfm_picture(root, name, model, f"{file}, shot '{name}'"), names, left_out)
     notices += left_out_notice("picture", left_out)
     points = np.array([point.coordinates for point in model.points.values()], np.float64).reshape(-1, 3)
     origin = None
@@ -212,11 +203,9 @@ def _opensfm_intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
     lens = (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3)
     if fisheye:
         lens = (camera.k1, camera.k2, camera.k3, camera.k4)
-    try:
-        sides = (int(camera.width), int(camera.height))
-        return lens_intrinsics("fisheye" if fisheye else "opencv", lens, (fx * size, fy * size, cx, cy), sides)
-    except (ConfigError, FrameError) as error:
-        raise ImportSourceError(f"{where}: {error}") from error
+    return camera_of(
+        where, (fx * size, fy * size, cx, cy), (camera.width, camera.height), "fisheye" if fisheye else "opencv", lens
+    )
 
 
 def _root(folder: Path, roots: tuple[Path, ...], names: list[str]) -> Path:
@@ -246,6 +235,8 @@ def _opened(
     origin: GpsPosition | None = None,
 ) -> PosedPictures:
     """Pictures posed in a model's world and unit, in the world of a log."""
+    if not pictures:
+        raise ImportSourceError("; ".join((f"{folder}: holds no posed picture", *notices)))
     names = {picture.file for picture in pictures}
     there = (file for place in {file.parent for file in names} for file in place.iterdir())
     unposed = sorted(str(file) for file in there if file.suffix.lower() in PICTURES and file not in names)

@@ -23,14 +23,22 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from semantic_mapper.errors import FrameError, ImportSourceError
+from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.importers.base import PICTURES, DepthScale, ImportOptions, first_size
+from semantic_mapper.replay.importers.base import (
+    PICTURES,
+    BadFrameError,
+    DepthScale,
+    ImportOptions,
+    camera_of,
+    first_size,
+)
 from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import (
     MAX_NORM_ERROR,
     convert_known,
+    keep_good,
     left_out_notice,
     numbered_files,
     read_plain_json,
@@ -84,36 +92,26 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
         raise ImportSourceError(f"{keyframes / 'images'}: no pictures; export 'raw data' (developer mode)")
     cameras = numbered_files(keyframes / f"{kind}cameras", (".json",), notices)
     notices += without_picture("camera", cameras, images, keyframes / f"{kind}images")
-    pictures: list[PosedPicture] = []
     left_out: list[str] = []
     tables: list[dict[str, Any]] = []
-    for time_us, image in images.items():
+
+    def picture_of(timed: tuple[int, Path]) -> PosedPicture:
+        time_us, image = timed
         file = keyframes / f"{kind}cameras" / f"{image.stem}.json"
-        try:
-            tables.append(read_plain_json(file))
-            refuse_keys(tables[-1], _POLYCAM_LENS, file)
-            camera = convert_known(tables[-1], _Camera, file)
-            intrinsics = _polycam_intrinsics(camera, image)
-        except (ImportSourceError, FrameError) as error:
-            left_out.append(f"{image}: {error}")
-            continue
-        depth, confidence = (keyframes / name / f"{image.stem}.png" for name in ("depth", "confidence"))
-        T_world_gl = np.array([[getattr(camera, f"t_{i}{j}") for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]])
+        tables.append(read_plain_json(file))
+        refuse_keys(tables[-1], _POLYCAM_LENS, file)
+        c = convert_known(tables[-1], _Camera, file)
+        size = (c.width, c.height) if c.width and c.height else first_size([image], file)
+        intrinsics = camera_of(file, (c.fx, c.fy, c.cx - 0.5, c.cy - 0.5), size)
+        T_world_gl = np.array([[getattr(c, f"t_{i}{j}") for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]])
         T = T_Z_UP_Y_UP @ T_world_gl @ GL_AXES
-        stamp_ns = 1000 * (time_us - min(images))
-        pictures.append(PosedPicture(image, intrinsics, T, stamp_ns, depth, confidence))
-    if not pictures:
-        raise ImportSourceError(f"{keyframes}: no picture has a camera that can be used: {left_out[0]}")
-    notices += left_out_notice("picture", left_out, "without a camera")
+        depth, confidence = (keyframes / name / f"{image.stem}.png" for name in ("depth", "confidence"))
+        return PosedPicture(image, intrinsics, T, 1000 * (time_us - min(images)), depth, confidence)
+
+    pictures = keep_good(picture_of, images.items(), left_out)
+    notices += left_out_notice("picture", left_out, "without a camera that can be used")
     notices += unknown_notice(keyframes / f"{kind}cameras", tables, _Camera, _POLYCAM_KNOWN)
     return PosedPictures(f"polycam {folder.resolve().name}", pictures, options, POLYCAM_SCALE, notices)
-
-
-def _polycam_intrinsics(camera: _Camera, image: Path) -> CameraIntrinsics:
-    size = (camera.width, camera.height) if camera.width and camera.height else first_size([image])
-    if size is None:
-        raise ImportSourceError("its camera has no width and height, and it cannot be read")
-    return CameraIntrinsics(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5, int(size[0]), int(size[1]))
 
 
 class _Metadata(msgspec.Struct, rename={"per_frame_k": "perFrameIntrinsicCoeffs", "frame_times": "frameTimestamps"}):
@@ -143,17 +141,16 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     notices += without_picture("pose", range(len(found.poses)), images, folder / "rgb")
     if (folder / "depth").is_dir():
         notices.append("the depth images (OpenEXR) are not read; frames come without depth")
-    pictures: list[PosedPicture] = []
+    seconds = _seconds(found, list(images), file, notices)
     left_out: list[str] = []
-    for (number, image), second in zip(images.items(), _seconds(found, list(images), file, notices), strict=True):
-        try:
-            k, pose = _record3d_intrinsics(found, number), _record3d_pose(found, number)
-        except ValueError as error:  # FrameError, too
-            left_out.append(f"{image}: {error}")
-            continue
-        pictures.append(PosedPicture(image, k, pose, round(second * 1e9)))
-    if not pictures:
-        raise ImportSourceError(f"{file}: tells the pose of none of the pictures: {left_out[0]}")
+
+    def picture_of(timed: tuple[tuple[int, Path], float]) -> PosedPicture:
+        (number, image), second = timed
+        return PosedPicture(
+            image, _record3d_intrinsics(found, number, image), _record3d_pose(found, number, image), round(second * 1e9)
+        )
+
+    pictures = keep_good(picture_of, zip(images.items(), seconds, strict=True), left_out)
     notices += left_out_notice("picture", left_out)
     return PosedPictures(f"record3d {folder.resolve().name}", pictures, options, RECORD3D_SCALE, notices)
 
@@ -167,21 +164,21 @@ def _numbers(rows: list[Any], number: int, count: int) -> Float64 | None:
     return row if row.shape == (count,) and np.isfinite(row).all() else None
 
 
-def _record3d_pose(found: _Metadata, number: int) -> Float64:
+def _record3d_pose(found: _Metadata, number: int, image: Path) -> Float64:
     row = _numbers(found.poses, number, 7)
     if row is None or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
-        raise ValueError("its pose is missing, or no unit quaternion qx qy qz qw and position")
+        raise BadFrameError(image, "its pose is missing, or no unit quaternion qx qy qz qw and position")
     return T_Z_UP_Y_UP @ pose_matrix(row[4:], row[:4]) @ GL_AXES
 
 
-def _record3d_intrinsics(found: _Metadata, number: int) -> CameraIntrinsics:
+def _record3d_intrinsics(found: _Metadata, number: int, image: Path) -> CameraIntrinsics:
     k = _numbers(found.per_frame_k, number, 4)
     if (k is None or (k <= 0).any()) and len(found.K) == 9:
         k = np.array(found.K)[[0, 4, 6, 7]]
     if k is None or (k <= 0).any():
-        raise ValueError("it has no intrinsics: neither K nor 4 numbers of perFrameIntrinsicCoeffs")
+        raise BadFrameError(image, "it has no intrinsics: neither K nor 4 numbers of perFrameIntrinsicCoeffs")
     fx, fy, cx, cy = k.tolist()
-    return CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, int(found.w), int(found.h))
+    return camera_of(image, (fx, fy, cx - 0.5, cy - 0.5), (found.w, found.h))
 
 
 def _seconds(found: _Metadata, numbers: list[int], file: Path, notices: list[str]) -> list[float]:

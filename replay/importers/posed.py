@@ -102,7 +102,7 @@ class PosedPictures:
         read_label: Callable[[Path, LabelSet, tuple[int, int]], UInt8] = read_label,
     ) -> None:
         if not pictures:
-            raise ImportSourceError(f"{source}: holds no posed picture")
+            raise ImportSourceError("; ".join((f"{source}: holds no posed picture", *notices)))
         self.notices = list(notices)
         self.depth_scale = depth_scale
         self._with_depth = not options.without_depth

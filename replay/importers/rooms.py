@@ -34,7 +34,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
+from semantic_mapper.errors import ImportSourceError, LabelError
 from semantic_mapper.labels import NYU40, LabelSet, make_label_set
 from semantic_mapper.replay.importers.base import (
     DEPTHS,
@@ -42,6 +42,7 @@ from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
+    camera_of,
     check_label,
     first_size,
     read_depth,
@@ -148,10 +149,7 @@ def _scannet_intrinsics(folder: Path, which: str, images: Iterable[Path]) -> Cam
             height, width = read_rgb(image)[0].shape[:2] if which == "color" else read_depth(image, SCANNET_SCALE).shape
         except BadFrameError:  # reported when its turn comes
             continue
-        try:
-            found = CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height)
-        except FrameError as error:
-            raise ImportSourceError(f"{file}: {error}") from error
+        found = camera_of(file, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (width, height))
         if not (0.25 * width < found.cx < 0.75 * width and 0.25 * height < found.cy < 0.75 * height):
             raise ImportSourceError(
                 f"{file}: its principal point ({found.cx:g}, {found.cy:g}) is far from the middle of images of "
@@ -184,14 +182,9 @@ def open_replica(folder: Path, options: ImportOptions) -> PosedPictures:
     labels = numbered_files(folder / "semantic_class", (".png",), notices)
     poses = read_pose_rows(folder / "traj_w_c.txt", color.keys())
     notices += without_picture("depth image", depth, color, folder / "rgb")
-    size = first_size(color.values())
-    if size is None:
-        raise ImportSourceError(f"{folder / 'rgb'}: no images rgb_0.png, rgb_1.png, ... that can be read")
+    size = first_size(color.values(), folder / "rgb")
     f = size[0] / 2 / np.tan(np.deg2rad(REPLICA_HFOV_DEG) / 2)
-    try:
-        intrinsics = CameraIntrinsics(f, f, (size[0] - 1) / 2, (size[1] - 1) / 2, *size)
-    except FrameError as error:
-        raise ImportSourceError(f"{folder / 'rgb'}: {error}") from error
+    intrinsics = camera_of(folder / "rgb", (f, f, (size[0] - 1) / 2, (size[1] - 1) / 2), size)
     pictures = [
         PosedPicture(
             file,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -23,6 +23,8 @@ MAX_NORM_ERROR = 0.1  # of a unit quaternion: files have few digits, and are nor
 _NUMBER_LENGTH = 100  # letters
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
+ItemT = TypeVar("ItemT")
+MadeT = TypeVar("MadeT")
 
 
 def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) -> dict[int, Path]:
@@ -54,6 +56,17 @@ def left_out_notice(kind: str, left_out: Sequence[str], why: str = "") -> list[s
     if not left_out:
         return []
     return [f"{counted(len(left_out), kind)} left out{', ' + why if why else ''}; the first: {left_out[0]}"]
+
+
+def keep_good(make: Callable[[ItemT], MadeT], items: Iterable[ItemT], left_out: list[str]) -> list[MadeT]:
+    """What is made of each item; of those that cannot be used, ``left_out`` gets the reason."""
+    made: list[MadeT] = []
+    for item in items:
+        try:
+            made.append(make(item))
+        except ImportSourceError as error:
+            left_out.append(str(error))
+    return made
 
 
 def without_picture(kind: str, numbers: Iterable[int], pictures: Iterable[int], where: Path) -> list[str]:

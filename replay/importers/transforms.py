@@ -23,14 +23,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from semantic_mapper.drivers.lens import is_fisheye_model, lens_intrinsics
-from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
+from semantic_mapper.drivers.lens import is_fisheye_model
+from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.files import numeric_order
-from semantic_mapper.replay.importers.base import BadFrameError, DepthScale, ImportOptions, first_size
+from semantic_mapper.replay.importers.base import BadFrameError, DepthScale, ImportOptions, camera_of, first_size
 from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import (
     convert_known,
     inside,
+    keep_good,
     left_out_notice,
     read_plain_json,
     refuse_keys,
@@ -104,31 +105,29 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     refuse_keys(plain, _REFUSED, file)
     notices = unknown_notice(file, [plain], _Transforms, _NEUTRAL) + unknown_notice(file, found.frames, _Frame)
     left_out: list[str] = []
-    frames: list[_Frame] = []
-    images: list[Path] = []
-    for number, frame in enumerate(found.frames):
-        try:
-            refuse_keys(frame, _REFUSED, f"{file}, frame {number}")
-            frames.append(convert_known(frame, _Frame, f"{file}, frame {number}"))
-            images.append(_image(folder, frames[-1].file_path))
-        except ImportSourceError as error:
-            left_out.append(str(error))
-            frames = frames[: len(images)]
-    size = None if found.w is not None and found.h is not None else first_size(images)
+
+    def read_frame(numbered: tuple[int, dict[str, Any]]) -> tuple[_Frame, Path]:
+        where = f"{file}, frame {numbered[0]}"
+        refuse_keys(numbered[1], _REFUSED, where)
+        frame = convert_known(numbered[1], _Frame, where)
+        return frame, _image(folder, frame.file_path)
+
+    read = keep_good(read_frame, enumerate(found.frames), left_out)
+    frames = [frame for frame, _ in read]
+    if read and (found.w is None or found.h is None):
+        found.w, found.h = first_size((image for _, image in read), folder)
     stamps_ns = _stamps([_time(frame) for frame in frames], file, notices)
     factor = _metres_per_unit(found, file, notices) if options.scale is None else 1.0
-    pictures: list[PosedPicture] = []
-    for frame, image, stamp_ns in zip(frames, images, stamps_ns, strict=True):
-        try:
-            lens, pose = _intrinsics(found, frame, size, image), _pose(frame.transform_matrix, image)
-            pose[:3, 3] *= factor
-            depth = frame.depth_file_path or frame.depth_path
-            pictures.append(PosedPicture(image, lens, pose, stamp_ns, inside(folder, depth) if depth else None))
-        except ImportSourceError as error:
-            left_out.append(str(error))
+
+    def picture_of(stamped: tuple[tuple[_Frame, Path], int | None]) -> PosedPicture:
+        (frame, image), stamp_ns = stamped
+        lens, pose = _intrinsics(found, frame, image), _pose(frame.transform_matrix, image)
+        pose[:3, 3] *= factor
+        depth = frame.depth_file_path or frame.depth_path
+        return PosedPicture(image, lens, pose, stamp_ns, inside(folder, depth) if depth else None)
+
+    pictures = keep_good(picture_of, zip(read, stamps_ns, strict=True), left_out)
     notices += left_out_notice("frame", left_out)
-    if not pictures:
-        raise ImportSourceError("; ".join((f"{folder}: holds no posed picture", *left_out[:1])))
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
     scale = _depth_scale(file, found, frames, options, factor)
     has_sensor = any(frame.depth_file_path for frame in frames) and not options.without_depth
@@ -222,13 +221,9 @@ def _pose(rows: list[list[float]] | None, image: Path) -> Float64:
     return T @ GL_AXES
 
 
-def _intrinsics(of_all: _Lens, frame: _Frame, size: tuple[int, int] | None, image: Path) -> CameraIntrinsics:
+def _intrinsics(of_all: _Lens, frame: _Frame, image: Path) -> CameraIntrinsics:
     own, shared = _given(frame), _given(of_all)
     k: dict[str, Any] = {**shared, **own}
-    if "w" not in k or "h" not in k:
-        if size is None:
-            raise BadFrameError(image, "has no w and h, and no picture tells them")
-        k |= {"w": size[0], "h": size[1]}
     (fx, fy), (all_fx, all_fy) = _focals(own, k), _focals(shared, k)
     fx, fy = (fx, fy) if fx or fy else (all_fx, all_fy)
     fx, fy = fx or fy, fy or fx
@@ -245,12 +240,7 @@ def _intrinsics(of_all: _Lens, frame: _Frame, size: tuple[int, int] | None, imag
             f"camera_model '{model}' has no {', '.join(strange)} that programs agree on; undistort the images first",
         )
     centre = k.get("cx", k["w"] / 2) - 0.5, k.get("cy", k["h"] / 2) - 0.5
-    try:
-        return lens_intrinsics(
-            model, [k.get(name, 0.0) for name in lens], (fx, fy, *centre), (int(k["w"]), int(k["h"]))
-        )
-    except (ConfigError, FrameError) as error:
-        raise BadFrameError(image, str(error)) from error
+    return camera_of(image, (fx, fy, *centre), (k["w"], k["h"]), model, [k.get(name, 0.0) for name in lens])
 
 
 def _given(lens: _Lens) -> dict[str, Any]:

@@ -137,19 +137,14 @@ def match_nearest(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], within_ns: i
     """
     if not len(b_ns):
         return [-1] * len(a_ns)
-    right = np.clip(np.searchsorted(b_ns, a_ns), 1, max(len(b_ns) - 1, 1))
-    right = np.minimum(right, len(b_ns) - 1)
-    left = np.maximum(right - 1, 0)
-    nearest = np.where(np.abs(b_ns[left] - a_ns) <= np.abs(b_ns[right] - a_ns), left, right)
+    nearest = np.searchsorted(b_ns[:-1] + np.diff(b_ns) // 2, a_ns)
     distance = np.abs(b_ns[nearest] - a_ns)
-    result = [-1] * len(a_ns)
-    taken: set[int] = set()
-    for i in np.argsort(distance, kind="stable"):
-        index = int(nearest[i])
-        if distance[i] <= within_ns and index not in taken:
-            taken.add(index)
-            result[int(i)] = index
-    return result
+    order = np.argsort(distance, kind="stable")
+    order = order[distance[order] <= within_ns]
+    taken = order[np.unique(nearest[order], return_index=True)[1]]  # of each of ``b`` the nearest
+    result = np.full(len(a_ns), -1)
+    result[taken] = nearest[taken]
+    return result.tolist()
 
 
 def pose_at(

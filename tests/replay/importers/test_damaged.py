@@ -150,7 +150,7 @@ STOPS: list[tuple[str, Edit, str]] = [
     ("colmap", row(SPARSE + "images.txt", 1, "1 x 0 0 0 0 0 0 1 0.png"), "pycolmap ended"),
     ("colmap", remove("images"), "pictures are missing"),
     ("colmap.bin", cut(SPARSE + "images.bin", 5), "pycolmap ended"),
-    ("record3d", keys("metadata.json", poses=[]), "pose of none"),
+    ("record3d", keys("metadata.json", poses=[]), "holds no posed picture.*its pose is missing"),
     ("opensfm", model(lambda m: m.update(cameras={})), "camera 'v2 dji' is missing"),
     ("opensfm", model(lambda m: m["cameras"]["v2 dji"].update(projection_type="spherical")), "'spherical' is not read"),
     ("opensfm", model(lambda m: m["cameras"]["v2 dji"].update(projection_type="fisheye", p1=0.1)), "p1 and p2"),
