@@ -34,23 +34,25 @@ _WINDOW = 80  # poses that are judged together
 
 
 class Track:
-    """Poses over time.
+    """Poses over time, or, where they are ``fixed``, the last of them at any time.
 
     Args:
         stamps_ns: In any order; of one stamp the last pose counts.
         rows: tx ty tz qx qy qz qw of each.
+        fixed: Whether they are of a transform that does not change.
 
     Attributes:
         stamps_ns: (N,) rising.
         doubled: How many poses have the stamp of another one, and are different.
     """
 
-    def __init__(self, stamps_ns: list[int], rows: list[tuple[float, ...]]) -> None:
+    def __init__(self, stamps_ns: list[int], rows: list[tuple[float, ...]], *, fixed: bool = False) -> None:
         stamps = np.array(stamps_ns, np.int64)
         order = np.argsort(stamps, kind="stable")
         self._all_stamps_ns: NDArray[np.int64] = stamps[order]
         self._all_rows = np.array(rows, np.float64).reshape(-1, 7)[order]
         again = np.diff(self._all_stamps_ns) == 0
+        self.fixed = fixed
         self.doubled = int((again & np.any(np.diff(self._all_rows, axis=0) != 0, axis=1)).sum())
         last = np.append(~again, [True] * bool(rows))
         self.stamps_ns: NDArray[np.int64] = self._all_stamps_ns[last]
@@ -58,7 +60,26 @@ class Track:
 
     def at(self, stamp_ns: int, within_ns: int = MATCH_NS) -> Float64 | None:
         """Pose (4, 4) at a time, see ``pose_at``."""
+        if self.fixed:
+            return pose_matrix(self._rows[-1, :3], self._rows[-1, 3:])
         return pose_at(stamp_ns, self.stamps_ns, self._rows, MAX_GAP_NS, within_ns)
+
+    def differs(self, other: Track, *, unless_apart: bool) -> bool:
+        """Whether another source tells the same poses otherwise.
+
+        Args:
+            other: Of the other source.
+            unless_apart: One after the other is no contradiction: a program was started again.
+        """
+        some = slice(None, None, max(1, len(self._rows) // 1000))
+        pairs = [
+            (pose_matrix(row[:3], row[3:]), other.at(int(stamp_ns), 0))
+            for stamp_ns, row in zip(self.stamps_ns[some], self._rows[some], strict=True)
+        ]
+        apart = [np.abs(mine - its).max() for mine, its in pairs if its is not None]
+        if not apart:
+            return not unless_apart
+        return bool(max(apart) > _SAME if self.fixed or other.fixed else np.quantile(apart, 0.9) > _JUMP_M)
 
     def jump_m(self) -> float:
         """How far the poses jump to and fro between two sources that take turns, in metres (or radians); 0 = not.
@@ -67,9 +88,9 @@ class Track:
         a pair fits, one source wrote the pose and the pair, another the poses between. Noise has no such pairs, and
         poses that are published several times each make no detours. One source may have 3 times the rate of the other.
         """
-        rotations = (
-            Rotation.from_quat(self._all_rows[:, 3:]).as_matrix() if len(self._all_rows) else np.zeros((0, 3, 3))
-        )
+        if self.fixed or not len(self._all_rows):
+            return 0.0
+        rotations = Rotation.from_quat(self._all_rows[:, 3:]).as_matrix()
         x = np.hstack((self._all_rows[:, :3], rotations[:, :, :2].reshape(-1, 6)))
         reach = 4 if len(x) >= _WINDOW // 2 else 2
         i = np.arange(reach, len(x) - reach)
@@ -94,49 +115,20 @@ class Track:
         fraction = np.where(gap > 0, (t[i] - t[i - j]) / np.maximum(gap, 1), 0.5)[:, None]
         return np.linalg.norm(x[i] - (1 - fraction) * x[i - j] - fraction * x[i + k], axis=1)
 
-    def differs(self, other: Track, *, unless_apart: bool) -> bool:
-        """Whether another source tells the same poses otherwise.
-
-        Args:
-            other: Of the other source.
-            unless_apart: One after the other is no contradiction: a program was started again.
-        """
-        both = (self.stamps_ns >= other.stamps_ns[0]) & (self.stamps_ns <= other.stamps_ns[-1])
-        pairs = [(self._pose(i), other.at(int(self.stamps_ns[i]), 0)) for i in _some(np.flatnonzero(both))]
-        apart = [np.abs(mine - its).max() for mine, its in pairs if its is not None]
-        return bool(np.quantile(apart, 0.9) > _JUMP_M) if apart else not unless_apart
-
-    def is_at(self, T: Float64) -> bool:
-        """Whether all poses are this one (4, 4)."""
-        return all(_same(self._pose(i), T) for i in _some(np.arange(len(self._rows))))
-
-    def _pose(self, index: int) -> Float64:
-        return pose_matrix(self._rows[index, :3], self._rows[index, 3:])
-
 
 @dataclass(slots=True)
 class _Published:
     """What one source publishes of where one frame sits."""
 
     topic: str
-    parents: set[str] = field(default_factory=set[str])
-    fixed: list[Float64] = field(default_factory=list[Float64])  # those that differ
     stamps_ns: list[int] = field(default_factory=list[int])
     rows: list[tuple[float, ...]] = field(default_factory=list[tuple[float, ...]])
     received_ns: list[int] = field(default_factory=list[int])
-    track: Track | None = None
+    track: Track = field(init=False)  # once all are in
 
-    def contradicts(self, other: _Published) -> bool:
-        """Whether both cannot be true."""
-        if self.parents != other.parents:
-            return True
-        if self.track is None or other.track is None:
-            return not all(one.is_only(T) for one, another in ((self, other), (other, self)) for T in another.fixed)
-        return self.track.differs(other.track, unless_apart=self.topic == other.topic)
-
-    def is_only(self, T: Float64) -> bool:
-        """Whether all that is published is this transform (4, 4)."""
-        return all(_same(mine, T) for mine in self.fixed) and (self.track is None or self.track.is_at(T))
+    @property
+    def fixed(self) -> bool:
+        return self.topic.endswith("tf_static")
 
 
 class TransformTree:
@@ -146,8 +138,7 @@ class TransformTree:
         self._refused = 0  # transforms that hold NaN or no rotation
         self._published: dict[str, dict[str, _Published]] = {}  # by child and source
         self._parents: dict[str, set[str]] = {}
-        self._fixed: dict[str, Float64] = {}
-        self._tracks: dict[str, Track] = {}
+        self._tracks: dict[str, Track] = {}  # of all sources that move a frame, or else of the last one
 
     def add(self, transforms: Iterable[Any], topic: str, program: str, received_ns: int) -> None:
         """Take in the ``geometry_msgs/TransformStamped`` of one message.
@@ -165,16 +156,11 @@ class TransformTree:
             if row is None or not child or child == parent:
                 self._refused += 1
                 continue
+            self._parents.setdefault(child, set()).add(parent)
             given = self._published.setdefault(child, {}).setdefault(source, _Published(topic))
-            given.parents.add(parent)
-            if topic.endswith("tf_static"):
-                T = pose_matrix(np.array(row[:3]), np.array(row[3:]))
-                if not any(_same(T, known) for known in given.fixed):
-                    given.fixed.append(T)
-            else:
-                given.stamps_ns.append(stamp_of(stamped.header))
-                given.received_ns.append(received_ns)
-                given.rows.append(row)
+            given.stamps_ns.append(stamp_of(stamped.header))
+            given.received_ns.append(received_ns)
+            given.rows.append(row)
 
     def close(self) -> list[str]:
         """Sort what was taken in; sentences on what is odd about it."""
@@ -182,21 +168,17 @@ class TransformTree:
         if self._refused:
             notices.append(f"{self._refused} transforms of tf are left out: they hold NaN or no rotation")
         for child, sources in self._published.items():
-            stamps_ns: list[int] = []
-            rows: list[tuple[float, ...]] = []
             for given in sources.values():
-                self._parents.setdefault(child, set()).update(given.parents)
                 if given.fixed:
-                    self._fixed[child] = given.fixed[-1]
-                if given.rows:
+                    given.stamps_ns = list(range(len(given.rows)))  # the last that was recorded counts
+                else:
                     notices += fill_stamps(given.stamps_ns, given.received_ns, f"tf of '{child}'")
-                    given.track = Track(given.stamps_ns, given.rows)
-                    notices += doubled_notice(given.track, f"tf of '{child}'")
-                    stamps_ns += given.stamps_ns
-                    rows += given.rows
-                    given.stamps_ns, given.received_ns, given.rows = [], [], []
-            if rows:
-                self._tracks[child] = Track(stamps_ns, rows)
+                given.track = Track(given.stamps_ns, given.rows, fixed=given.fixed)
+                notices += doubled_notice(given.track, f"tf of '{child}'")
+            moving = [given for given in sources.values() if not given.fixed] or [*sources.values()][-1:]
+            stamps_ns = [stamp for given in moving for stamp in given.stamps_ns]
+            rows = [row for given in moving for row in given.rows]
+            self._tracks[child] = Track(stamps_ns, rows, fixed=moving[0].fixed)
         return notices
 
     def check(self, target: str, source: str) -> None:
@@ -204,27 +186,25 @@ class TransformTree:
 
         Raises ImportSourceError: two programs publish one transform and differ.
         """
-        up, down = self.way_up(source), self.way_up(target)
-        for child in set(up) ^ set(down):
+        for child in {*self.way_up(source)} ^ {*self.way_up(target)}:
             if child not in self._published:
                 continue
             what = f"tf: '{child}' on '{next(iter(self._parents[child]))}'"
             sources = self._published[child]
             for name, given in sources.items():
-                if len(given.fixed) > 1:
-                    apart = np.linalg.norm(given.fixed[0][:3, 3] - given.fixed[-1][:3, 3])
+                if given.fixed and given.track.differs(given.track, unless_apart=True):
                     raise ImportSourceError(
-                        f"{what} is fixed, but {name} says two things, {apart:.3f} m apart: cut the bag between the "
-                        "two, or record the true one alone"
+                        f"{what} is fixed, but {name} says two things: cut the bag between them, or record the true "
+                        "one alone"
                     )
             for (a, given), (b, other) in combinations(sources.items(), 2):
-                if given.contradicts(other):
+                one, another = (given, other) if other.fixed else (other, given)  # a fixed one has no times
+                if one.track.differs(another.track, unless_apart=given.topic == other.topic):
                     raise ImportSourceError(
                         f"{what} is published by {a} and, otherwise, by {b}: record the true one alone, or keep "
                         "only it in the bag (`rosbag filter`, `ros2 bag convert`)"
                     )
-            jump = self._tracks[child].jump_m() if child in self._tracks else 0.0
-            if jump:
+            if jump := self._tracks[child].jump_m():
                 raise ImportSourceError(
                     f"{what} jumps to and fro by {jump:.2g} m or rad: two programs publish it; stop one (such as the "
                     "odometry of the wheels next to a filter) and record again, or name a topic of poses: --topic "
@@ -235,7 +215,9 @@ class TransformTree:
         """The transforms between a frame and a world that change over time, as 'parent to child'."""
         way = self.way_up(frame)
         way = way[: way.index(world) + 1] if world in way else way
-        return [(f"'{up}' to '{down}'", self._tracks[down]) for down, up in pairwise(way) if down in self._tracks]
+        return [
+            (f"'{up}' to '{down}'", self._tracks[down]) for down, up in pairwise(way) if not self._tracks[down].fixed
+        ]
 
     def way_up(self, frame: str) -> list[str]:
         """The frame, the one it sits on, and so on to the root.
@@ -274,8 +256,7 @@ class TransformTree:
         """From the parent of the last frame of ``way`` to its first."""
         T = np.eye(4)
         for frame in way:
-            track = self._tracks.get(frame)
-            step = self._fixed.get(frame) if track is None else track.at(stamp_ns, within_ns)
+            step = self._tracks[frame].at(stamp_ns, within_ns)
             if step is None:
                 return None
             T = step @ T
@@ -315,12 +296,3 @@ def pose_row(position: Any, rotation: Any) -> tuple[float, ...] | None:
     if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1) > MAX_NORM_ERROR:
         return None
     return tuple(float(value) for value in row)
-
-
-def _same(a: Float64, b: Float64) -> bool:
-    return bool(np.allclose(a, b, rtol=0, atol=_SAME))
-
-
-def _some(indices: NDArray[np.intp]) -> NDArray[np.intp]:
-    """At most 1000 of them, evenly."""
-    return indices[:: max(1, len(indices) // 1000)]
