@@ -207,13 +207,12 @@ class Calibration:
         """Cameras send some before they know."""
         return bool((self.K.any() or self.P.any()) and all(np.isfinite(m).all() for m in (self.K, self.D, self.P)))
 
-    def intrinsics(self, *, rectified: bool) -> CameraIntrinsics:
+    def intrinsics(self, where: str, *, rectified: bool) -> CameraIntrinsics:
         """Of the raw image, or of one whose lens distortion has been removed already.
 
         Raises ImportSourceError: not calibrated, a lens model that is not OpenCV's, skew, binning or a region of
         interest.
         """
-        where = "its camera_info"
         if not self.whole:
             raise ImportSourceError(f"{where} has binning or a region of interest, which is not read: record it whole")
         rectified = rectified and bool(self.P.any() or self.D.any())  # a pinhole camera's driver may leave P empty
@@ -236,7 +235,6 @@ class Bag:
     """
 
     def __init__(self, src: Path) -> None:
-        self.src = src
         try:
             highlevel, typesys = (importlib.import_module(f"rosbags.{name}") for name in ("highlevel", "typesys"))
         except ImportError as error:
@@ -337,7 +335,7 @@ class Bag:
             raise
         except Exception as error:  # storage, compression and messages each raise their own
             raise ImportSourceError(
-                f"{self.src}: this ROS bag cannot be read: {visible(str(error)) or type(error).__name__}; {_REPAIR}"
+                f"this ROS bag cannot be read: {visible(str(error)) or type(error).__name__}; {_REPAIR}"
             ) from error
 
 

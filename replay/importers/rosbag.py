@@ -82,7 +82,10 @@ def open_rosbag(src: Path, options: ImportOptions) -> PosedPictures:
         src: ``.bag``, ``.mcap`` or ``.db3`` file, or folder of ROS 2.
         options: See ``ImportOptions``.
     """
-    return _BagReader(src, options).pictures()
+    try:
+        return _BagReader(src, options).pictures()
+    except ImportSourceError as error:
+        raise ImportSourceError(f"{src}: {error}") from error
 
 
 class _BagReader:
@@ -96,7 +99,12 @@ class _BagReader:
             raise ImportSourceError(f"no topic has the role '{unknown[0]}'; the roles are {', '.join(ROLES)}")
         self._bag = Bag(src)
         self._color, self._depth = self._find_images()
-        self._refuse_no_poses()
+        if not self._bag.topics(*POSES, *TF):
+            kinds = ", ".join(t.replace("/msg/", "/") for t in POSES)
+            hint = _VIEWER if self._color.name.startswith(_REALSENSE_VIEWER) else ""
+            raise ImportSourceError(
+                f"has no poses: neither tf nor a topic of {kinds}; it has {self._bag.listing()}{hint}"
+            )
         info = self._info_topic(self._color, options.topics.get("info", ""))
         depth_info = options.topics.get("depth_info", "")
         if self._depth is not None and (depth_info or _info_name(self._depth) in self._bag.topics(CAMERA_INFO)):
@@ -135,7 +143,7 @@ class _BagReader:
             self._options,
             DEPTH_SCALE,
             self.notices,
-            hz=_rate(stamps),
+            hz=round(1e9 * (len(stamps) - 1) / span_ns, 3) if (span_ns := int(np.ptp(stamps))) else 0.0,
             read_rgb=self._rgb,
             read_depth=self._depth_m,
         )
@@ -171,9 +179,6 @@ class _BagReader:
             )
         return register_depth(depth_m, own, T_color_depth, lens.intrinsics)
 
-    def _refusal(self, text: str) -> ImportSourceError:
-        return ImportSourceError(f"{self._src}: {text}")
-
     def _find_images(self) -> tuple[Topic, Topic | None]:
         """The topics of colour and of depth."""
         topics, wanted = self._bag.image_topics(), self._options.topics
@@ -203,14 +208,14 @@ class _BagReader:
             if topic.name == name:
                 return topic
         there = ", ".join(map(str, fitting[:LISTED])) or "none"
-        raise self._refusal(f"no topic '{name}' of images for {role}; there are {there}")
+        raise ImportSourceError(f"no topic '{name}' of images for {role}; there are {there}")
 
     def _only(self, role: str, fitting: list[Topic]) -> Topic:
         if len(fitting) == 1:
             return fitting[0]
         if not fitting:
-            raise self._refusal(f"no topic has images; there are {self._bag.listing()}")
-        raise self._refusal(
+            raise ImportSourceError(f"no topic has images; there are {self._bag.listing()}")
+        raise ImportSourceError(
             f"several topics fit the {role}: {', '.join(map(str, fitting[:LISTED]))}; name one: "
             f"--topic {role}={fitting[0].name}"
         )
@@ -224,17 +229,10 @@ class _BagReader:
             self.notices.append(f"the calibration of {topic.name} is that of {infos[0]}, the only one")
             return infos[0]
         others = f"there are {', '.join(infos[:LISTED])}: name one with --topic info=NAME"
-        raise self._refusal(
+        raise ImportSourceError(
             f"no camera_info at {name}, without which the focal length of {topic.name} is not known; "
             f"{others if infos else 'the bag has no such topic'}"
         )
-
-    def _refuse_no_poses(self) -> None:
-        """Raises: ImportSourceError: nothing in the bag tells poses."""
-        if not self._bag.topics(*POSES, *TF):
-            kinds = ", ".join(t.replace("/msg/", "/") for t in POSES)
-            hint = _VIEWER if self._color.name.startswith(_REALSENSE_VIEWER) else ""
-            raise self._refusal(f"has no poses: neither tf nor a topic of {kinds}; it has {self._bag.listing()}{hint}")
 
     def _read_all(self) -> None:
         """One pass over the bag: times of images, calibrations, transforms and poses, by topic."""
@@ -264,12 +262,10 @@ class _BagReader:
 
     def _intrinsics(self, topic: Topic, info: str) -> CameraIntrinsics:
         """Of the images of a topic."""
-        try:
-            found = [c.intrinsics(rectified=topic.rectified) for c in _unlike(self._calibrations[info])]
-        except ImportSourceError as error:
-            raise self._refusal(f"{topic.name}: {error}") from error
+        unlike = {(c.model, c.size, *c.K, *c.D, *c.P): c for c in self._calibrations[info]}
+        found = [c.intrinsics(f"camera_info of {topic.name}", rectified=topic.rectified) for c in unlike.values()]
         if any(k.distortion != found[0].distortion or not _one_lens(found[0], k) for k in found):
-            raise self._refusal(
+            raise ImportSourceError(
                 f"the calibration of {topic.name} changes ({found[0]}, then {found[-1]}): the lens has zoomed or the "
                 "size was switched; cut the bag where it does"
             )
@@ -296,12 +292,12 @@ class _BagReader:
             if other == info or "depth" in other.lower() or found[0].frame != own.frame:
                 continue
             try:
-                a, b = own.intrinsics(rectified=False), found[0].intrinsics(rectified=False)
+                a, b = (c.intrinsics(info, rectified=False) for c in (own, found[0]))
             except ImportSourceError:  # of a lens that is not undone: another camera's
                 continue
             bent_otherwise = a.distorted and b.distorted and a.distortion != b.distortion
             if same_view((a.width, a.height), (b.width, b.height)) and (bent_otherwise or not _one_lens(a, b)):
-                raise self._refusal(
+                raise ImportSourceError(
                     f"{info} and {other} give the camera frame '{self._frame}' two calibrations ({a}, {b}); name the "
                     f"true one: --topic info={info} or --topic info={other}"
                 )
@@ -318,23 +314,23 @@ class _BagReader:
         if frame != self._frame:
             T_color_depth = None
             if self._tree.reaches(self._frame, frame):
-                self._check_sources(self._frame, frame)
+                self._tree.check(self._frame, frame)
                 first_ns = self._series[self._color.name][0][0]
                 T_color_depth = self._tree.lookup(self._frame, frame, first_ns, MAX_STAMP_NS)
         if one_lens and T_color_depth is not None and np.allclose(T_color_depth, np.eye(4), atol=_SAME_PLACE):
             return None
         if own.distorted:
-            raise self._refusal(
+            raise ImportSourceError(
                 f"{depth.name} has lens distortion of its own; record depth that is registered to colour, or import "
                 "without it: --topic depth=none"
             )
         if T_color_depth is None:
-            raise self._refusal(
+            raise ImportSourceError(
                 f"{depth.name} is of another camera ({frame}) than {self._color.name} ({self._frame}), and tf does not "
                 "link the two; record tf_static or registered depth, or import without it: --topic depth=none"
             )
         if frame == self._frame and "depth_info" not in self._options.topics:
-            raise self._refusal(
+            raise ImportSourceError(
                 f"{depth.name} has the frame of {self._color.name}, '{frame}', but its calibration has other "
                 f"intrinsics ({own}, colour {color}). Where depth is registered to colour: --topic "
                 f"depth_info={_info_name(self._color)}; where it has a lens of its own: --topic depth_info={info}; "
@@ -348,7 +344,7 @@ class _BagReader:
         topic, frame, tree = self._pose_topic(), self._frame, self._tree
         if not topic:
             world = self._world()
-            self._check_sources(world, frame)
+            tree.check(world, frame)
             self._moving = tree.moving_above(frame, world)
             self.notices.append(f"poses are those of {frame} in {world}, from tf")
 
@@ -359,13 +355,13 @@ class _BagReader:
             return from_tf
         body, track = self._track(topic)
         if body != frame and not tree.reaches(body, frame):
-            raise self._refusal(
+            raise ImportSourceError(
                 f"{topic} tells where '{body}' is, but tf does not say where the camera '{frame}' sits on it; record "
                 f"tf_static, or say with --body {frame} that the poses are the camera's"
             )
-        self._check_sources(body, frame)
+        tree.check(body, frame)
         if jump := track.jump_m():
-            raise self._refusal(
+            raise ImportSourceError(
                 f"the poses of {topic} jump to and fro by {jump:.2g} m or rad: two programs publish it; record one of "
                 "them, or name another topic: --topic pose=NAME"
             )
@@ -384,11 +380,11 @@ class _BagReader:
         """The topic that poses come from; empty = tf."""
         found, name = self._bag.topics(*POSES), self._options.topics.get("pose", "")
         if name and name not in found:
-            raise self._refusal(f"no topic '{name}' of poses; there are {', '.join(found[:LISTED]) or 'none'}")
+            raise ImportSourceError(f"no topic '{name}' of poses; there are {', '.join(found[:LISTED]) or 'none'}")
         if name or self._options.world or set(WORLD_FRAMES) & set(self._tree.way_up(self._frame)):
             return name
         if len(found) > 1:
-            raise self._refusal(
+            raise ImportSourceError(
                 f"several topics tell poses: {', '.join(found[:LISTED])}; name one: --topic pose={found[0]}"
             )
         return found[0] if found else ""
@@ -399,7 +395,7 @@ class _BagReader:
         named = topic in self._bag.topics(*NAMED_POSES)
         body = frame_name(self._options.body or (messages[0][1].child_frame_id if named else ""))
         if not body:
-            raise self._refusal(
+            raise ImportSourceError(
                 f"{topic} does not say whose poses it tells; name the frame with --body, such as --body {self._frame} "
                 "where they are the camera's"
             )
@@ -407,11 +403,11 @@ class _BagReader:
         self.notices += fill_stamps(stamps, [received_ns for received_ns, _ in messages], topic)
         rows = [pose_row(*self._bag.pose(topic, message)) for _, message in messages]
         good = [(stamp, row) for stamp, row in zip(stamps, rows, strict=True) if row is not None]
-        if not good:
-            raise self._refusal(f"{topic} holds no pose")
         if len(good) < len(rows):
             left_out = counted(len(rows) - len(good), "pose")
             self.notices.append(f"{left_out} of {topic} left out: they hold NaN or no rotation")
+        if not good:
+            raise ImportSourceError(f"{topic} holds no pose")
         track = Track([stamp for stamp, _ in good], [row for _, row in good])
         self.notices += doubled_notice(track, topic)
         return body, track
@@ -422,35 +418,28 @@ class _BagReader:
         on = " on ".join(f"'{frame}'" for frame in way)
         wanted = frame_name(self._options.world)
         if wanted and wanted not in way:
-            raise self._refusal(f"tf has no way from {self._frame} to {wanted}: {on}")
+            raise ImportSourceError(f"tf has no way from {self._frame} to {wanted}: {on}")
         world = next((world for world in (wanted, *WORLD_FRAMES) if world in way), None)
         if world is not None:
             return world
         if len(way) == 1:
-            raise self._refusal(
+            raise ImportSourceError(
                 f"tf does not know the frame '{self._frame}' of {self._color.name}; record tf and tf_static, or name a "
                 f"topic of poses: --topic pose=NAME --body {self._frame or 'FRAME'}"
             )
         still = "" if self._tree.moving_above(self._frame, way[-1]) else ", where the camera stood still"
-        raise self._refusal(
+        raise ImportSourceError(
             f"tf has no frame {', '.join(WORLD_FRAMES)} above the camera: {on}; record tf or odometry, or name a topic "
             f"of poses (--topic pose=NAME), or the world{still}: --world {way[-1]}"
         )
 
-    def _check_sources(self, target: str, source: str) -> None:
-        """Raises: ImportSourceError: tf has two truths about a transform between the frames."""
-        try:
-            self._tree.check(target, source)
-        except ImportSourceError as error:
-            raise self._refusal(str(error)) from error
-
     def _check_times(self) -> None:
         """Raises: ImportSourceError: no image was taken while poses were."""
-        stamps = np.array([stamp for stamp, _ in self._series[self._color.name]], np.int64)
+        stamps = self._stamps(self._color)
         for name, track in self._moving:
             first, last = int(track.stamps_ns[0]) - MATCH_NS, int(track.stamps_ns[-1]) + MATCH_NS
             if len(stamps) and (stamps.max() < first or stamps.min() > last):
-                raise self._refusal(
+                raise ImportSourceError(
                     f"images of {self._color.name} are from {_span(stamps)}, poses ({name}) from "
                     f"{_span(track.stamps_ns)}: their clocks differ; record both with one clock (use_sim_time)"
                 )
@@ -488,11 +477,6 @@ def _info_name(topic: Topic) -> str:
     return f"{topic.base.rsplit('/', 1)[0]}/camera_info"
 
 
-def _unlike(calibrations: list[Calibration]) -> list[Calibration]:
-    """The first of calibrations that are equal."""
-    return list({(c.model, c.size, *c.K, *c.D, *c.P): c for c in reversed(calibrations)}.values())[::-1]
-
-
 def _span(stamps_ns: NDArray[np.int64]) -> str:
     return f"{stamps_ns.min() / 1e9:.3f} to {stamps_ns.max() / 1e9:.3f} s"
 
@@ -504,10 +488,3 @@ def _one_lens(a: CameraIntrinsics, b: CameraIntrinsics) -> bool:
     b = scale_intrinsics(b, a.width, a.height)
     focal = max(abs(a.fx - b.fx) / a.fx, abs(a.fy - b.fy) / a.fy)
     return focal < _SAME_LENS and max(abs(a.cx - b.cx), abs(a.cy - b.cy)) < _SAME_LENS * a.width
-
-
-def _rate(stamps: Any) -> float:
-    """Images a second, 0 where it is unknown."""
-    if len(stamps) < 2 or stamps.max() == stamps.min():
-        return 0.0
-    return round(1e9 * (len(stamps) - 1) / float(stamps.max() - stamps.min()), 3)
