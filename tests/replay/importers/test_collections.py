@@ -15,10 +15,8 @@ from PIL import Image
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.replay.importers.run import detect_format
-from semantic_mapper.replay.sfm.colmap import intrinsics_of, read_model
-from semantic_mapper.replay.sfm.gps import (
-    ORIGIN_KEY,
-)
+from semantic_mapper.replay.sfm.colmap import intrinsics_of
+from semantic_mapper.replay.sfm.gps import ORIGIN_KEY
 from tests.replay.recordings import (
     POINTS,
     F,
@@ -103,15 +101,6 @@ def test_a_colmap_model_is_imported_upright(tmp_path: Path, kind: str) -> None:
     assert (frames[0].intrinsics.fx, frames[0].intrinsics.cx) == (F, 31.5)
 
 
-@pytest.mark.parametrize("kind", ["txt", "bin"])
-def test_both_forms_of_a_model_are_read_alike(tmp_path: Path, kind: str) -> None:
-    model = read_model(make_colmap(tmp_path / "scan", kind) / "sparse" / "0")
-    assert [image.name for image in model.images] == ["0.png", "1.png", "2.png"]
-    assert np.allclose(model.images[1].T_world_camera, poses()[1], atol=1e-9)
-    assert np.allclose(model.images[1].xy, [(10, 20), (11, 20), (12, 20)]) and len(model.images[0].points) == 0
-    assert np.allclose(model.xyz, POINTS) and model.errors_px[1] == 0.5
-
-
 def test_a_colmap_model_without_scale_says_so_and_is_made_of_room_size(tmp_path: Path) -> None:
     report, frames = imported(make_colmap(tmp_path / "scan", "bin"))
     assert not report.info.scale_known
@@ -144,13 +133,19 @@ def test_a_fisheye_of_transforms_json_is_undone(tmp_path: Path, flag: dict[str, 
     assert frames[0].intrinsics.distortion == () and frames[0].intrinsics.fx != pytest.approx(50, rel=0.02)
 
 
-def test_each_picture_of_record3d_has_its_own_intrinsics_and_time(tmp_path: Path) -> None:
+def test_each_picture_of_record3d_has_its_own_intrinsics_and_time_or_else_k(tmp_path: Path) -> None:
     own = [[50.0 + n, 51.0 + n, 30.0 + n, 25.0 - n] for n in range(3)]
     folder = make_record3d(tmp_path / "phone", perFrameIntrinsicCoeffs=own, frameTimestamps=[7.0, 7.5, 8.25])
-    for frame, (fx, fy, cx, cy) in zip(imported(folder)[1], own, strict=True):
+    frames = imported(folder)[1]
+    for frame, (fx, fy, cx, cy) in zip(frames, own, strict=True):
         k = frame.intrinsics
         assert (k.fx, k.fy, k.cx, k.cy) == pytest.approx((fx, fy, cx - 0.5, cy - 0.5))
-    assert [frame.stamp_ns for frame in imported(folder)[1]] == [0, 500_000_000, 1_250_000_000]
+    assert [frame.stamp_ns for frame in frames] == [0, 500_000_000, 1_250_000_000]
+    times = [7.5, 7.0, 8.0]
+    folder = make_record3d(tmp_path / "old", perFrameIntrinsicCoeffs=[own[0], None, [0.0] * 4], frameTimestamps=times)
+    report, frames = imported(folder)
+    assert sorted(frame.intrinsics.fy for frame in frames) == [50.0, 50.0, 51.0]
+    assert "times of the pictures go back" in said(report)
 
 
 def test_depth_of_instant_ngp_is_in_the_unit_of_the_poses(tmp_path: Path) -> None:
@@ -185,14 +180,6 @@ def test_the_largest_colmap_model_is_imported_and_the_rest_is_counted(tmp_path: 
     assert len(frames) == 2 and len(report.skipped) == 1
     assert "largest of 2 models is imported, 1 of 3 pictures; left out: 0 of 1" in said(report)
     assert "1 picture left out, without a pose" in said(report) and "unposed.png" in said(report)
-
-
-def test_record3d_falls_back_to_k_and_its_times_are_sorted(tmp_path: Path) -> None:
-    own = [[50.0, 51.0, 30.0, 25.0], None, [0.0, 0.0, 0.0, 0.0]]
-    folder = make_record3d(tmp_path / "phone", perFrameIntrinsicCoeffs=own, frameTimestamps=[7.5, 7.0, 8.0])
-    report, frames = imported(folder)
-    assert len(frames) == 3 and sorted(frame.intrinsics.fy for frame in frames) == [50.0, 50.0, 51.0]
-    assert "times of the pictures go back" in said(report)
 
 
 @pytest.mark.parametrize(
@@ -263,6 +250,8 @@ def test_newer_models_of_colmap_are_judged_by_their_values(model: str, params: l
     for other, count in (("EQUIRECTANGULAR", 2), ("DIVISION", 5), ("RAD_TAN_THIN_PRISM_FISHEYE", 16)):
         with pytest.raises(ImportSourceError, match="image_undistorter"):
             intrinsics_of(other, 64, 48, [1.0] * count, "camera 1")
+    found = intrinsics_of("BROWN_CONRADY", 64, 48, [50, 32, 24, 0.1, 0.2, 0.3, 0.01, 0.02], "camera 1")
+    assert found.distortion[:5] == (0.1, 0.2, 0.01, 0.02, 0.3) and found.fy == 50  # COLMAP's: k1 k2 k3 p1 p2
 
 
 @pytest.mark.parametrize(("times", "fps"), [([5.0, 5.5], 10), ([None, 5.0, 5.5], 10), ([5.0, "x", 6.0], None)])
@@ -270,11 +259,6 @@ def test_times_that_record3d_lacks_are_made_up_at_its_rate(tmp_path: Path, times
     report, frames = imported(make_record3d(tmp_path / "phone", frameTimestamps=times, fps=fps))
     assert [frame.stamp_ns for frame in frames] == [round(n * 1e9 / (fps or 60)) for n in range(3)]
     assert f"made up at {fps or 60} frames a second" in said(report)
-
-
-def test_coefficients_of_brown_conrady_come_in_the_order_of_opencv() -> None:
-    found = intrinsics_of("BROWN_CONRADY", 64, 48, [50, 32, 24, 0.1, 0.2, 0.3, 0.01, 0.02], "camera 1")
-    assert found.distortion[:5] == (0.1, 0.2, 0.01, 0.02, 0.3) and found.fy == 50  # COLMAP's: k1 k2 k3 p1 p2
 
 
 def change(folder: Path, **changes: Any) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ import pytest
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.importers.run import detect_format
-from semantic_mapper.replay.importers.tables import seconds_to_ns, split_row, unknown_notice
+from semantic_mapper.replay.importers.tables import seconds_to_ns, unknown_notice
 from tests.replay import recordings as rec
 from tests.replay.recordings import DRIVE, H, W, imported
 
@@ -170,7 +170,9 @@ COSTS: list[tuple[str, Edit, int, str]] = [
     ("folder", keys("intrinsics.json", axes="x forward"), 6, "not read: 'axes'"),
     ("tum", remove("depth.txt"), 6, "no depth.txt"),
     ("tum", text("rgb.txt", " rgb/", " ../rgb/", 1), 5, "outside of it"),
-    ("tum", lambda f: text("rgb.txt", "\n", "\r\n")(f), 6, ""),
+    ("tum", text("rgb.txt", "\n", "\r\n"), 6, ""),
+    ("tum", text("groundtruth.txt", " ", "; "), 6, ""),
+    ("folder", text("poses.txt", " ", ","), 6, ""),
     ("scannet", remove("color/60.jpg"), 5, "1 pose without a picture"),
     ("replica", remove("depth/depth_1.png"), 3, ""),
     ("replica", row("traj_w_c.txt", 2, ""), 2, "row i belongs to image i"),
@@ -255,11 +257,6 @@ def test_depth_as_numpy_writes_it_is_read(tmp_path: Path, suffix: str) -> None:
 )
 def test_seconds_in_any_form_are_exact(value: str, ns: int) -> None:
     assert seconds_to_ns(value) == ns
-
-
-@pytest.mark.parametrize("words", ["1.5 2 -3e-1", "1.5,2,-3e-1", "1.5; 2;-3e-1", "[1.5\t2\t-3e-1]"])
-def test_rows_are_parted_by_what_programs_use(words: str) -> None:
-    assert [float(word) for word in split_row(words)] == [1.5, 2.0, -0.3]
 
 
 def test_keys_that_change_what_numbers_mean_are_named(tmp_path: Path) -> None:
