@@ -148,7 +148,7 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
 
 def camera_of(
     where: object,
-    k: tuple[float, float, float, float],
+    k: Iterable[float],
     size: tuple[float, float],
     model: str = "",
     coefficients: Sequence[float] = (),
@@ -158,7 +158,8 @@ def camera_of(
     Raises ImportSourceError: they cannot be; ``where`` they stand.
     """
     try:
-        return lens_intrinsics(model, coefficients, k, (int(size[0]), int(size[1])))
+        fx, fy, cx, cy = map(float, k)
+        return lens_intrinsics(model, coefficients, (fx, fy, cx, cy), (int(size[0]), int(size[1])))
     except (ValueError, OverflowError) as error:  # ConfigError and FrameError, too
         raise ImportSourceError(f"{where}: {error}") from error
 

@@ -24,13 +24,14 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.calibration import Rectifier
-from semantic_mapper.errors import FrameError, ImportSourceError
-from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.geometry import camera_matrix, invert_pose, transform
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
+    camera_of,
     check_label,
     read_bytes,
     read_plane,
@@ -130,9 +131,13 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
 
     def read_depth(picture: PosedPicture, _: Rectifier) -> Float32:
         assert picture.depth_file is not None
+        data = read_bytes(picture.depth_file)
+        if len(data) % 16:
+            raise BadFrameError(picture.depth_file, "a scan has 16 bytes a point, this one has not; download it again")
+        points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
         intrinsics, T_cam0_camera = rectified[picture.camera_id]
         T_camera_scanner = invert_pose(T_cam0_camera) @ T_cam0_scanner
-        return depth_of_scan(_read_scan(picture.depth_file), T_camera_scanner, intrinsics)
+        return depth_of_scan(points, T_camera_scanner, intrinsics)
 
     return PosedPictures(
         f"{SOURCE}{drive}",
@@ -173,8 +178,14 @@ def _read_stamps(file: Path, count: int, notices: list[str]) -> list[int | BadFr
         notices.append(f"{file} is missing: stamps are made up at {NOMINAL_HZ:g} frames a second")
         return [round(number * 1e9 / NOMINAL_HZ) for number in range(count)]
     rows = read_rows(file, count)
+    stamps: list[int | BadFrameError] = []
+    for line, text in rows:  # 2013-05-28 08:46:02.904547200
+        try:
+            stamps.append(int(np.datetime64(text.strip().replace(" ", "T") or "none", "ns").astype(np.int64)))
+        except ValueError as error:
+            stamps.append(BadFrameError(file, f"line {line}: expected a date and a time: {error}"))
     missing = [BadFrameError(file, f"has {len(rows)} rows and so no time for image {n}") for n in range(count)]
-    return [*(_time_ns(text, file, line) for line, text in rows), *missing[len(rows) :]]
+    return [*stamps, *missing[len(rows) :]]
 
 
 def find_drive(folder: Path) -> tuple[Path, str]:
@@ -188,11 +199,9 @@ def find_drive(folder: Path) -> tuple[Path, str]:
     drives = sorted(path.name for path in (folder / "data_2d_raw").glob("*_drive_*_sync") if path.is_dir())
     if len(drives) == 1:
         return folder, drives[0]
-    if not drives:
-        raise ImportSourceError(f"{folder / 'data_2d_raw'}: no drive (2013_05_28_drive_0000_sync or the like) in it")
     raise ImportSourceError(
-        f"{folder}: holds {len(drives)} drives; name the folder of one: {folder / 'data_2d_raw' / drives[0]}, "
-        f"{', '.join(drives[1:])}"
+        f"{folder / 'data_2d_raw'}: holds {len(drives)} drives (2013_05_28_drive_0000_sync or the like); name the "
+        f"folder of one: {', '.join(drives) or 'there is none'}"
     )
 
 
@@ -213,12 +222,11 @@ def _rectified_camera(file: Path, which: str) -> tuple[CameraIntrinsics, Float64
     """Intrinsics of the rectified camera "00" or "01", and ``T_cam0_camera`` (4, 4)."""
     P = _calibrated(file, f"P_rect_{which}", 12).reshape(3, 4)
     width, height = _calibrated(file, f"S_rect_{which}", 2)
+    intrinsics = camera_of(f"{file}: P_rect_{which} and S_rect_{which}", P[[0, 1, 0, 1], [0, 1, 2, 2]], (width, height))
     T_cam0_camera = np.eye(4)
-    try:
-        intrinsics = CameraIntrinsics(P[0, 0], P[1, 1], P[0, 2], P[1, 2], int(width), int(height))
-        T_cam0_camera[:3, 3] = -np.linalg.solve(P[:, :3], P[:, 3])  # P = K [I | t] takes points of the left camera
-    except (FrameError, np.linalg.LinAlgError) as error:
-        raise ImportSourceError(f"{file}: P_rect_{which} and S_rect_{which}: {error}") from error
+    T_cam0_camera[:3, 3] = -np.linalg.solve(
+        camera_matrix(intrinsics), P[:, 3]
+    )  # P = K [I | t] takes points of the left camera
     return intrinsics, T_cam0_camera
 
 
@@ -235,14 +243,6 @@ def _read_semantics(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt
     ids = read_plane(file, "uint8", size, "label").astype(np.uint8)
     ids[np.isin(ids, _VOID)] = labels.ignore_id
     return check_label(ids, labels, file)
-
-
-def _read_scan(file: Path) -> Float64:
-    """Points (N, 3) of a scan, metres, in the scanner's axes."""
-    data = read_bytes(file)
-    if len(data) % 16:
-        raise BadFrameError(file, f"a scan has 16 bytes a point, this one {len(data)} bytes; download it again")
-    return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
 
 
 def depth_of_scan(points: Float64, T_camera_scanner: Float64, intrinsics: CameraIntrinsics) -> Float32:
@@ -269,11 +269,3 @@ def depth_of_scan(points: Float64, T_camera_scanner: Float64, intrinsics: Camera
     depth = np.asarray(cv2.erode(depth, np.ones((2 * half_v + 1, 2 * half_u + 1), np.uint8)))
     depth = depth[half_v : half_v + k.height, half_u : half_u + k.width]
     return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-
-
-def _time_ns(text: str, file: Path, line: int) -> int | BadFrameError:
-    """``2013-05-28 08:46:02.904547200`` -> nanoseconds since 1970."""
-    try:
-        return int(np.datetime64(text.strip().replace(" ", "T") or "none", "ns").astype(np.int64))
-    except ValueError as error:
-        return BadFrameError(file, f"line {line}: expected a date and a time: {error}")

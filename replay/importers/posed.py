@@ -11,7 +11,7 @@ import numpy as np
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ConfigError, ImportSourceError
-from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.geometry import camera_matrix, scale_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
@@ -36,7 +36,6 @@ SHIFT_NS = 1_000_000  # between pictures of one time
 DEFAULT_HZ = 2.0  # at which pictures without times count as taken
 T_Z_UP_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of ARKit's world frame
 GL_AXES = np.diag((1.0, -1.0, -1.0, 1.0))  # T_gl_cv: OpenGL's cameras look along -z, with y up
-_SAME_PIXEL = 0.25  # px; pictures that are off by less are not resampled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,9 +73,7 @@ class PosedPictures:
     Args:
         source: What the log names as its source.
         pictures: In their order; where each has a time, in that of the times.
-        options: See ``ImportOptions``; ``scale`` makes metres of poses in a unit of their own.
-        depth_scale: Of the depth images.
-        notices: What is to be said of the recording so far.
+        options, depth_scale, notices: See ``ImportOptions``, ``DepthScale``, ``ImportReport``.
         metric: Whether lengths are metres.
         hz: About the rate of the pictures.
         labels: Classes of the label images; None = no labels.
@@ -151,7 +148,7 @@ class PosedPictures:
                 label = self._read_label(picture.label_file, self.info.label_set, size)
             except BadFrameError as error:
                 label_error = error
-        changed = own.distorted or (picture.view is not None and _differs(own, picture.view))
+        changed = own.distorted or own != (picture.view or own)
         if picture.view is not None and changed:
             rgb = _in_view(rgb, own, picture.view, cv2.INTER_AREA)
             label = None if label is None else _in_view(label, own, picture.view, cv2.INTER_NEAREST)
@@ -228,28 +225,15 @@ def depth_of_size(depth_m: Float32, size: tuple[int, int], file: Path) -> Float3
     return np.asarray(cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
 
 
-def _differs(own: CameraIntrinsics, view: CameraIntrinsics) -> bool:
-    corners = np.array(((0, 0, 1), (view.width - 1, view.height - 1, 1)), np.float64)
-    moved = np.abs(corners @ _pixel_map(view, own).T - corners[:, :2]).max() > _SAME_PIXEL
-    return bool(moved) or (own.width, own.height) != (view.width, view.height)
-
-
-def _pixel_map(a: CameraIntrinsics, b: CameraIntrinsics) -> Float64:
-    """(2, 3) affine map from pixels of camera a to those of b, both in one point and turned alike."""
-    sx, sy = b.fx / a.fx, b.fy / a.fy
-    return np.array(((sx, 0, b.cx - sx * a.cx), (0, sy, b.cy - sy * a.cy)))
-
-
 def _in_view(image: UInt8, own: CameraIntrinsics, view: CameraIntrinsics, interpolation: int) -> UInt8:
-    """Colour or classes of a camera in the pixels of another one; classes outside are 0, unknown."""
+    """Colour or classes of a camera in the pixels of another one at its place; classes outside are 0, unknown."""
     size, border = (view.width, view.height), cv2.BORDER_CONSTANT
     if interpolation == cv2.INTER_AREA:
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         own, interpolation, border = scale_intrinsics(own, *size), cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
-        if not _differs(own, view):
-            return image
+    own_of_view = camera_matrix(own) @ np.linalg.inv(camera_matrix(view))  # pixels to pixels
     flags = interpolation | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(image, _pixel_map(view, own), size, flags=flags, borderMode=border), np.uint8)
+    return np.asarray(cv2.warpAffine(image, own_of_view[:2], size, flags=flags, borderMode=border), np.uint8)
 
 
 def _once_each(pictures: Sequence[PosedPicture], notices: list[str]) -> list[PosedPicture]:

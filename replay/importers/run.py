@@ -29,7 +29,7 @@ from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.rosbag import open_rosbag
 from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import open_tum
-from semantic_mapper.replay.log.format import LogReader, LogWriter, atomic_log
+from semantic_mapper.replay.log.format import LogReader, atomic_log
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.replay.sfm.colmap import find_models
@@ -208,7 +208,11 @@ def import_recording(
     packing = CodecOptions(depth_scale=recording.depth_scale.units_per_m)
     with atomic_log(dst, info, options=packing, overwrite=overwrite) as writer:
         if name == "folder" and (src / AUTOLABEL_ATTACHMENT).is_file():
-            _attach_note(src / AUTOLABEL_ATTACHMENT, writer)
+            # Who rendered its pseudo labels, and from which frames' labels: these must not be scored.
+            note = LogAttachment(AUTOLABEL_ATTACHMENT, "application/json", read_bytes(src / AUTOLABEL_ATTACHMENT))
+            if read_note({note.name: note}) is None:
+                raise ImportSourceError(f"{src}: {note.name} does not say who rendered the pseudo labels; export again")
+            writer.attach(note)
         for done, number in enumerate(numbers, 1):
             try:
                 loaded = recording.load(number)
@@ -235,14 +239,6 @@ def import_recording(
             report.notices.append(f"{counted(count, 'frame')} with {what}; marked in the log")
     report.bytes = dst.stat().st_size
     return report
-
-
-def _attach_note(file: Path, writer: LogWriter) -> None:
-    """Who has rendered a folder's pseudo labels, and from which frames' labels: these must not be scored."""
-    note = LogAttachment(file.name, "application/json", read_bytes(file))
-    if read_note({file.name: note}) is None:
-        raise ImportSourceError(f"{file}: does not say who rendered the pseudo labels; export the log again")
-    writer.attach(note)
 
 
 def _changes(

@@ -73,11 +73,10 @@ def _intrinsics(folder: Path, notices: list[str]) -> tuple[CameraIntrinsics, Dep
     if file.exists():
         intrinsics, given, _ = read_intrinsics(file, notices, sorted((folder / "rgb").glob("*")))
         return intrinsics, given or DEPTH_SCALE
-    for key, calibration in _CALIBRATIONS.items():
-        if key in folder.resolve().name:
-            return calibration, DEPTH_SCALE
-    notices.append("no intrinsics.json and no freiburg1, 2 or 3 in the name: the ROS default f = 525 is used")
-    return _DEFAULT, DEPTH_SCALE
+    known = next((k for name, k in _CALIBRATIONS.items() if name in folder.resolve().name), None)
+    if known is None:
+        notices.append("no intrinsics.json and no freiburg1, 2 or 3 in the name: the ROS default f = 525 is used")
+    return known or _DEFAULT, DEPTH_SCALE
 
 
 def _read_list(file: Path, notices: list[str]) -> list[tuple[int, Path]]:
