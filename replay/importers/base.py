@@ -181,15 +181,16 @@ def read_depth(file: Path, scale: DepthScale) -> Float32:
     Raises BadFrameError: missing, damaged, or not 16-bit.
     """
     if file.suffix.lower() == ".png":
-        return depth_from_uint16(read_plane(file, "uint16", None, "depth").astype(np.uint16), scale.units_per_m)
+        return metres(read_plane(file, "uint16", None, "depth"), scale.units_per_m)
     values = _read_numpy(file)
-    units = scale.units_per_m if values.dtype.kind in "iu" else scale.float_units_per_m
-    return metres(values.astype(np.float64) / units)
+    return metres(values, scale.units_per_m if values.dtype.kind in "iu" else scale.float_units_per_m)
 
 
-def metres(values: NDArray[np.generic]) -> Float32:
+def metres(values: NDArray[np.generic], units_per_m: float) -> Float32:
     """Depth (H, W) in metres, float32: 0 for what is no measurement (NaN, infinity, negative)."""
-    depth_m = values.astype(np.float32)
+    if values.dtype == np.uint16:
+        return depth_from_uint16(values.astype(np.uint16, copy=False), units_per_m)
+    depth_m = (values.astype(np.float64) / units_per_m).astype(np.float32)
     depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0
     return depth_m
 

@@ -24,7 +24,6 @@ import numpy as np
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from numpy.typing import NDArray
 
 from semantic_mapper.errors import (
     CodecError,
@@ -36,8 +35,6 @@ from semantic_mapper.errors import (
 from semantic_mapper.files import open_regular
 from semantic_mapper.plain_text import visible
 from semantic_mapper.replay.importers.base import camera_of, metres
-from semantic_mapper.transport.codec import EncodedImage
-from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _PACKED = (".zstd", ".zst")
@@ -381,16 +378,6 @@ def color_image(message: Any) -> UInt8:
         ) from error
 
 
-def compressed_color_image(message: Any) -> tuple[UInt8, EncodedImage]:
-    """RGB (H, W, 3) of a ``sensor_msgs/CompressedImage``, and its file as it is.
-
-    Raises CodecError: neither JPEG nor PNG, or damaged.
-    """
-    data = message.data.tobytes()
-    rgb, encoding = decode_image_file(data)
-    return rgb, EncodedImage(encoding, data)
-
-
 def depth_image(message: Any) -> Float32:
     """Depth (H, W) in metres of a ``sensor_msgs/Image``, 0 where nothing was measured.
 
@@ -401,7 +388,7 @@ def depth_image(message: Any) -> Float32:
         raise CodecError(f"depth images of encoding '{message.encoding}' are not read, only {known}")
     kind = DEPTH_ENCODINGS[message.encoding]
     values = _rows(message, kind.itemsize).view(kind.newbyteorder(">") if message.is_bigendian else kind)
-    return _metres(values)
+    return metres(values, UNITS_PER_M if values.dtype.kind == "u" else 1.0)
 
 
 def compressed_depth_image(message: Any) -> Float32:
@@ -427,10 +414,10 @@ def compressed_depth_image(message: Any) -> Float32:
         raise CodecError(f"the depth image of format '{message.format}' is damaged, or no PNG of 16 bits")
     values = np.asarray(image, np.uint16)
     if quantised is None:
-        return _metres(values)
+        return metres(values, UNITS_PER_M)
     a, b = quantised
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _metres(np.where(values > 0, a / (values.astype(np.float32) - b), 0).astype(np.float32))
+        return metres(np.where(values > 0, a / (values.astype(np.float32) - b), 0).astype(np.float32), 1.0)
 
 
 def _rows(message: Any, bytes_a_pixel: int) -> UInt8:
@@ -442,9 +429,3 @@ def _rows(message: Any, bytes_a_pixel: int) -> UInt8:
             f"an image of {width}x{height} with {step} bytes a row does not fit into its {len(message.data)} bytes"
         )
     return np.ascontiguousarray(message.data[: height * step].reshape(height, step)[:, :used])
-
-
-def _metres(values: NDArray[np.generic]) -> Float32:
-    if values.dtype.kind == "u":
-        return depth_from_uint16(values.astype(np.uint16), UNITS_PER_M)
-    return metres(values)

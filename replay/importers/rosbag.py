@@ -40,7 +40,6 @@ from semantic_mapper.replay.importers.ros_bags import (
     Calibration,
     Topic,
     color_image,
-    compressed_color_image,
     compressed_depth_image,
     depth_image,
     frame_name,
@@ -58,6 +57,7 @@ from semantic_mapper.replay.importers.ros_transforms import (
 )
 from semantic_mapper.replay.importers.tum import match_nearest
 from semantic_mapper.transport.codec import EncodedImage
+from semantic_mapper.transport.images import decode_image_file
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, UInt8
 
 ROLES = ("image", "depth", "info", "depth_info", "pose")
@@ -155,7 +155,11 @@ class _BagReader:
     def _rgb(self, file: Path) -> tuple[UInt8, EncodedImage | None]:
         try:
             message = self._bag.message(self._color.name, self._series[self._color.name], int(file.name))
-            return (color_image(message), None) if self._color.raw else compressed_color_image(message)
+            if self._color.raw:
+                return color_image(message), None
+            data = message.data.tobytes()
+            rgb, encoding = decode_image_file(data)
+            return rgb, EncodedImage(encoding, data)
         except CodecError as error:
             raise BadFrameError(file, str(error)) from error
 
@@ -184,41 +188,31 @@ class _BagReader:
         topics, wanted = self._bag.image_topics(), self._options.topics
         depths = [t for t in topics if is_depth(t.name, t.encoding)]
         colors = [t for t in topics if t not in depths]
-        if "image" in wanted:
-            color = self._named("image", colors)
-        else:
-            fitting = _without_doubles(colors)
-            color = self._only("image", [t for t in fitting if not is_grey(t.encoding)] or fitting)
-            left = [str(t) for t in fitting if t != color]
-            if left:
-                self.notices.append(f"images are those of {color.name}; there are also {', '.join(left[:LISTED])}")
+        fitting = _without_doubles(colors)
+        color = self._choose("image", colors, [t for t in fitting if not is_grey(t.encoding)] or fitting)
+        left = [str(t) for t in fitting if t != color]
+        if "image" not in wanted and left:
+            self.notices.append(f"images are those of {color.name}; there are also {', '.join(left[:LISTED])}")
         if self._options.without_depth:
             return color, None
-        if "depth" in wanted:
-            return color, self._named("depth", depths)
         fitting = _without_doubles(depths)
-        if not fitting:
+        if not fitting and "depth" not in wanted:
             self.notices.append("no topic has depth images: frames come without depth")
             return color, None
-        return color, self._only("depth", [t for t in fitting if t.frame == color.frame] or fitting)
+        return color, self._choose("depth", depths, [t for t in fitting if t.frame == color.frame] or fitting)
 
-    def _named(self, role: str, fitting: list[Topic]) -> Topic:
-        name = self._options.topics[role]
-        for topic in fitting:
-            if topic.name == name:
-                return topic
-        there = ", ".join(map(str, fitting[:LISTED])) or "none"
-        raise ImportSourceError(f"no topic '{name}' of images for {role}; there are {there}")
-
-    def _only(self, role: str, fitting: list[Topic]) -> Topic:
-        if len(fitting) == 1:
-            return fitting[0]
-        if not fitting:
-            raise ImportSourceError(f"no topic has images; there are {self._bag.listing()}")
-        raise ImportSourceError(
-            f"several topics fit the {role}: {', '.join(map(str, fitting[:LISTED]))}; name one: "
-            f"--topic {role}={fitting[0].name}"
-        )
+    def _choose(self, role: str, topics: list[Topic], fitting: list[Topic]) -> Topic:
+        """The one of the topics that is named, or else the only one that fits."""
+        name = self._options.topics.get(role)
+        found = fitting if name is None else [topic for topic in topics if topic.name == name][:1]
+        if len(found) == 1:
+            return found[0]
+        there = ", ".join(map(str, (found or topics)[:LISTED])) or "none"
+        if found:
+            raise ImportSourceError(f"several topics fit the {role}: {there}; name one: --topic {role}={found[0].name}")
+        if name is not None:
+            raise ImportSourceError(f"no topic '{name}' of images for {role}; there are {there}")
+        raise ImportSourceError(f"no topic has images; there are {self._bag.listing()}")
 
     def _info_topic(self, topic: Topic, wanted: str) -> str:
         """The topic of the calibration of images."""

@@ -143,21 +143,19 @@ def _depth_scale(
     file: Path, found: _Transforms, frames: Sequence[_Frame], options: ImportOptions, factor: float
 ) -> DepthScale:
     """Of the depth images; ``factor`` is what the positions of the file were multiplied by."""
+    unit = found.depth_unit_scale_factor
     if any(f.depth_path and not f.depth_file_path for f in frames) and not options.without_depth:  # of instant-ngp
         unit = (found.integer_depth_scale or 0.0) * (options.scale or 1.0) * factor  # depth follows the poses
-        if not 0 < unit < 1e3:
-            raise ImportSourceError(
-                f"{file}: depth_path needs integer_depth_scale, the unit of the poses per number of the depth images; "
-                "write it, or import without depth (--topic depth=none)"
-            )
-        return DepthScale(1 / unit, file, float_units_per_m=1 / unit)
-    unit = found.depth_unit_scale_factor
     if unit is None:
         return DepthScale(
             1000.0, convention="nerfstudio's millimetres; another unit belongs into depth_unit_scale_factor"
         )
     if not 0 < unit < 1e3:
-        raise ImportSourceError(f"{file}: depth_unit_scale_factor {unit:g} cannot be")
+        raise ImportSourceError(
+            f"{file}: {unit:g} m cannot be the unit of depth; depth_path needs integer_depth_scale, the unit of the "
+            "poses per number of the depth images, and depth_file_path takes depth_unit_scale_factor, in metres; write "
+            "it, or import without depth (--topic depth=none)"
+        )
     return DepthScale(1 / unit, file, float_units_per_m=1 / unit)
 
 

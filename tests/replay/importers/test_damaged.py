@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.importers.run import detect_format
 from semantic_mapper.replay.importers.tables import seconds_to_ns, unknown_notice
 from tests.replay import recordings as rec
 from tests.replay.recordings import DRIVE, H, W, imported
@@ -265,21 +264,3 @@ def test_keys_that_change_what_numbers_mean_are_named(tmp_path: Path) -> None:
     neutral = {"pose_rotation": np.eye(3).tolist(), "lens": [0.0], "fisheye_crop_radius": 0}
     (notice,) = unknown_notice(tmp_path, [telling | ordinary | neutral], msgspec.defstruct("Read", []))
     assert {key for key in telling | ordinary | neutral if f"'{key}'" in notice} == set(telling)
-
-
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("transforms_train.json", "one transforms.json"),
-        ("associations.txt", "ICL-NUIM"),
-        ("database.db", "no model"),
-        ("rgbd", "Record3D"),
-        ("a.sens", "SensReader"),
-        ("a.r3d", "EXR"),
-        ("a.klg", "poses"),
-    ],
-)
-def test_what_is_nearly_a_recording_says_what_to_do(tmp_path: Path, name: str, says: str) -> None:
-    (tmp_path / name).write_text("")
-    with pytest.raises(ImportSourceError, match=says):
-        detect_format(tmp_path / name if "." in name and name[:2] == "a." else tmp_path)

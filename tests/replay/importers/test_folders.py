@@ -176,9 +176,18 @@ def test_every_second_frame_is_imported(folder: Path) -> None:
 
 def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path: Path) -> None:
     assert [detect_format(src) for src in (folder, tum, scannet)] == ["folder", "tum", "scannet"]
-    for name in ("nothing", "half/color", "bag"):
+    for name in ("nothing", "half/color", "bag", "nice"):
         (tmp_path / name).mkdir(parents=True)
-    for name in ("half/poses.txt", "bag/metadata.yaml", "bag/day_0.db3", "day.bag", "film.MP4", "day.zip"):
+    for name in (
+        "half/poses.txt",
+        "bag/metadata.yaml",
+        "bag/day_0.db3",
+        "day.bag",
+        "film.MP4",
+        "day.zip",
+        "a.sens",
+        "nice/traj.txt",
+    ):
         (tmp_path / name).touch()
     (tmp_path / "log.mcap").touch()
     for src, complaint in (
@@ -187,6 +196,8 @@ def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path
         ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json"),
         ("film.MP4", "is a film, which has no poses"),
         ("day.zip", "is packed; unpack it"),
+        ("a.sens", "unpack it by the data set's SensReader"),
+        ("nice", "Rewrite it as a sequence folder"),
         ("no", "no such file or folder"),
         ("log.mcap", "nor a log of semantic-mapper"),
     ):
