@@ -77,10 +77,9 @@ class PosedPictures:
         metric: Whether lengths are metres.
         hz: About the rate of the pictures.
         labels: Classes of the label images; None = no labels.
-        read_rgb: Reads a picture.
         read_depth: Reads the depth image of a picture, in metres and in the pixels of its rectified image; None = by
             ``depth_scale``, where its file is there.
-        read_label: Reads a label image of a size (height, width).
+        read_rgb, read_label: As those of ``base``.
     """
 
     def __init__(

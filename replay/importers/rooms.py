@@ -117,9 +117,8 @@ def _scannet_pose(file: Path) -> Float64 | BadFrameError:
         pose = read_matrix(file)
     except BadFrameError as error:
         return error
-    return (
-        pose if np.isfinite(pose).all() else BadFrameError(file, "the scanner had lost track of its pose here (-inf)")
-    )
+    lost = BadFrameError(file, "the scanner had lost track of its pose here (-inf)")
+    return pose if np.isfinite(pose).all() else lost
 
 
 def _scannet_table(folder: Path) -> UInt8 | None:

@@ -36,14 +36,8 @@ _WINDOW = 80  # poses that are judged together
 class Track:
     """Poses over time, or, where they are ``fixed``, the last of them at any time.
 
-    Args:
-        stamps_ns: In any order; of one stamp the last pose counts.
-        rows: tx ty tz qx qy qz qw of each.
-        fixed: Whether they are of a transform that does not change.
-
-    Attributes:
-        stamps_ns: (N,) rising.
-        doubled: How many poses have the stamp of another one, and are different.
+    Stamps may come in any order; of one stamp the last row, tx ty tz qx qy qz qw, counts. ``doubled`` is how many have
+    the stamp of another one and differ from it.
     """
 
     def __init__(self, stamps_ns: list[int], rows: list[tuple[float, ...]], *, fixed: bool = False) -> None:
@@ -55,7 +49,7 @@ class Track:
         self.fixed = fixed
         self.doubled = int((again & np.any(np.diff(self._all_rows, axis=0) != 0, axis=1)).sum())
         last = np.append(~again, [True] * bool(rows))
-        self.stamps_ns: NDArray[np.int64] = self._all_stamps_ns[last]
+        self.stamps_ns: NDArray[np.int64] = self._all_stamps_ns[last]  # (N,) rising
         self._rows = self._all_rows[last]
 
     def at(self, stamp_ns: int, within_ns: int = MATCH_NS) -> Float64 | None:
@@ -67,9 +61,7 @@ class Track:
     def differs(self, other: Track, *, unless_apart: bool) -> bool:
         """Whether another source tells the same poses otherwise.
 
-        Args:
-            other: Of the other source.
-            unless_apart: One after the other is no contradiction: a program was started again.
+        ``unless_apart``: one after the other is no contradiction, since a program was started again.
         """
         some = slice(None, None, max(1, len(self._rows) // 1000))
         pairs = [
@@ -143,11 +135,8 @@ class TransformTree:
     def add(self, transforms: Iterable[Any], topic: str, program: str, received_ns: int) -> None:
         """Take in the ``geometry_msgs/TransformStamped`` of one message.
 
-        Args:
-            transforms: Of the message.
-            topic: Whose name ends in tf_static where they are fixed.
-            program: That published it; empty = not known.
-            received_ns: When; stands for the stamps of those that have none.
+        Those of a topic tf_static are fixed. ``program`` published it (empty = not known), at ``received_ns``, which
+        stands for the stamps of those that have none.
         """
         source = f"{topic} of {program}" if program else topic
         for stamped in transforms:
