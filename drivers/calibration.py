@@ -97,8 +97,7 @@ class StereoCalibration:
 def load_calibration(path: Path) -> CameraIntrinsics:
     """Read a calibration file: TOML, with the suffix ``.json`` JSON, with ``.yaml`` ROS's camera_info or Kalibr's.
 
-    Raises:
-        ConfigError: missing, of another form, or with impossible values.
+    Raises ConfigError: missing, of another form, or with impossible values.
     """
     file = None if path.suffix.lower() in _YAML else _load_file(path)
     try:
@@ -151,8 +150,7 @@ def save_calibration(
 def load_stereo(path: Path) -> StereoCalibration:
     """Read the file of a stereo pair.
 
-    Raises:
-        ConfigError: missing, the calibration of a single camera, of another form, or with impossible values.
+    Raises ConfigError: missing, the calibration of a single camera, of another form, or with impossible values.
     """
     try:
         file = load_config(path, StereoFile)
@@ -191,9 +189,7 @@ def _write(path: Path, tables: Mapping[str, Mapping[str, Any]]) -> None:
 def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraIntrinsics | None:
     """The calibration that a driver was given as a file; None where the user wants images for calibrating.
 
-    Raises:
-        CameraError: neither, or both; says the ways out.
-        ConfigError: see ``load_calibration``.
+    Raises CameraError: neither, or both; says the ways out. ConfigError: see ``load_calibration``.
     """
     if path and uncalibrated:
         raise CameraError(f"{camera}: has a calibration and is to be used uncalibrated; leave one of the two out")

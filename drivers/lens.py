@@ -37,15 +37,14 @@ def lens_intrinsics(
 ) -> CameraIntrinsics:
     """Intrinsics of a camera whose lens has a model by name.
 
+    Raises ConfigError: a model that is neither OpenCV's pinhole nor its fisheye, or more coefficients than it has.
+    FrameError: see ``CameraIntrinsics``.
+
     Args:
         model: Name of the model, however it is written.
         coefficients: In OpenCV's order, any number of them.
         k: fx fy cx cy; pixel centres are integers.
         size: (width, height).
-
-    Raises:
-        ConfigError: a model that is neither OpenCV's pinhole nor its fisheye, or more coefficients than it has.
-        FrameError: see ``CameraIntrinsics``.
     """
     name = _plain(model)
     values = [float(value) for value in coefficients]

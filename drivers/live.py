@@ -57,8 +57,7 @@ class Device:
     def read(self) -> CameraImage | None:
         """The next image, waited for; ``seq`` is the device's own count. None where none came or it was damaged.
 
-        Raises:
-            CameraError: the device is gone, or gives what cannot be used.
+        Raises CameraError: the device is gone, or gives what cannot be used.
         """
         raise NotImplementedError
 
@@ -271,8 +270,7 @@ class CaptureDevice(Device):
 def first_of(read: Callable[[], FirstT | None], stopping: threading.Event, name: str) -> FirstT:
     """The first thing that a device gives.
 
-    Raises:
-        CameraError: it gives nothing for ``START_S``, or a stop was requested.
+    Raises CameraError: it gives nothing for ``START_S``, or a stop was requested.
     """
     deadline = time.monotonic() + START_S
     while not stopping.is_set() and time.monotonic() < deadline:

@@ -45,14 +45,14 @@ def load_driver(kind: str) -> Any:
 def open_camera(kind: str, config: Mapping[str, Any], camera_id: str, where: str) -> Camera:
     """A camera of a kind, not open yet.
 
+    Raises ConfigError, CameraError, DependencyError: a bad setting, one that cannot work, or something is not
+    installed.
+
     Args:
         kind: Of ``KINDS``.
         config: Plain data, checked against the ``Config`` of the kind.
         camera_id: What its images will be called.
         where: The config comes from, for messages.
-
-    Raises:
-        ConfigError, CameraError, DependencyError: a bad setting, one that cannot work, or something is not installed.
     """
     driver = load_driver(kind)
     return driver.open_camera(convert_config(dict(config), driver.Config, where), camera_id)

@@ -62,7 +62,8 @@ def finish_session(
     pictures and the report last. Returns the summary.
 
     Each file is there whole or not at all, whenever the process is killed; what an earlier run left is removed first,
-    but for its map. A summary that is there means that the map next to it is whole, and the one that it is of.
+    but for its map. A summary that is there means that the map next to it is whole, and the one that it is of. Raises
+    MapError: the map cannot be written. ConfigError: the report cannot be written.
 
     Args:
         session: To be finished; it counts what came since this process began.
@@ -70,10 +71,6 @@ def finish_session(
         stopped_by: What ended it early; empty = nothing.
         restarted: What became of the map of a process before this one; empty = there was none.
         progress: Called after each step.
-
-    Raises:
-        MapError: the map cannot be written.
-        ConfigError: the report cannot be written.
     """
     try:
         session.process_rest()

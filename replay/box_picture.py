@@ -60,11 +60,10 @@ class _Place(NamedTuple):
 def draw_boxes(log: Log, boxes: Sequence[Primitive], title: str) -> tuple[UInt8, int]:
     """Draw boxes, which are in the world of a log, over the frames that show the most of them, and from above.
 
+    Raises LogError: the log has no frames.
+
     Returns:
         The picture (H, W, 3) uint8 RGB, and how many boxes have their middle in view of any frame.
-
-    Raises:
-        LogError: the log has no frames.
     """
     places = [
         _Place(number, e.stamp_ns, log.info.cameras[e.source], np.array(e.T_world_camera, np.float64).reshape(4, 4))

@@ -111,9 +111,8 @@ class _Instance(msgspec.Struct, frozen=True, rename={"class_name": "class"}):
 def load_boxes(path: Path) -> BoxFile:
     """Read a file of boxes in any of the three formats.
 
-    Raises:
-        ConfigError: no such file, neither format, or boxes that cannot be used, each with its number in the file. Of
-            XML these are left out, and counted in a warning, unless all are.
+    Raises ConfigError: no such file, neither format, or boxes that cannot be used, each with its number in the file. Of
+    XML these are left out, and counted in a warning, unless all are.
     """
     try:
         text = read_regular(path, MAX_FILE_BYTES).removeprefix(codecs.BOM_UTF8)
@@ -135,10 +134,8 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
     """Boxes that a field can be fitted with, and the label set of the field: that of the pseudo labels, and classes of
     boxes that one of its classes stands for, as ``merge`` says, or else ``MERGE``.
 
-    Boxes of XML of any other class that it lacks are left out, with a warning. ``path`` is the file, for errors.
-
-    Raises:
-        ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name.
+    Boxes of XML of any other class that it lacks are left out, with a warning. ``path`` is the file, for errors. Raises
+    ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name.
     """
     names = {*label_set.names, *(name for others in boxes.merge.values() for name in others)}
     lacking = {p.class_name for p in boxes.primitives} - names
@@ -172,8 +169,7 @@ def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]
     """Boxes with poses by frame of a drive of KITTI-360, with the times of these frames in a log of it instead; and the
     ids of boxes of which the log lacks all frames, which are dropped. ``path`` is the file of the boxes, for errors.
 
-    Raises:
-        ConfigError: the log is of something else, or has none of the frames at which any box is.
+    Raises ConfigError: the log is of something else, or has none of the frames at which any box is.
     """
     if all(box.frames is None for box in boxes.primitives):
         return boxes, []

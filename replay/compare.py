@@ -50,9 +50,7 @@ class Run(NamedTuple):
 def read_run(path: Path) -> Run:
     """Read the folder that a replay or a mapper node has left, or a saved map alone.
 
-    Raises:
-        ConfigError: no map there, a log, or a folder with a damaged summary.
-        MapError: a damaged map.
+    Raises ConfigError: no map there, a log, or a folder with a damaged summary. MapError: a damaged map.
     """
     voxel_map = VoxelMap.load(map_path(path))
     # A mapper saves its map before its summary.
@@ -107,8 +105,7 @@ class Comparison:
 def compare_runs(a: Run, b: Run, tolerances: Tolerances) -> Comparison:
     """Compare what two runs counted and scored, and their maps; without both summaries the maps alone.
 
-    Raises:
-        MapError: only one of the maps is in metres.
+    Raises MapError: only one of the maps is in metres.
     """
     figures = [*_map_figures(a.voxel_map, b.voxel_map, tolerances)]
     if a.summary is None or b.summary is None:

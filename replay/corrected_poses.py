@@ -39,8 +39,7 @@ class Trajectory(NamedTuple):
 def read_corrections(path: Path) -> Trajectory:
     """Read a trajectory in TUM's format, ``stamp tx ty tz qx qy qz qw``: the poses of the camera, stamps in seconds.
 
-    Raises:
-        ImportSourceError: missing, empty, or with an invalid line.
+    Raises ImportSourceError: missing, empty, or with an invalid line.
     """
     stamps_ns, rows, left_out = read_trajectory(path)
     if left_out:  # a recording can do without a frame; who corrects poses wants all of them
@@ -76,11 +75,9 @@ def match_frames(
 def correct_session(session: MapSession, trajectory: Trajectory) -> int:
     """Move the map to the corrected poses; frames between and after them move along. Returns how many poses were used.
 
-    Poses that no frame of the history was taken within 5 ms of are left out and counted in the log.
-
-    Raises:
-        ImportSourceError: that is true of all of them, or the session has frames of several cameras.
-        MapError: the map cannot be corrected.
+    Poses that no frame of the history was taken within 5 ms of are left out and counted in the log. Raises
+    ImportSourceError: that is true of all of them, or the session has frames of several cameras. MapError: the map
+    cannot be corrected.
     """
     keys = sorted(session.pipeline.corrector.poses(), key=lambda key: key[1])
     cameras = sorted({camera_id for camera_id, _ in keys})

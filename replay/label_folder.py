@@ -84,9 +84,7 @@ class LabelFolder:
     def write(self, number: int, label: UInt8) -> None:
         """Write the label image (H, W) of a frame, whole or not at all; one without a labelled pixel is removed.
 
-        Raises:
-            LabelError: an id that is no class.
-            LogError: it cannot be written.
+        Raises LabelError: an id that is no class. LogError: it cannot be written.
         """
         channels = self.label_set.to_channels(label, f"label image of frame {number}")
         there = self._files().get(number, self.path / f"{number:06d}.png")
@@ -161,9 +159,7 @@ def make_label_folder(path: Path, log: Log, label_set: LabelSet) -> LabelFolder:
 def read_classes(file: Path) -> LabelSet:
     """Classes from a file: a ``labels.json``, or a text with one name a line, whose ids are then 1, 2, 3, ...
 
-    Raises:
-        ConfigError: no such file, or no text.
-        ImportSourceError, LabelError: no classes.
+    Raises ConfigError: no such file, or no text. ImportSourceError, LabelError: no classes.
     """
     if file.suffix == ".json":
         return read_label_set(file)

@@ -62,8 +62,7 @@ def folder_for_results(out: Path) -> Iterator[None]:
 def hold_folder(out: Path) -> Iterator[None]:
     """As ``folder_for_results``, and keeps other runs out of the folder for as long as this one lasts.
 
-    Raises:
-        ConfigError: it cannot be made or written to, or another run writes its results there.
+    Raises ConfigError: it cannot be made or written to, or another run writes its results there.
     """
     with folder_for_results(out):
         folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
@@ -87,8 +86,7 @@ def hold_folder(out: Path) -> Iterator[None]:
 def map_path(path: Path) -> Path:
     """The file of a map that is named itself, or by the folder it is in.
 
-    Raises:
-        ConfigError: no map is there, or it is a log; with what to do, from what is there.
+    Raises ConfigError: no map is there, or it is a log; with what to do, from what is there.
     """
     if not path.exists():
         raise ConfigError(f"{path}: no such map file or folder")

@@ -19,11 +19,7 @@ MAX_SUMMARY_BYTES = 1 << 24
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """The summary in a result folder.
-
-    Raises:
-        ConfigError: it is missing or damaged.
-    """
+    """The summary in a result folder. Raises ConfigError: it is missing or damaged."""
     path = folder / SUMMARY_FILE
     try:
         summary = json.loads(read_regular(path, MAX_SUMMARY_BYTES))

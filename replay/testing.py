@@ -98,13 +98,11 @@ class ReplayedMap:
     def assert_like(self, stored: Path | str, **tolerances: float) -> None:
         """Fail where this run is not as an earlier one, saying what differs; ``pytest --update-runs`` stores it there.
 
+        Raises ConfigError: no such tolerance, or a folder without a run. MapError: a damaged map.
+
         Args:
             stored: A folder with ``map.npz`` and ``summary.json``, or a map alone; relative to pytest's root folder.
             tolerances: As of ``semantic_mapper.replay.compare.Tolerances``: score, surface_m, labels.
-
-        Raises:
-            ConfigError: no such tolerance, or a folder without a run.
-            MapError: a damaged map.
         """
         target = self.root / stored
         if self.update:
@@ -150,16 +148,15 @@ class LogReplays:
     ) -> ReplayedMap:
         """Replay a log through ``MappingPipeline.step``, as ``semantic-mapper replay`` does.
 
+        Raises LogError: the log cannot be read, or none of its frames can be mapped. WeightsError, ConfigError,
+        MapError: as of ``Mapper.load`` and ``MappingPipeline.step``.
+
         Args:
             log: Recorded log (.mcap).
             weights: None = those that ship with the package.
             config: Of the mapper: a TOML file, or its sections as a dict.
             quality: None = as the config says.
             max_frames: 0 = all.
-
-        Raises:
-            LogError: the log cannot be read, or none of its frames can be mapped.
-            WeightsError, ConfigError, MapError: as of ``Mapper.load`` and ``MappingPipeline.step``.
         """
         log = self._root / log
         weights = None if weights is None else self._root / weights

@@ -39,16 +39,14 @@ class MapClient(Closing):
     mapper that was restarted is found again. What takes or gives metres is refused (``MapError``) where the map has
     none (``MapInfo.scale_known``). Any thread may call; calls wait for each other.
 
-    ``version`` is the version of the map that the last answer was about.
+    ``version`` is the version of the map that the last answer was about. Raises TransportError: an invalid endpoint, or
+    a mapper that is not among the peers.
 
     Args:
         endpoint: Of the mapper's query service; by default that of a mapper of this user that was started by hand.
         timeout_s: How long to wait for an answer before asking again.
         attempts: How often to ask.
         identity: Of a mapper that has keys (``transport.keys``), as those on other machines have.
-
-    Raises:
-        TransportError: an invalid endpoint, or a mapper that is not among the peers.
     """
 
     def __init__(
@@ -196,8 +194,7 @@ class MapClient(Closing):
     def return_to_weights(self, version: int) -> Weights:
         """Ask the mapper to go back to weights that it has used before, which it does a moment later.
 
-        Raises:
-            MapError: it has never used these, or keeps them no longer.
+        Raises MapError: it has never used these, or keeps them no longer.
         """
         return self._ask(questions.WeightsRequest(to=version))
 

@@ -343,12 +343,11 @@ def with_quality(config: MapperConfig) -> MapperConfig:
 def check_quality(data: Mapping[str, Any], quality: Quality, where: str) -> None:
     """Refuse what a file says of settings that a quality sets otherwise: one of the two would be without effect.
 
+    Raises ConfigError: names the settings.
+
     Args:
         data: The mapper's config as the file ``where`` has it, of the right form.
         quality: In force, whether the file asks for it or somebody else.
-
-    Raises:
-        ConfigError: names the settings.
     """
     if quality == "custom":
         return
@@ -371,8 +370,7 @@ ConfigT = TypeVar("ConfigT", bound=msgspec.Struct)
 def load_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     """Read a TOML file onto ``kind``.
 
-    Raises:
-        ConfigError: file missing, not TOML, unknown key (with the nearest valid one), or a value of the wrong type.
+    Raises ConfigError: file missing, not TOML, unknown key (with the nearest valid one), or a value of the wrong type.
     """
     return convert_config(read_toml(path), kind, str(path))
 
@@ -383,10 +381,7 @@ def load_mapper_config(
     """The mapper's config: a TOML file, what goes before it, and what stands in where it says nothing.
 
     ``settings`` by dotted name ("voxel_map.voxel_size_m") replace what the file says (None = not given); ``defaults``
-    stand in for what neither says.
-
-    Raises:
-        ConfigError: see ``load_config`` and ``check_quality``.
+    stand in for what neither says. Raises ConfigError: see ``load_config`` and ``check_quality``.
     """
     data = read_toml(path) if path else {}
     where = str(path) if path else "settings of the mapper"
@@ -401,20 +396,12 @@ def load_mapper_config(
 
 
 def parse_assignments(texts: Iterable[str]) -> dict[str, Any]:
-    """What ``--set NAME=VALUE`` says, by name; values as of ``parse_value``.
-
-    Raises:
-        ConfigError: not of this form.
-    """
+    """What ``--set NAME=VALUE`` says, by name; values as of ``parse_value``. Raises ConfigError: not of this form."""
     return {name: parse_value(value) for name, value in map(split_assignment, texts)}
 
 
 def split_assignment(text: str) -> tuple[str, str]:
-    """Name and value of NAME=VALUE.
-
-    Raises:
-        ConfigError: not of this form.
-    """
+    """Name and value of NAME=VALUE. Raises ConfigError: not of this form."""
     name, equals, value = text.partition("=")
     if not equals or not name:
         raise ConfigError(f"--set {text}: write NAME=VALUE, such as seed=1")
@@ -432,10 +419,8 @@ def parse_value(text: str) -> Any:
 def assign(data: dict[str, Any], name: str, value: Any, where: str, *, replace: bool = True) -> None:
     """Set a value of nested tables by its dotted name, making the tables on the way.
 
-    ``replace`` says whether a value that is there gives way; ``where`` names the file in messages.
-
-    Raises:
-        ConfigError: a part of the name is a value already, not a table.
+    ``replace`` says whether a value that is there gives way; ``where`` names the file in messages. Raises ConfigError:
+    a part of the name is a value already, not a table.
     """
     *tables, last = name.split(".")
     for key in tables:
@@ -450,8 +435,7 @@ def assign(data: dict[str, Any], name: str, value: Any, where: str, *, replace: 
 def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as plain data.
 
-    Raises:
-        ConfigError: file missing, no regular file, larger than ``MAX_FILE_BYTES``, or not TOML.
+    Raises ConfigError: file missing, no regular file, larger than ``MAX_FILE_BYTES``, or not TOML.
     """
     text = _read(path)
     try:
@@ -466,9 +450,8 @@ JsonT = TypeVar("JsonT")
 def read_json(path: Path, kind: type[JsonT], limit: int = MAX_FILE_BYTES) -> JsonT:
     """A JSON file of at most ``limit`` bytes as ``kind`` (``dict`` or a struct).
 
-    Raises:
-        ConfigError: file missing, no regular file, larger than ``limit``, not JSON, of another form, or with
-            a number that nothing has.
+    Raises ConfigError: file missing, no regular file, larger than ``limit``, not JSON, of another form, or with a
+    number that nothing has.
     """
     try:
         data = msgspec.json.decode(decode_text(_read(path, limit)), type=kind)
@@ -483,9 +466,8 @@ def read_json(path: Path, kind: type[JsonT], limit: int = MAX_FILE_BYTES) -> Jso
 def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
     """Check plain data against ``kind``; see ``load_config``.
 
-    Raises:
-        ConfigError: an unknown key (with the nearest valid one), a value of the wrong type or out of its range, or one
-            that ``check_values`` refuses.
+    Raises ConfigError: an unknown key (with the nearest valid one), a value of the wrong type or out of its range, or
+    one that ``check_values`` refuses.
     """
     check_values(data, where)
     try:
@@ -497,10 +479,7 @@ def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
 def check_values(data: Any, where: str, name: str = "") -> None:
     """Refuse what no setting can be: numbers that are not finite or too large to compute with, text that is no name.
 
-    ``where`` and the dotted ``name`` of the setting are for messages.
-
-    Raises:
-        ConfigError: names the setting.
+    ``where`` and the dotted ``name`` of the setting are for messages. Raises ConfigError: names the setting.
     """
     match data:
         case Mapping():

@@ -32,9 +32,7 @@ _NAME_BYTES = 200  # of the final name that are part of the other one: names end
 def open_regular(path: Path) -> BinaryIO:
     """Open a regular file to be read. Pipes, devices and sockets are refused: they may never end, or never begin.
 
-    Raises:
-        ConfigError: no regular file.
-        OSError: it is missing or cannot be read; ``filename`` is set.
+    Raises ConfigError: no regular file. OSError: it is missing or cannot be read; ``filename`` is set.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not block
     if not stat.S_ISREG(os.fstat(fd).st_mode):
@@ -46,8 +44,7 @@ def open_regular(path: Path) -> BinaryIO:
 def read_regular(path: Path, limit: int) -> bytes:
     """All bytes of a regular file of at most ``limit`` bytes.
 
-    Raises:
-        ConfigError, OSError: as of ``open_regular``; or it is larger.
+    Raises ConfigError, OSError: as of ``open_regular``; or it is larger.
     """
     with open_regular(path) as file:
         data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
@@ -61,8 +58,7 @@ def read_regular(path: Path, limit: int) -> bytes:
 def decode_text(data: bytes) -> str:
     """Text of a file: UTF-8, with or without the mark that Windows' programs begin it with, or UTF-16 with its mark.
 
-    Raises:
-        UnicodeDecodeError: neither.
+    Raises UnicodeDecodeError: neither.
     """
     utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return data.decode("utf-16" if utf16 else "utf-8-sig")
@@ -75,16 +71,14 @@ def atomic_write(
     """Give a file to write; at the end it takes the place of ``path``.
 
     After an error nothing is left of it, and ``path`` is as it was. Two writers at a time do not mix: the last one to
-    end wins. What killed writers of this path have left is removed.
+    end wins. What killed writers of this path have left is removed. Raises OSError: it cannot be written; ``filename``
+    is ``path``.
 
     Args:
         path: Of the file, in a folder that exists. A link is replaced, and what it points to stays as it is.
         sync: What a power cut leaves. "none": anything, for files that live no longer than the machine runs. "file":
             the old file or the new one. "folder": once this has returned, the new one.
         raises: Raised in the place of an ``OSError``.
-
-    Raises:
-        OSError: it cannot be written; ``filename`` is ``path``.
     """
     with atomic_path(path, sync=sync, raises=raises) as part, part.open("wb") as file:
         yield file

@@ -33,10 +33,8 @@ REPEAT_VALUE = 0.5  # a second view of the same point is worth half of the first
 def expect_shape(x: torch.Tensor | NDArray[np.generic], pattern: str, name: str = "array") -> dict[str, int]:
     """Check ``x`` against a pattern such as ``"M 3 H W"`` and return the sizes of its named dimensions.
 
-    A letter stands for any size, the same letter for the same size, a number for itself.
-
-    Raises:
-        ShapeError: with the expected and the actual shape.
+    A letter stands for any size, the same letter for the same size, a number for itself. Raises ShapeError: with the
+    expected and the actual shape.
     """
     parts = pattern.split()
     shape = tuple(int(n) for n in x.shape)
@@ -52,9 +50,8 @@ def expect_shape(x: torch.Tensor | NDArray[np.generic], pattern: str, name: str 
 def check_pose(T_world_camera: Float64, where: str, of: str = "camera") -> None:
     """Refuse what is not a rigid transform (4, 4) ``of`` something; ``where`` names the frame or file in the error.
 
-    Raises:
-        PoseError: NaN or infinite numbers, wrong last row, a 3x3 part that is not a rotation, or a position farther
-            than ``MAX_TRANSLATION_M`` from the origin.
+    Raises PoseError: NaN or infinite numbers, wrong last row, a 3x3 part that is not a rotation, or a position farther
+    than ``MAX_TRANSLATION_M`` from the origin.
     """
     expect_shape(T_world_camera, "4 4", f"{where}: T_world_{of}")
     if not np.isfinite(T_world_camera).all():
@@ -156,8 +153,7 @@ def pose_distance(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]
 def look_at(eye: Float64, target: Float64, up: Float64) -> Float64:
     """Pose (4, 4) of a camera at ``eye`` that looks at ``target``, with image-up along ``up`` (world).
 
-    Raises:
-        PoseError: ``eye`` is ``target``, or the view is along ``up``, so that the roll is not defined.
+    Raises PoseError: ``eye`` is ``target``, or the view is along ``up``, so that the roll is not defined.
     """
     forward = target - eye
     right = np.cross(forward, up)

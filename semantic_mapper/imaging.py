@@ -116,14 +116,11 @@ def depth_prior(depth_m: Float32, rgb: UInt8) -> Float32:
     A depth sensor errs at borders: stereo widens what is near and leaves holes next to it, and the nearest measured
     pixel of a hole is often on the wrong surface. Where the neighbourhood of a pixel holds two surfaces, the pixel
     belongs to the one whose pixels look more like it: a joint bilateral filter that chooses between both, so that no
-    depth lies between.
+    depth lies between. Raises ShapeError: images of different sizes.
 
     Args:
         depth_m: (H, W) float32, 0 = not measured; all 0 gives all 0.
         rgb: (H, W, 3) uint8, the view's image.
-
-    Raises:
-        ShapeError: images of different sizes.
     """
     sizes = expect_shape(depth_m, "H W", "depth")
     expect_shape(rgb, f"{sizes['H']} {sizes['W']} 3", "rgb")
@@ -175,8 +172,7 @@ def rotate_frame(frame: PosedFrame, quarters: int) -> PosedFrame:
     """The frame with its images turned clockwise by this many quarters of a full turn, and its pose and intrinsics with
     them: every pixel keeps its ray in the world.
 
-    Raises:
-        FrameError: an image that is not rectified.
+    Raises FrameError: an image that is not rectified.
     """
     quarters %= 4
     if quarters == 0:

@@ -52,11 +52,7 @@ class LabelSet:
         return len(self.ids)
 
     def to_channels(self, label: UInt8, where: str = "label image") -> NDArray[np.int64]:
-        """Ids -> channels, any shape; the ignore id becomes -1.
-
-        Raises:
-            LabelError: where an id is not in the set.
-        """
+        """Ids -> channels, any shape; the ignore id becomes -1. Raises LabelError: where an id is not in the set."""
         table = np.full(256, IGNORE_CHANNEL - 1, np.int64)
         table[list(self.ids)] = np.arange(len(self.ids))
         table[self.ignore_id] = IGNORE_CHANNEL
@@ -81,11 +77,7 @@ class LabelSet:
         return table[label]
 
     def id_of(self, name: str) -> int:
-        """Id of a class.
-
-        Raises:
-            LabelError: no class of that name; lists those there are.
-        """
+        """Id of a class. Raises LabelError: no class of that name; lists those there are."""
         if name not in self.names:
             raise LabelError(f"label set '{self.name}' has no class '{name}'; it has {', '.join(self.names)}")
         return self.ids[self.names.index(name)]
@@ -101,11 +93,10 @@ class LabelSet:
     def renamed(self, names: Mapping[str, str]) -> tuple[LabelSet, UInt8]:
         """Give classes other names, by the present ones; those that then have one name become one, of the lowest id.
 
+        Raises LabelError: a present name that is not in the set.
+
         Returns:
             The new set, and its id for each id 0..255 of this one (ids that this set lacks stay as they are).
-
-        Raises:
-            LabelError: a present name that is not in the set.
         """
         unknown = sorted(set(names) - set(self.names))
         if unknown:
@@ -121,8 +112,7 @@ class LabelSet:
     def with_names(self, names: Sequence[str]) -> LabelSet:
         """This set and classes of more names, in their order, with the lowest ids that are free.
 
-        Raises:
-            LabelError: there are no more ids, or a name is there already.
+        Raises LabelError: there are no more ids, or a name is there already.
         """
         free = [i for i in range(256) if i not in self.ids and i != self.ignore_id][: len(names)]
         if len(free) < len(names):
@@ -145,10 +135,8 @@ def make_label_set(
     """Build a label set with distinct generated colours.
 
     Without ids the classes are 1, 2, 3, ... The ignore id means unknown; None, for a data set that has none, stands for
-    the highest id that is no class.
-
-    Raises:
-        LabelError: names or ids that are no label set, or all 256 ids are classes, so that none can mean unknown.
+    the highest id that is no class. Raises LabelError: names or ids that are no label set, or all 256 ids are classes,
+    so that none can mean unknown.
     """
     chosen = tuple(ids) if ids is not None else tuple(range(1, len(names) + 1))
     if ignore_id is None:

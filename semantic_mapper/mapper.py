@@ -30,13 +30,12 @@ class Mapper:
     def load(cls, weights: Path | str | None = None, config: MapperConfig | Path | str | None = None) -> Mapper:
         """Load weights and build the pipeline round them; the map's classes are those of the weights.
 
+        Raises ConfigError: a setting cannot be used, or a GPU is requested that is not there. WeightsError: missing,
+        damaged or foreign weights.
+
         Args:
             weights: A .safetensors file; None = the weights that ship with the package.
             config: Settings, or a TOML file of them; None = the defaults.
-
-        Raises:
-            ConfigError: a setting cannot be used, or a GPU is requested that is not there.
-            WeightsError: missing, damaged or foreign weights.
         """
         if not isinstance(config, MapperConfig):
             config = MapperConfig() if config is None else load_config(Path(config), MapperConfig)
@@ -64,8 +63,7 @@ class Mapper:
     def step(self, frame: PosedFrame) -> MapUpdate:
         """Fuse one frame into the map; see ``MappingPipeline.step``.
 
-        Raises:
-            FrameError: the frame cannot be used; the map is as it was.
+        Raises FrameError: the frame cannot be used; the map is as it was.
         """
         return self.pipeline.step(frame)
 
@@ -74,10 +72,7 @@ def make_field(model: LearnedField, config: MapperConfig) -> SemanticField:
     """The renderer that a config asks for, over given weights.
 
     With ``sampling.mode = "streaming"`` and a model that the compiled renderer covers it is that renderer; otherwise,
-    and on a GPU, it is the eager one.
-
-    Raises:
-        ConfigError: ``render.device = "cuda"`` where torch sees no GPU.
+    and on a GPU, it is the eager one. Raises ConfigError: ``render.device = "cuda"`` where torch sees no GPU.
     """
     if config.render.device == "cuda":
         return DeviceField(model, choose_device("cuda", 0), config.sampling, bfloat16=config.render.bfloat16)

@@ -140,10 +140,7 @@ def encode_picture(picture: UInt8, *, jpeg: bool = False) -> bytes:
 def write_picture(path: Path, picture: UInt8) -> None:
     """Write an RGB picture (H, W, 3), as JPEG if its name says so, else as PNG; whole or not at all.
 
-    The folder is made if missing.
-
-    Raises:
-        SemanticMapperError: it cannot be encoded or written.
+    The folder is made if missing. Raises SemanticMapperError: it cannot be encoded or written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,9 +43,7 @@ class CameraIntrinsics:
     """Pinhole model in pixels; ``distortion`` holds OpenCV coefficients, empty for a rectified image.
 
     This is the one place where intrinsics are checked, wherever they come from: the bounds are the constants above.
-
-    Raises:
-        FrameError: a value is not finite or does not fit the image size; normalised intrinsics are named as such.
+    Raises FrameError: a value is not finite or does not fit the image size; normalised intrinsics are named as such.
     """
 
     fx: float
@@ -83,10 +81,8 @@ class CameraIntrinsics:
 class FisheyeIntrinsics(CameraIntrinsics):
     """A lens of OpenCV's fisheye model (equidistant, Kannala-Brandt): ``distortion`` holds its k1 k2 k3 k4.
 
-    A ``Rectifier`` makes a pinhole camera of it; frames have none.
-
-    Raises:
-        FrameError: not four coefficients, and as ``CameraIntrinsics``.
+    A ``Rectifier`` makes a pinhole camera of it; frames have none. Raises FrameError: not four coefficients, and as
+    ``CameraIntrinsics``.
     """
 
     @property
@@ -130,8 +126,7 @@ def _check_lens(k: CameraIntrinsics) -> None:
 class PosedFrame:
     """One camera image with its pose, as a driver or a log gives it.
 
-    Raises:
-        FrameError: a shape or dtype is off, or a number out of its range. ``geometry.check_pose`` checks the pose.
+    Raises FrameError: a shape or dtype is off, or a number out of its range. ``geometry.check_pose`` checks the pose.
     """
 
     stamp_ns: int  # of capture, int64 nanoseconds on the robot's monotonic clock, 0 to ``MAX_STAMP_NS``

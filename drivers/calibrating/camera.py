@@ -61,8 +61,7 @@ def calibrate_camera(
 ) -> CameraCalibration:
     """Calibrate from views that are unlike each other.
 
-    Raises:
-        CameraError: the views cover too little, do not fit each other, or leave the focal length open; says which.
+    Raises CameraError: the views cover too little, do not fit each other, or leave the focal length open; says which.
     """
     counts = area_counts([v.pixels for v in views], size)
     _refuse(camera_id, shortfalls(config, len(views), counts, None))
@@ -94,11 +93,7 @@ def calibrate_camera(
 def compare_camera(
     camera_id: str, views: Sequence[BoardView], intrinsics: CameraIntrinsics, config: CalibrationConfig
 ) -> CameraCalibration:
-    """How well a camera that is calibrated already fits its views.
-
-    Raises:
-        CameraError: no view, or they do not fit.
-    """
+    """How well a camera that is calibrated already fits its views. Raises CameraError: no view, or they do not fit."""
     ideal = replace(intrinsics, distortion=())
     used = [(v, p[0][1]) for v in views if (p := board_poses(v.points, ideal_pixels(v.pixels, intrinsics), ideal))]
     if not used:

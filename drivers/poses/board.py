@@ -45,8 +45,7 @@ def make_board(config: BoardPoses) -> Any:
 def sheet_png(config: BoardPoses) -> bytes:
     """The board with its margin as a PNG file that says how large it is; squares have a whole number of pixels.
 
-    Raises:
-        ConfigError: a board that cannot be, or too large to be drawn.
+    Raises ConfigError: a board that cannot be, or too large to be drawn.
     """
     square_px = max(8, round(config.square_m * PIXELS_A_METRE))
     a_metre = square_px / config.square_m

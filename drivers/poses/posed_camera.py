@@ -122,8 +122,7 @@ class PosedCamera:
     def __iter__(self) -> Iterator[PosedFrame]:
         """Frames in the order of capture.
 
-        Raises:
-            CameraError: the camera is gone, or it cannot have poses from this source.
+        Raises CameraError: the camera is gone, or it cannot have poses from this source.
         """
         for image in self._camera:
             estimate = self._checked_pose(image)

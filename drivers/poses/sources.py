@@ -31,8 +31,7 @@ from semantic_mapper.errors import CameraError, ConfigError
 def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseConfig:
     """Plain data -> checked settings of one ``kind`` (of ``KINDS``); opens nothing.
 
-    Raises:
-        ConfigError: no such kind, an unknown or bad setting, or a matrix that is no rigid transform.
+    Raises ConfigError: no such kind, an unknown or bad setting, or a matrix that is no rigid transform.
     """
     kind = config.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:

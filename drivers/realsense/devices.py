@@ -51,8 +51,7 @@ def list_devices() -> list[FoundCamera]:
 def find_device(serial: str, search_s: float) -> Any:
     """The SDK's ``device`` of a serial number, looked for until it is there; empty for the only one that is connected.
 
-    Raises:
-        CameraError: there is no device, or several where one should be; and how to fix it.
+    Raises CameraError: there is no device, or several where one should be; and how to fix it.
     """
     deadline = time.monotonic() + search_s
     while True:

@@ -28,14 +28,13 @@ LEAST_OVERLAP = 0.5  # of the width may be lost to rectification
 class StereoDepth:
     """Makes rectified images, at most ``width`` pixels wide, and depth of pairs.
 
+    Raises ConfigError: the cameras are not side by side, or look apart, or the depths are out of reach.
+
     Attributes:
         intrinsics: Of the rectified left camera.
         T_left_rectified: (4, 4) from it to the left camera: a turn by a degree or so, which makes the image planes one.
         baseline_m: Between the cameras.
         disparities: How many are searched.
-
-    Raises:
-        ConfigError: the cameras are not side by side, or look apart, or the depths are out of reach.
     """
 
     def __init__(self, pair: StereoCalibration, width: int, min_depth_m: float, max_depth_m: float) -> None:

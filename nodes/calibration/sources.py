@@ -54,9 +54,8 @@ class Source:
 def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
     """Sources as ``[NAME=]PLACE``, see ``calibrate``; ``size`` as "WIDTHxHEIGHT" to ask of V4L2 cameras, or empty.
 
-    Raises:
-        ConfigError: not a place, no name for a camera, or two cameras of one name.
-        CameraError, DependencyError: a camera that cannot be opened.
+    Raises ConfigError: not a place, no name for a camera, or two cameras of one name. CameraError, DependencyError: a
+    camera that cannot be opened.
     """
     named = [_split(text, alone=len(texts) == 1) for text in texts]
     stems = sorted({file.stem for _, place in named if Path(place).is_dir() for file in _pictures(Path(place))})
@@ -180,8 +179,7 @@ class Gathering:
     def run(self, sources: Sequence[Source], stop: StopRequest, seconds: float, *, rig: bool) -> None:
         """Take in all images; of live cameras, until there is enough of them, the time is over, or a stop request.
 
-        Raises:
-            CameraError, LogError: a source fails.
+        Raises CameraError, LogError: a source fails.
         """
         for source in sources:
             if not source.live:

@@ -18,8 +18,7 @@ REMIND_S = 2.0  # how often the end is said again meanwhile
 def wait_for_listeners(context: NodeContext, publisher: Publisher, acks: LosslessSubscriber | None = None) -> bool:
     """Wait until all others are there, in slices: False where a stop request came first.
 
-    Raises:
-        TransportError: too few within the time.
+    Raises TransportError: too few within the time.
     """
     deadline = time.monotonic() + START_S
     while not context.stop:

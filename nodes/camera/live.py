@@ -77,8 +77,7 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
 def check_world(name: str, live: LiveCamera) -> None:
     """A camera without depth that tracks itself must not come back: it could not be found in the map again.
 
-    Raises:
-        ConfigError: it is to be restarted.
+    Raises ConfigError: it is to be restarted.
     """
     config, where = table_of(live.poses, "camera.poses")
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
@@ -94,8 +93,7 @@ def check_world(name: str, live: LiveCamera) -> None:
 def make_source(live: LiveCamera) -> PosedCamera:
     """The camera with its poses, not open yet.
 
-    Raises:
-        ConfigError, CameraError, DependencyError: see ``run_live_camera``.
+    Raises ConfigError, CameraError, DependencyError: see ``run_live_camera``.
     """
     config, where = table_of(live.config, "camera.config")
     return with_poses(open_camera(live.kind, config, live.id, where), live, config)
@@ -104,8 +102,7 @@ def make_source(live: LiveCamera) -> PosedCamera:
 def with_poses(camera: Camera, live: LiveCamera, driver: dict[str, Any]) -> PosedCamera:
     """A camera whose frames get their poses from the source that a config names; its ``checks`` say what is refused.
 
-    Raises:
-        ConfigError, CameraError: see ``run_live_camera``.
+    Raises ConfigError, CameraError: see ``run_live_camera``.
     """
     config = dict(table_of(live.poses, "camera.poses")[0])
     checks = convert_config(config.pop("checks", {}), PoseChecks, "poses: checks")
@@ -149,8 +146,7 @@ class _LiveNode:
     def open(self, live: LiveCamera, stack: ExitStack) -> PosedCamera | None:
         """An open source, which ``stack`` closes; None where a stop request came first.
 
-        Raises:
-            CameraError: it could not be opened within ``live.open_s``.
+        Raises CameraError: it could not be opened within ``live.open_s``.
         """
         began, pause_s = time.monotonic(), FIRST_PAUSE_S
         while not self._context.stop:
@@ -176,9 +172,8 @@ class _LiveNode:
     def publish_all(self, source: PosedCamera) -> None:
         """Publish frames to the end of the source, or until a stop request, and the end of the stream.
 
-        Raises:
-            CameraError: the camera has failed.
-            TransportError: a reader that must not lose any has taken no frame for ``ack_timeout_s``.
+        Raises CameraError: the camera has failed. TransportError: a reader that must not lose any has taken no frame
+        for ``ack_timeout_s``.
         """
         context, publisher = self._context, self._publisher
         publisher.publish(encode(source.info, sender=context.name))

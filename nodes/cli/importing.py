@@ -67,11 +67,7 @@ class SourceOptions(Options, frozen=True):
         return self != type(self)()
 
     def film_options(self) -> FilmOptions:
-        """As the import of films takes them.
-
-        Raises:
-            ConfigError: values that cannot be, or that exclude each other.
-        """
+        """As the import of films takes them. Raises ConfigError: values that cannot be, or that exclude each other."""
         if sum(map(bool, (self.scale, self.distance, self.square_mm, self.camera_height))) > 1:
             raise ConfigError("the scale comes from one source only: leave out all but one of the options that say it")
         hint = ScaleHint(

@@ -138,16 +138,14 @@ class SettingOptions:
     def given(self) -> dict[str, Any]:
         """What the command line says, by names of settings.
 
-        Raises:
-            ConfigError: ``--set`` is not of the form NAME=VALUE.
+        Raises ConfigError: ``--set`` is not of the form NAME=VALUE.
         """
         return self._named | parse_assignments(self._assigned)
 
     def table(self) -> dict[str, Any]:
         """File and command line together, as a TOML file would have them.
 
-        Raises:
-            ConfigError: a file that is no TOML, or ``given`` is not.
+        Raises ConfigError: a file that is no TOML, or ``given`` is not.
         """
         data = read_toml(self.path) if self.path else {}
         for name, value in self.given.items():
@@ -155,11 +153,7 @@ class SettingOptions:
         return data
 
     def convert(self, kind: type[ConfigT]) -> ConfigT:
-        """The settings.
-
-        Raises:
-            ConfigError: one that is not valid.
-        """
+        """The settings. Raises ConfigError: one that is not valid."""
         return convert_config(self.table(), kind, str(self.path or "command line"))
 
 
@@ -174,11 +168,7 @@ class MapperSettings(SettingOptions):
     }
 
     def load(self, defaults: Mapping[str, Any] | None = None) -> MapperConfig:
-        """The config; see ``load_mapper_config``.
-
-        Raises:
-            ConfigError: a setting that is not valid.
-        """
+        """The config; see ``load_mapper_config``. Raises ConfigError: a setting that is not valid."""
         return load_mapper_config(self.path, self.given, defaults)
 
 
@@ -189,11 +179,7 @@ class Remote(Options, frozen=True):
     keys: Path | None = None  # --server: folder of the keys, in place of this user's
 
     def identity(self) -> ServerIdentity | None:
-        """Whom to expect at the other end; None where no server is named.
-
-        Raises:
-            TransportError: no keys.
-        """
+        """Whom to expect at the other end; None where no server is named. Raises TransportError: no keys."""
         from semantic_mapper.transport.keys import ServerIdentity, load_keys, user_key_folder
 
         if not self.server:
@@ -322,8 +308,7 @@ def results_file(out: Path | None) -> Path | None:
 def must_be_there(*paths: Path) -> None:
     """Refuse what is missing, or neither a file nor a folder, before the packages that read it are loaded.
 
-    Raises:
-        LogError: one of them is.
+    Raises LogError: one of them is.
     """
     for path in paths:
         if not path.is_file() and not path.is_dir():

@@ -36,15 +36,14 @@ _PATIENT = {"RAY_raylet_start_wait_time_s": "240", "RAY_agent_register_timeout_m
 def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool = False) -> Iterator[None]:
     """Connect this process to a Ray cluster, for the length of the context.
 
+    Raises DependencyError: the extra ``fleet`` is not installed. FleetError: the cluster cannot be started, is not
+    there, or is not safe.
+
     Args:
         address: None starts a cluster on this machine that ends with the context. ``HOST:PORT`` joins one that runs; a
             node of it must run on this machine (``ray start --address=HOST:PORT --num-cpus=0``).
         cpus: Of the cluster of this machine; None = all that this process may use.
         worker_logs: Show on stderr what tasks print.
-
-    Raises:
-        DependencyError: the extra ``fleet`` is not installed.
-        FleetError: the cluster cannot be started, is not there, or is not safe.
     """
     try:
         import ray

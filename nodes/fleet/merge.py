@@ -93,6 +93,8 @@ def merge_maps(
 def find_maps(arguments: Sequence[str]) -> dict[str, str]:
     """Paths and URLs of the maps that are meant.
 
+    Raises ConfigError: fewer than two maps, or no such file. StoreError: a store cannot be reached.
+
     Args:
         arguments: Paths or URLs of map files, of folders with a ``map.npz``, or of stores: the latest replay of each
             of its logs.
@@ -100,10 +102,6 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
     Returns:
         By the name of the file, of the folder of a ``map.npz``, or of the log that it was made of; by the path or URL
         itself where two have the same name.
-
-    Raises:
-        ConfigError: fewer than two maps, or no such file.
-        StoreError: a store cannot be reached.
     """
     found: list[tuple[str, str]] = []
     for argument in arguments:
@@ -128,12 +126,10 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
 def read_poses(path: Path) -> dict[str, Float64]:
     """T_world_map (4, 4) float64 by the names of maps.
 
+    Raises ConfigError: the file cannot be read, or holds something else. PoseError: a matrix is no rigid transform.
+
     Args:
         path: JSON, an object whose values are 4 rows of 4 numbers (T_world_map) or [x, y, z, yaw_deg], yaw about +z.
-
-    Raises:
-        ConfigError: the file cannot be read, or holds something else.
-        PoseError: a matrix is no rigid transform.
     """
     poses: dict[str, Float64] = {}
     for name, values in read_json(path, dict[str, list[Any]]).items():
@@ -149,11 +145,7 @@ def read_poses(path: Path) -> dict[str, Float64]:
 
 
 def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
-    """With the settings of the first map and room for all.
-
-    Raises:
-        MapError: two maps are the same.
-    """
+    """With the settings of the first map and room for all. Raises MapError: two maps are the same."""
     seen: dict[bytes, str] = {}
     for name, manifest in manifests.items():
         chunks = msgspec.json.encode(manifest.chunks)

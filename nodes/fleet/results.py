@@ -78,11 +78,10 @@ class Tables:
     def query(self, text: str) -> Rows:
         """The rows that a query selects; it can read and write nothing but these tables.
 
+        Raises ConfigError: DuckDB refuses it, in its words.
+
         Args:
             text: A statement of SQL in DuckDB's dialect, or names of columns of ``logs``, such as ``log, miou``.
-
-        Raises:
-            ConfigError: DuckDB refuses it, in its words.
         """
         try:
             found = self._database.execute(text if _SQL.match(text) else f"SELECT {text} FROM logs")
@@ -217,7 +216,9 @@ def compare_stores(
 ) -> FleetComparison:
     """Compare the latest results of the same logs, paired by the content of these.
 
-    Logs of A that failed in B, or are missing there, count as worse, also where B has no result at all.
+    Logs of A that failed in B, or are missing there, count as worse, also where B has no result at all. Raises
+    ConfigError: there is nothing to compare: no such operation or metric, or B has results of other logs only.
+    StoreError: a store cannot be reached.
 
     Args:
         store_a: With the results before.
@@ -227,10 +228,6 @@ def compare_stores(
         threshold: B is worse where the interval of its mean lies below minus this, in units of the metric.
         log_threshold: A log is worse where it is sure to have lost more than this.
         lower_is_better: None = as is known of the metric.
-
-    Raises:
-        ConfigError: there is nothing to compare: no such operation or metric, or B has results of other logs only.
-        StoreError: a store cannot be reached.
     """
     results = list(store_a.results())
     operations = sorted({result.operation for result in results})

@@ -170,6 +170,8 @@ def run_fleet(
 ) -> RunReport:
     """Go through all logs, on the cluster that this process is connected with.
 
+    Raises FleetError: no node has the resources, or a worker has other code. StoreError: the store cannot be reached.
+
     Args:
         task: What to do with each log.
         inputs: The logs.
@@ -177,10 +179,6 @@ def run_fleet(
         stopped: Looked at often; once it is true, tasks that run are ended and the run is over.
         on_progress: Called after each log.
         function: What a worker does with a log; None = ``run_task``.
-
-    Raises:
-        FleetError: no node has the resources, or a worker has other code.
-        StoreError: the store cannot be reached.
     """
     import ray
 

@@ -306,15 +306,12 @@ def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
     A glob stands for the files that it matches (``site/*.mcap``) or, with a slash at its end, for folders
     (``site/*/``); a folder is the parts of one recording, as for ``replay``. A manifest is CSV with a column ``log``
     (relative paths count from the manifest) and any others, which become tags. Whether a log can be read is found out
-    by its task.
+    by its task. Raises ConfigError: a glob matches nothing, a path is missing, a manifest cannot be used, or there is
+    no log at all. StoreError: something cannot be reached.
 
     Args:
         arguments: Paths and URLs.
         suffix: Of files, such as ".mcap".
-
-    Raises:
-        ConfigError: a glob matches nothing, a path is missing, a manifest cannot be used, or there is no log at all.
-        StoreError: something cannot be reached.
     """
     found: dict[str, LogInput] = {}
     for argument in arguments:

@@ -79,11 +79,10 @@ class _Camera:
 class FoxgloveServer:
     """Serves Foxglove; a context manager. Frames and status come from one thread, map and graph from another.
 
+    Raises TransportError: the port is taken.
+
     Args:
         port: Of 127.0.0.1; 0 = any that is free.
-
-    Raises:
-        TransportError: the port is taken.
     """
 
     def __init__(self, port: int) -> None:

@@ -103,8 +103,7 @@ def launch_files() -> dict[str, Path]:
 def find_launch(path: Path) -> Path:
     """The launch file that ``path`` names, else that of the package which is called so ("replay" or "replay.toml").
 
-    Raises:
-        ConfigError: neither is there; lists those of the package.
+    Raises ConfigError: neither is there; lists those of the package.
     """
     if path.exists() and not path.is_dir():
         return path
@@ -119,13 +118,12 @@ def find_launch(path: Path) -> Path:
 def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = None) -> Launch:
     """Read and check a launch file.
 
+    Raises ConfigError: unknown key, name or node (with the nearest valid one), a missing value, or one of a wrong type.
+
     Args:
         path: Of the file.
         settings: "NODE.OPTION=VALUE" or "SETTING=VALUE", see ``_Overrides``.
         out: The same as "out=DIR".
-
-    Raises:
-        ConfigError: unknown key, name or node (with the nearest valid one), a missing value, or one of a wrong type.
     """
     file = load_config(path, LaunchFile)
     names = [n.name for n in file.node]
@@ -168,8 +166,7 @@ class _Overrides:
     def apply(self, name: str, text: str) -> None:
         """Replace a value.
 
-        Raises:
-            ConfigError: nothing is called so; or it belongs into a table that is named as a file.
+        Raises ConfigError: nothing is called so; or it belongs into a table that is named as a file.
         """
         first, *keys = name.split(".")
         node = self._nodes.get(first)
@@ -297,8 +294,7 @@ def _convert_options(node: NodeEntry, keys: str, path: Path) -> NodeOptions:
 def _check_camera(camera: dict[str, Any], node: str) -> None:
     """Say at once, before a mapper has started, what the camera's own process would refuse much later.
 
-    Raises:
-        ValueError: no such kind of camera or of poses, or no poses at all.
+    Raises ValueError: no such kind of camera or of poses, or no poses at all.
     """
     kind, poses = str(camera.get("kind") or ""), camera.get("poses")
     if kind not in CAMERA_KINDS:
@@ -322,10 +318,9 @@ def _check_camera(camera: dict[str, Any], node: str) -> None:
 def _check_launch(launch: Launch) -> None:
     """Whether the nodes fit together.
 
-    Raises:
-        ValueError: a node listens to what is not there, or to what is of another kind; there is no camera; two cameras
-            of one name, or two endpoints; or a node is to be restarted while a camera waits for others: frames that
-            wait for their readers have a result, which a restart would spoil.
+    Raises ValueError: a node listens to what is not there, or to what is of another kind; there is no camera; two
+    cameras of one name, or two endpoints; or a node is to be restarted while a camera waits for others: frames that
+    wait for their readers have a result, which a restart would spoil.
     """
     options = launch.options
     cameras = {name: own for name, own in options.items() if isinstance(own, CameraOptions)}

@@ -127,9 +127,8 @@ class Launcher:
     def run(self, stop: StopRequest) -> None:
         """Watch until all nodes have ended, one has failed for good, or a stop is requested; then end all in order.
 
-        Raises:
-            NodeError: a node failed, hung, had to be killed, or says at its end what it has lost; names it and its
-                last words.
+        Raises NodeError: a node failed, hung, had to be killed, or says at its end what it has lost; names it and its
+        last words.
         """
         # When no camera runs, the others have the end of the stream and end by themselves.
         while not stop and not self._failures() and any(p.runs for p in self._processes if p.kind == "camera"):
@@ -214,11 +213,9 @@ class LaunchStatus:
     """Publishes a ``Status`` of each node, and one of the launch itself.
 
     Counters and ages of a node's own status are passed on (a player of logs has none: its launcher counts ``published``
-    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms`` and ``fds``, and the ages ``start``
-    (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
-
-    Raises:
-        TransportError: the endpoint cannot be bound.
+    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms`` and ``fds``, and the ages ``start`` (of the
+    process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status). Raises
+    TransportError: the endpoint cannot be bound.
     """
 
     def __init__(self, stack: ExitStack, endpoints: Mapping[str, str], launch: Launch) -> None:

@@ -78,13 +78,12 @@ class RestartBackoff:
 class NodeProcess:
     """A running node, in an interpreter of its own. Its stderr is passed on line by line, marked with its name.
 
+    Raises OSError, RuntimeError: no process, thread, file or memory is to be had; nothing is left behind.
+
     Args:
         kind: A row of the process table.
         job: What it is to do (``heartbeat_fd`` is filled in here).
         heartbeat_s: Of the launch file.
-
-    Raises:
-        OSError, RuntimeError: no process, thread, file or memory is to be had; nothing is left behind.
     """
 
     def __init__(self, kind: str, job: NodeJob, heartbeat_s: float = BUSY_SILENCE_S) -> None:

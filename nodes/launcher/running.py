@@ -64,11 +64,7 @@ def leave_launch_note(launch: Launch, folder: Path) -> None:
 
 
 def read_launch_note(folder: Path) -> LaunchNote:
-    """Of a launch that runs.
-
-    Raises:
-        TransportError: there is no launch, or it cannot be understood.
-    """
+    """Of a launch that runs. Raises TransportError: there is no launch, or it cannot be understood."""
     try:
         return msgspec.json.decode(read_regular(folder / NOTE, MAX_FILE_BYTES), type=LaunchNote)
     except (OSError, msgspec.DecodeError) as error:
@@ -93,8 +89,7 @@ def running_launches() -> list[Path]:
 def launch_folder(place: str) -> Path:
     """The socket folder of a running launch; an empty place stands for the one launch that runs.
 
-    Raises:
-        TransportError: none runs, several do, or the folder is not that of a launch.
+    Raises TransportError: none runs, several do, or the folder is not that of a launch.
     """
     if place:
         if not (Path(place) / STATUS_SOCKET).exists():
@@ -111,8 +106,7 @@ def launch_folder(place: str) -> Path:
 def socket_in_launch(place: str, name: str) -> str:
     """The endpoint ``name`` of a running launch, which is named as for ``launch_folder``; endpoints stay as they are.
 
-    Raises:
-        TransportError: as of ``launch_folder``.
+    Raises TransportError: as of ``launch_folder``.
     """
     return place if "://" in place else f"ipc://{launch_folder(place)}/{name}"
 
@@ -120,11 +114,10 @@ def socket_in_launch(place: str, name: str) -> str:
 def map_endpoint(place: str) -> str:
     """Where the mapper answers that a person means by a place; empty for anything else, such as a saved map.
 
+    Raises TransportError: there is no such socket, no launch runs, or several do.
+
     Args:
         place: An endpoint, ``live`` for the one launch that runs, or the socket folder of a launch.
-
-    Raises:
-        TransportError: there is no such socket, no launch runs, or several do.
     """
     if place == LIVE or (Path(place) / STATUS_SOCKET).exists():
         place = socket_in_launch("" if place == LIVE else place, QUERY_SOCKET)
@@ -140,8 +133,7 @@ def map_endpoint(place: str) -> str:
 def node_endpoints(folder: Path) -> dict[str, str]:
     """Where the nodes of a running launch that have not ended publish, by name, as soon as all have said that they run.
 
-    Raises:
-        TransportError: the launcher says nothing, or not all nodes have come to run in time.
+    Raises TransportError: the launcher says nothing, or not all nodes have come to run in time.
     """
     known: dict[str, Status] = {}
     deadline = time.monotonic() + START_S

@@ -112,11 +112,9 @@ def resume_map(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
     """In a restarted mapper, make the empty ``voxel_map`` the one that its forerunner has saved in this launch at
     ``path``; a sentence that says what became of that, empty where the mapper was not restarted.
 
-    Poses are of the same session as before, so a saved map continues as if the frames after it had not come.
-    A saved map that cannot be gone on with is put aside, so that nothing is written over it.
-
-    Raises:
-        OSError: notes cannot be written, or a map cannot be put aside.
+    Poses are of the same session as before, so a saved map continues as if the frames after it had not come. A saved
+    map that cannot be gone on with is put aside, so that nothing is written over it. Raises OSError: notes cannot be
+    written, or a map cannot be put aside.
     """
     if not context.restarts:
         context.leave_note(_EARLIER, _identity(path))

@@ -63,9 +63,8 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
     """Record until the stream ends or somebody asks to stop, or ``follow``, called some twenty times a second, says
     True.
 
-    Raises:
-        LogError: the log cannot be begun, or somebody has removed it meanwhile.
-        TransportError: a source cannot be subscribed to.
+    Raises LogError: the log cannot be begun, or somebody has removed it meanwhile. TransportError: a source cannot be
+    subscribed to.
     """
     topics = tuple(dict.fromkeys(("info", *options.topics, "end")))
     cameras = [context.endpoint(name) for name in options.cameras]

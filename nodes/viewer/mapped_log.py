@@ -29,10 +29,8 @@ def show_log(
 ) -> None:
     """Map a log, at most ``frames`` of it (0 = all), and show it meanwhile, its map every ``refresh_s`` and at the end.
 
-    ``begin`` is called once log and weights are open; it goes on while ``going()``.
-
-    Raises:
-        LogError, WeightsError, ConfigError, MapError: it cannot be mapped.
+    ``begin`` is called once log and weights are open; it goes on while ``going()``. Raises LogError, WeightsError,
+    ConfigError, MapError: it cannot be mapped.
     """
     bundle = Mapper.load(weights, config)
     pipeline = bundle.pipeline

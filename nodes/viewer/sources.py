@@ -81,11 +81,7 @@ class MapShow:
 
 
 def show_saved(path: Path, begin: Begin) -> None:
-    """Show a saved map; its ages are not known.
-
-    Raises:
-        MapError: it cannot be read.
-    """
+    """Show a saved map; its ages are not known. Raises MapError: it cannot be read."""
     voxel_map = VoxelMap.load(path)
     log = RerunLog(begin(), voxel_map.label_set, voxel_map.config.voxel_size_m)
     log.note_scale(voxel_map.scale_known)

@@ -158,9 +158,7 @@ class PanopticTruth:
     def score(self, voxel_map: VoxelMap) -> Mapping[str, Any]:
         """The figures of ``SegmentationMetrics`` and of ``PanopticMetrics``, whose classes are ``pq_per_class``.
 
-        Raises:
-            LabelError: no frame was added.
-            MapError: lengths of the map are not metres.
+        Raises LabelError: no frame was added. MapError: lengths of the map are not metres.
         """
         views = self._known_views()
         things = ThingSurface(voxel_map)

@@ -27,11 +27,7 @@ class TruthMapper:
         self.shared = tuple(n for n in stream.names if n in target.names)
 
     def to_map_ids(self, label: UInt8, where: str) -> UInt8:
-        """Label image in ids of the map.
-
-        Raises:
-            LabelError: an id that the stream's own label set does not know.
-        """
+        """Label image in ids of the map. Raises LabelError: an id that the stream's own label set does not know."""
         self._stream.to_channels(label, where)
         return self._table[label]
 

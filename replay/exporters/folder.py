@@ -45,11 +45,7 @@ class FolderExporter:
         self._camera = _OneCamera(info.scale_known)
 
     def add(self, item: ExportFrame) -> None:
-        """Write one frame.
-
-        Raises:
-            LeftOut: its stamp does not rise, or its camera has changed.
-        """
+        """Write one frame. Raises LeftOut: its stamp does not rise, or its camera has changed."""
         frame = item.frame
         if self._stamps and frame.stamp_ns <= self._stamps[-1]:
             raise LeftOut("it is not later than the frame before it, which the layout needs")
@@ -120,11 +116,7 @@ class TumExporter:
         self._camera = _OneCamera()
 
     def add(self, item: ExportFrame) -> None:
-        """Write one frame.
-
-        Raises:
-            LeftOut: there is a frame of that time already, or its camera has changed.
-        """
+        """Write one frame. Raises LeftOut: there is a frame of that time already, or its camera has changed."""
         frame = item.frame
         self._camera.check(frame)
         self._trajectory.add(item)
@@ -169,11 +161,7 @@ class TrajectoryExporter:
         self._about = () if scale_known else (f"# {SCALE_KEY}: {SCALE_UNKNOWN}",)
 
     def add(self, item: ExportFrame) -> None:
-        """Take the pose of one frame.
-
-        Raises:
-            LeftOut: there is a frame of that time already.
-        """
+        """Take the pose of one frame. Raises LeftOut: there is a frame of that time already."""
         frame = item.frame
         if frame.stamp_ns in self._lines:
             raise LeftOut("there is a frame of the same time already")

@@ -82,11 +82,7 @@ class ExportReport:
 
 
 def format_of(path: Path, given: str | None) -> Format:
-    """The format of a file to write.
-
-    Raises:
-        ConfigError: nothing is given, and the name does not tell.
-    """
+    """The format of a file to write. Raises ConfigError: nothing is given, and the name does not tell."""
     for name in get_args(Format):
         if given == name:
             return name
@@ -101,9 +97,7 @@ def format_of(path: Path, given: str | None) -> Format:
 def parse_transform(text: str) -> Float64:
     """``"x y z yaw_deg"``, or the name of a text file that holds a rigid (4, 4) row by row.
 
-    Raises:
-        ConfigError: neither of these.
-        PoseError: the file holds something else than a rigid transform.
+    Raises ConfigError: neither of these. PoseError: the file holds something else than a rigid transform.
     """
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]
@@ -128,11 +122,7 @@ def _read_transform(path: Path) -> Float64:
 
 
 def parse_up(text: str) -> Float64 | None:
-    """``auto`` (None), an axis of the world (x, -y, ...), or three numbers.
-
-    Raises:
-        ConfigError: none of these.
-    """
+    """``auto`` (None), an axis of the world (x, -y, ...), or three numbers. Raises ConfigError: none of these."""
     if text == "auto":
         return None
     if text in AXES:
@@ -149,10 +139,8 @@ def parse_up(text: str) -> Float64 | None:
 def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
     """Write a map to ``path``, and what belongs to it next to it.
 
-    Raises:
-        ConfigError: an option that the format cannot honour.
-        MapError: nothing to write, a floor plan of a map without metres, impossible numbers, or the file cannot be
-            written.
+    Raises ConfigError: an option that the format cannot honour. MapError: nothing to write, a floor plan of a map
+    without metres, impossible numbers, or the file cannot be written.
     """
     for option in ("color", "up", "height", "resolution", "floor", "costs"):
         if getattr(request, option) is not None and option not in _TAKES[request.format]:
@@ -226,8 +214,7 @@ def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
 def read_costs(path: Path, label_set: LabelSet) -> NDArray[np.int64]:
     """Cost (256,) of each class id, -1 where a TOML file of lines ``CLASS = COST`` has none; ``unknown`` is one, too.
 
-    Raises:
-        ConfigError: no such file, no TOML, no class of the map, or no cost.
+    Raises ConfigError: no such file, no TOML, no class of the map, or no cost.
     """
     ids = dict(zip((*label_set.names, "unknown"), (*label_set.ids, label_set.ignore_id), strict=True))
     costs = np.full(256, -1, np.int64)

@@ -71,11 +71,7 @@ _MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 
 def recording_file(path: Path) -> rr.RecordingStream:
-    """A recording that is written to a file; open it with ``rerun FILE``.
-
-    Raises:
-        LogError: the file cannot be made.
-    """
+    """A recording that is written to a file; open it with ``rerun FILE``. Raises LogError: the file cannot be made."""
     stream = rr.RecordingStream(APPLICATION)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -240,8 +236,7 @@ class RerunLog:
     def close(self) -> None:
         """End the recording once all of it is written or sent. Harmless when repeated.
 
-        Raises:
-            LogError: not all of it could be.
+        Raises LogError: not all of it could be.
         """
         try:
             self._stream.flush(timeout_sec=FLUSH_S)

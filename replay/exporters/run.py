@@ -44,8 +44,7 @@ class LogExportReport(NamedTuple):
 def log_format_of(path: Path, given: str | None) -> LogFormat:
     """The format of a file or folder to write.
 
-    Raises:
-        ConfigError: nothing is given, and the name does not tell; or it is a format for maps.
+    Raises ConfigError: nothing is given, and the name does not tell; or it is a format for maps.
     """
     for name in FORMATS:
         if given == name:

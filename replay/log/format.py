@@ -35,8 +35,7 @@ from semantic_mapper.types import PosedFrame
 class AtomicFile:
     """A new file, open for writing. ``write`` collects in memory, ``commit`` brings all of it to the file or nothing.
 
-    Raises:
-        OSError: it exists and may not be replaced, or cannot be made.
+    Raises OSError: it exists and may not be replaced, or cannot be made.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
@@ -62,8 +61,7 @@ class AtomicFile:
     def commit(self) -> None:
         """Bring what was collected to the file.
 
-        Raises:
-            OSError: not all of it could be written; the file is as it was, and what was collected is dropped.
+        Raises OSError: not all of it could be written; the file is as it was, and what was collected is dropped.
         """
         data, self._pending = memoryview(self._pending), bytearray()
         written = 0
@@ -78,11 +76,7 @@ class AtomicFile:
         self.size += written
 
     def sync(self) -> None:
-        """Wait until the disk has it.
-
-        Raises:
-            OSError: it cannot.
-        """
+        """Wait until the disk has it. Raises OSError: it cannot."""
         os.fsync(self._fd)
 
     def close(self) -> None:
@@ -99,6 +93,8 @@ _DEFAULTS = CodecOptions()
 class LogWriter:
     """Writes a log. A context manager; not for several threads at once.
 
+    Raises LogError: the file exists, or cannot be written; then no file is left.
+
     Args:
         path: Of the new file.
         info: What the stream is.
@@ -108,9 +104,6 @@ class LogWriter:
 
     Attributes:
         trouble: Why it takes nothing more; None where all is well.
-
-    Raises:
-        LogError: the file exists, or cannot be written; then no file is left.
     """
 
     def __init__(
@@ -159,8 +152,7 @@ class LogWriter:
     def flush(self) -> None:
         """Bring attachments to the file that no message has followed.
 
-        Raises:
-            LogError: the disk is full or gone; the log is as it was, and takes nothing more.
+        Raises LogError: the disk is full or gone; the log is as it was, and takes nothing more.
         """
         try:
             self._file.commit()
@@ -171,22 +163,19 @@ class LogWriter:
     def write_frame(self, frame: PosedFrame, *, encoded_rgb: EncodedImage | None = None) -> None:
         """Append one frame.
 
+        Raises CodecError: the frame cannot be packed; the log is as it was. LogError: the disk is full or gone.
+
         Args:
             frame: With a finite pose.
             encoded_rgb: A PNG or JPEG file that decodes to ``frame.rgb``, kept as it is.
-
-        Raises:
-            CodecError: the frame cannot be packed; the log is as it was.
-            LogError: the disk is full or gone.
         """
         self.write_parts(encode_frame(frame, self._options, encoded_rgb=encoded_rgb))
 
     def write_parts(self, parts: Parts) -> None:
         """Append one encoded message of any topic, as it came over the wire.
 
-        Raises:
-            CodecError: not a message of ours; the log is as it was.
-            LogError: the disk is full or gone; the log is as it was, and takes nothing more.
+        Raises CodecError: not a message of ours; the log is as it was. LogError: the disk is full or gone; the log is
+        as it was, and takes nothing more.
         """
         if self._failed:
             raise LogError(f"{self.path}: is closed to further messages since one could not be written")
@@ -211,10 +200,8 @@ class LogWriter:
     def close(self) -> None:
         """Write the index and close the file. Harmless when repeated.
 
-        Where there is no room for the index, the log ends without one: it is whole, and slower to search.
-
-        Raises:
-            LogError: the disk is full to the last byte, or gone; what was written can be read.
+        Where there is no room for the index, the log ends without one: it is whole, and slower to search. Raises
+        LogError: the disk is full to the last byte, or gone; what was written can be read.
         """
         if self._file.closed:
             return
@@ -295,12 +282,11 @@ def atomic_log(
 ) -> Iterator[LogWriter]:
     """A writer of the log ``path``, which gets its name as the last thing; after an error no log is left.
 
+    Raises LogError: ``path`` is there already, or cannot be written.
+
     Args:
         path, info, options, attachments: See ``LogWriter``.
         overwrite: Whether a log that is there may be replaced; it stays until then.
-
-    Raises:
-        LogError: ``path`` is there already, or cannot be written.
     """
     if path.exists() and not overwrite:
         raise LogError(f"{path}: exists already; remove it or choose another name")
@@ -339,8 +325,7 @@ class RecoverReport(NamedTuple):
 def recover(src: Path, dst: Path) -> RecoverReport:
     """Write every intact message of ``src`` to the new log ``dst``; ``src`` is not touched.
 
-    Raises:
-        LogError: ``src`` gives no frame at all, or ``dst`` exists or cannot be written; then there is no ``dst``.
+    Raises LogError: ``src`` gives no frame at all, or ``dst`` exists or cannot be written; then there is no ``dst``.
     """
     with (
         LogReader(src) as reader,

@@ -57,12 +57,11 @@ class Scan:
 def scan(fd: int, where: str) -> Scan:
     """Find the messages of a file that is open for reading; its position is not used.
 
+    Raises LogError: not an MCAP file.
+
     Args:
         fd: Of the file.
         where: Names the file in errors.
-
-    Raises:
-        LogError: not an MCAP file.
     """
     size = os.fstat(fd).st_size
     start = os.pread(fd, 16, 0)
@@ -129,13 +128,12 @@ def _walk(fd: int, size: int) -> Scan:
 def read_payloads(fd: int, offset: int, length: int, most: int | None = None) -> list[bytes]:
     """Data of the messages of one chunk, or of a message outside chunks.
 
+    Raises LogError: damaged, beyond the limits of a chunk, or the disk fails; says not where.
+
     Args:
         fd: Of the file.
         offset, length: Of the record.
         most: Only so many bytes of each message, without checking the chunk's checksum; None = all.
-
-    Raises:
-        LogError: damaged, beyond the limits of a chunk, or the disk fails; says not where.
     """
     try:
         head = os.pread(fd, _RECORD.size + _CHUNK.size, offset)

@@ -65,7 +65,9 @@ def play(
 ) -> PlayReport:
     """Publish a log: its ``StreamInfo``, its frames (the very bytes of the log), ``EndOfStream``.
 
-    A frame that cannot be read or decoded is passed over and stands in the report; the rest is played.
+    A frame that cannot be read or decoded is passed over and stands in the report; the rest is played. Raises
+    NodeError: lockstep, and the mapper has gone or does not answer. ``EndOfStream`` has been sent then too.
+    TransportError: no subscriber came, or one does not keep up.
 
     Args:
         log: To play.
@@ -74,10 +76,6 @@ def play(
         options: See ``PlayOptions``.
         stop: Ends the playing early when set.
         on_frame: Called with each frame sent, in lockstep once the mapper has answered it.
-
-    Raises:
-        NodeError: lockstep, and the mapper has gone or does not answer. ``EndOfStream`` has been sent then too.
-        TransportError: no subscriber came, or one does not keep up.
     """
     options, stop = options or PlayOptions(), stop or threading.Event()
     if options.mode == "lockstep" and acks is None:

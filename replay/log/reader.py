@@ -45,7 +45,8 @@ class LogReader:
     """A recorded log, open for reading. Iterate it as often as you like, also from several threads.
 
     A message that is damaged or cannot be decoded becomes a ``LogError`` in ``errors`` (each once) and goes to
-    ``on_error``; iteration goes on with the next. A message whose checksum is wrong is never used.
+    ``on_error``; iteration goes on with the next. A message whose checksum is wrong is never used. Raises LogError: no
+    such file, not an MCAP file, not a log of ours, or no frame in it.
 
     Args:
         path: Of the file; may be unfinished (its writer was killed) or cut off.
@@ -57,9 +58,6 @@ class LogReader:
         errors: Everything that had to be passed over so far.
         notices: Sentences for people ("the log was not closed ...").
         finished: False where the writer did not come to close the file.
-
-    Raises:
-        LogError: no such file, not an MCAP file, not a log of ours, or no frame in it.
     """
 
     def __init__(
@@ -116,11 +114,7 @@ class LogReader:
                 yield error
 
     def frame(self, number: int) -> PosedFrame:
-        """Frame ``number`` of ``len(self)``.
-
-        Raises:
-            LogError: it is damaged, or there is no such frame.
-        """
+        """Frame ``number`` of ``len(self)``. Raises LogError: it is damaged, or there is no such frame."""
         if not 0 <= number < len(self._frames):
             raise LogError(f"{self.path}: no frame {number}; the log holds {len(self._frames)}")
         entry = self._index[self._frames[number]]

@@ -52,6 +52,8 @@ def free_bytes(folder: Path) -> int:
 class Recording:
     """Writes messages to the parts of a recording.
 
+    Raises LogError: something is there already, or the first part cannot be written.
+
     Args:
         path: Of the first part; the folder has to be there.
         info: What the stream is; stands in each part, as ``attachments`` do.
@@ -70,9 +72,6 @@ class Recording:
         ended: Nothing will be written any more.
         gone: A part's file was removed by somebody else while it was written.
         trouble: Why nothing is written at the moment, for people; empty where all is well.
-
-    Raises:
-        LogError: something is there already, or the first part cannot be written.
     """
 
     def __init__(
@@ -140,8 +139,7 @@ class Recording:
     def write(self, parts: Parts) -> None:
         """Append one encoded message; where there is no room it is counted in ``lost``.
 
-        Raises:
-            CodecError: not a message of ours; the recording is as it was.
+        Raises CodecError: not a message of ours; the recording is as it was.
         """
         size = sum(len(part) for part in parts)
         if self.ended or self._clock() < self._retry_at or not self._make_room(size):
@@ -159,12 +157,11 @@ class Recording:
     def announce(self, info: Parts, attachment: LogAttachment) -> None:
         """Append what a further stream is; like the first one's it stands in each part that begins from now on.
 
+        Raises CodecError: not a message of ours; the recording is as it was.
+
         Args:
             info: The message.
             attachment: Takes the place of the one of its name.
-
-        Raises:
-            CodecError: not a message of ours; the recording is as it was.
         """
         self._others.append(info)  # first: where there is no room now, it stands in the next part
         self._attachments = (*(kept for kept in self._attachments if kept.name != attachment.name), attachment)
@@ -297,13 +294,12 @@ def _is_of(file: Path, recording: str) -> bool:
 def make_way(path: Path, *, overwrite: bool, dry: bool = False) -> None:
     """Make sure that no other recording is mixed with a new one.
 
+    Raises LogError: something is there, and must not be replaced.
+
     Args:
         path: Of its first part.
         overwrite: Delete what is there.
         dry: Delete nothing yet.
-
-    Raises:
-        LogError: something is there, and must not be replaced.
     """
     for file in parts_on_disk(path).values():  # parts also come of a recorder that was restarted
         if not overwrite:

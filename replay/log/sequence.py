@@ -35,8 +35,7 @@ class Part(msgspec.Struct, frozen=True):
 class LogSequence:
     """The parts of one recording (in any order), open for reading; gives what ``LogReader`` gives of one.
 
-    Raises:
-        LogError: a part cannot be opened, or they are no parts of one recording.
+    Raises LogError: a part cannot be opened, or they are no parts of one recording.
     """
 
     def __init__(
@@ -103,11 +102,7 @@ class LogSequence:
             count -= here
 
     def frame(self, number: int) -> PosedFrame:
-        """Frame ``number`` of ``len(self)``.
-
-        Raises:
-            LogError: it is damaged, or there is no such frame.
-        """
+        """Frame ``number`` of ``len(self)``. Raises LogError: it is damaged, or there is no such frame."""
         if not 0 <= number < len(self):
             raise LogError(f"{self.path}: no frame {number}; its {len(self.logs)} parts hold {len(self)}")
         at = bisect_right(self._ends, number)
@@ -149,13 +144,12 @@ def open_log(
 ) -> Log:
     """Open a log, or the parts of a recording as one.
 
+    Raises LogError: see ``LogReader`` and ``LogSequence``.
+
     Args:
         paths: A file (that log alone), several (the parts of one recording, in any order), or a folder: all logs in it.
         on_error: Called with each error as it is found.
         allow_empty: Open one without frames too.
-
-    Raises:
-        LogError: see ``LogReader`` and ``LogSequence``.
     """
     named = [Path(paths)] if isinstance(paths, str | Path) else list(paths)
     files = [file for path in named for file in (logs_in(path) if path.is_dir() else [path])]
@@ -174,11 +168,7 @@ def open_log(
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """The logs in a folder.
-
-    Raises:
-        LogError: there is no log.
-    """
+    """The logs in a folder. Raises LogError: there is no log."""
     files = sorted(folder.glob(f"*{SUFFIX}"))
     if not files:
         raise LogError(f"{folder}: cannot be read as a recording: the folder holds no log (*{SUFFIX})")
@@ -188,8 +178,7 @@ def logs_in(folder: Path) -> list[Path]:
 def read_part(log: LogReader) -> Part | None:
     """Which part of a recording a log is; None where it is whole by itself.
 
-    Raises:
-        LogError: it says so in a way that cannot be understood.
+    Raises LogError: it says so in a way that cannot be understood.
     """
     kept = log.attachments().get(PART_ATTACHMENT)
     if kept is None:

@@ -126,9 +126,7 @@ def require_colmap() -> None:
 def run_colmap(subject: Path, arguments: Sequence[Path], on_line: Callable[[str], None] = lambda _: None) -> None:
     """Run ``colmap_process``; ``on_line`` gets each line of its progress.
 
-    Raises:
-        ImportSourceError: it fails; says why, and names the subject.
-        DependencyError: pycolmap is not installed.
+    Raises ImportSourceError: it fails; says why, and names the subject. DependencyError: pycolmap is not installed.
     """
     require_colmap()
     command = [sys.executable, "-I", "-m", "semantic_mapper.replay.sfm.colmap_process", *map(str, arguments)]
@@ -191,9 +189,8 @@ def find_models(folder: Path) -> list[Path]:
 def read_model(folder: Path) -> ColmapModel:
     """Read the model in a folder, text or binary.
 
-    Raises:
-        ImportSourceError: a file is missing or damaged, or no image has a camera with a lens of OpenCV's models.
-        DependencyError: pycolmap is not installed.
+    Raises ImportSourceError: a file is missing or damaged, or no image has a camera with a lens of OpenCV's models.
+    DependencyError: pycolmap is not installed.
     """
     with tempfile.TemporaryDirectory(prefix="semantic-mapper-colmap-") as scratch:
         file = Path(scratch) / "model.npz"
@@ -226,8 +223,7 @@ def read_model(folder: Path) -> ColmapModel:
 def intrinsics_of(model: str, width: int, height: int, params: list[float], where: str) -> CameraIntrinsics:
     """A camera of COLMAP's as OpenCV's model.
 
-    Raises:
-        ImportSourceError: a lens that neither OpenCV's pinhole nor its fisheye model has, or impossible values.
+    Raises ImportSourceError: a lens that neither OpenCV's pinhole nor its fisheye model has, or impossible values.
     """
     one_focal = model.startswith(("SIMPLE", "RADIAL", "BROWN"))
     fx, fy, cx, cy, *lens = (params[0], *params) if one_focal else (*params, *[0.0] * (4 - len(params)))

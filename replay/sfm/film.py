@@ -44,7 +44,8 @@ class FilmFrame:
 class Film:
     """A film, or a folder of pictures by the numbers in their names; may be read several times, with the same result.
 
-    Frames are turned clockwise by ``quarters``, on top of what the film's own rotation mark says.
+    Frames are turned clockwise by ``quarters``, on top of what the film's own rotation mark says. Raises
+    ImportSourceError: missing, no film that OpenCV can decode, or no pictures.
 
     Attributes:
         width, height: Of the frames as they are given, in pixels.
@@ -53,9 +54,6 @@ class Film:
         focal_px: Focal length by the picture's EXIF data, for the given size; None where nothing tells it.
         unread: Of a film that was read to its end: announced frames that cannot be decoded, or are not there.
         odd_pictures: Of a folder: pictures that cannot be read or have another size, with the reason.
-
-    Raises:
-        ImportSourceError: missing, no film that OpenCV can decode, or no pictures.
     """
 
     def __init__(self, path: Path, quarters: int = 0) -> None:

@@ -103,8 +103,7 @@ def place_by_gps(T_model_camera: Float64, positions: Sequence[GpsPosition | None
     """The similarity that takes a model of poses (N, 4, 4) to where its pictures say they are; single wrong positions
     do not count. None where no picture has one.
 
-    Raises:
-        ImportSourceError: too few have one, they lie on a line, or they contradict the pictures.
+    Raises ImportSourceError: too few have one, they lie on a line, or they contradict the pictures.
     """
     rows = [n for n, position in enumerate(positions) if position is not None]
     known = [position for position in positions if position is not None]

@@ -275,8 +275,7 @@ class _Import:
     def _map(self, picked: list[int]) -> tuple[colmap.ColmapModel, float]:
         """The largest model of the best attempt, and its mean reprojection error.
 
-        Raises:
-            ImportSourceError: see ``refusals``.
+        Raises ImportSourceError: see ``refusals``.
         """
 
         def progress(line: str) -> None:

@@ -173,8 +173,7 @@ class BoardScale:
     def metres_per_unit(self, poses: Mapping[int, Float64], intrinsics: CameraIntrinsics) -> tuple[float, str]:
         """Scale by frames with poses T_world_camera, and a sentence on how it was found.
 
-        Raises:
-            ImportSourceError: the board was not seen from two sides by frames that have a pose.
+        Raises ImportSourceError: the board was not seen from two sides by frames that have a pose.
         """
         rays: dict[tuple[float, ...], list[tuple[Float64, Float64]]] = {}
         frames = 0
@@ -202,13 +201,12 @@ def marked_place(
 ) -> Float64:
     """Where in the world (3,) what a mark shows is: it is followed into the frames around, and triangulated.
 
+    Raises ImportSourceError: it cannot be followed.
+
     Args:
         marked: Index of the frame that it is a pixel of; one without a pose will do.
         pictures: (H, W) gray pictures of this frame and of registered frames around it, by their index.
         poses: T_world_camera (4, 4) of registered frames, by their index.
-
-    Raises:
-        ImportSourceError: it cannot be followed.
     """
     order = sorted(pictures)
     at = order.index(marked)

@@ -81,8 +81,7 @@ def room_scenes(rooms: int, view: CameraIntrinsics = VIEW) -> list[BenchScene]:
 def log_scenes(path: Path, count: int, step: int = 5) -> list[BenchScene]:
     """Scenes spread over a labelled log: a frame from the 8 round it, ``step`` frames apart.
 
-    Raises:
-        LabelError: the log has no labels. LogError: it has too few frames.
+    Raises LabelError: the log has no labels. LogError: it has too few frames.
     """
     with LogReader(path) as log:
         if log.info.label_set is None:
@@ -109,14 +108,12 @@ def bench_render(
     At the same weights: the eager reference with 64 + 64 samples a ray, the eager renderer and the compiled one with 8
     guided samples, and the compiled one with the rays and samples of the mapper's "balanced" and "fast" quality; with a
     GPU, the eager one there. All get the mapper's depth prior, and where it is measured. The reference is timed on
-    2,048 rays spread over each view and scaled; all are scored at the pixels of these rays.
+    2,048 rays spread over each view and scaled; all are scored at the pixels of these rays. Raises ConfigError: weights
+    of another field than S-Ray.
 
     Returns:
         Plain data; ``speedup`` is wall time of the reference over that of "balanced" for the same views, and
         ``miou_reference``, ``miou_streaming`` are theirs.
-
-    Raises:
-        ConfigError: weights of another field than S-Ray.
     """
     if not isinstance(checkpoint.model, SRay):
         raise ConfigError(

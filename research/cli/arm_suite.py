@@ -88,6 +88,8 @@ def run_arm_suite(
 ) -> int:
     """Run the arms that are missing, then print and write what there is; returns the exit code.
 
+    Raises ConfigError: with what is wrong and the mend.
+
     Args:
         suite: What to run.
         names: Of arms; none = all.
@@ -95,9 +97,6 @@ def run_arm_suite(
         out: JSON; None = named after the suite. Beside it lie the records (``.jsonl``), and what arms fit
             (folder ``SUITE-grids``).
         print_json: Print JSON, and nothing else.
-
-    Raises:
-        ConfigError: with what is wrong and the mend.
     """
     out = out or Path("runs") / f"{suite.file}.json"
     every = suite.arms(out.parent / f"{suite.name}-grids")

@@ -63,8 +63,9 @@ def run_suite_verb(
 ) -> int:
     """Run what is missing, then print, write and draw what there is.
 
-    Beside the JSON lie the records of the rooms (``.jsonl``), their pictures (``.views``), the sheet (``.png``)
-    and, of what was fitted, mIoU against seconds (``.curves.png``).
+    Beside the JSON lie the records of the rooms (``.jsonl``), their pictures (``.views``), the sheet (``.png``) and, of
+    what was fitted, mIoU against seconds (``.curves.png``). Raises WeightsError, ConfigError, MapError: with what is
+    wrong and the mend.
 
     Args:
         weights: Files under test; the shipped ones where neither these nor ``kinds`` are given.
@@ -75,9 +76,6 @@ def run_suite_verb(
 
     Returns:
         The exit code: 0, or that of the signal that ended the run.
-
-    Raises:
-        WeightsError, ConfigError, MapError: with what is wrong and the mend.
     """
     if kinds and suite.protocol == "generalize":
         raise ConfigError("--kind has random weights, which must be fitted; --protocol scratch, or finetune")
@@ -338,11 +336,7 @@ def _fit_title(suite: SuiteConfig) -> str:
 
 
 def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures: Sequence[Path], found: Any) -> None:
-    """Write the report of a benchmark run with its pictures.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
+    """Write the report of a benchmark run with its pictures. Raises ConfigError: it cannot be written."""
     figures = Section(notes=lines, tables=[table])
     drawn = Section(pictures=list(picture_files(*((path, path.name) for path in pictures))))
     write_page(path, found["title"], [figures, drawn, Section(folded={"All figures": json.dumps(found, indent=1)})])

@@ -31,8 +31,7 @@ def train_on_maps(
 ) -> int:
     """Make the maps that are missing, train, write the weights; returns the exit code.
 
-    Raises:
-        ConfigError, WeightsError, LogError, MapError: with what is wrong and the mend.
+    Raises ConfigError, WeightsError, LogError, MapError: with what is wrong and the mend.
     """
     plain = to_plain(load_config(config, NesfTrainConfig) if config else NesfTrainConfig())
     given = {"seconds": seconds, "steps": steps, "seed": seed}

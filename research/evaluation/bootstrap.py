@@ -45,16 +45,14 @@ def paired_bootstrap(
     """Percentile interval of the difference in data-set mIoU, ``first`` minus ``second``.
 
     Each resample draws as many scenes as there are, with replacement and the same ones for both methods, and adds up
-    their confusion matrices (Efron and Tibshirani 1993, chapter 13).
+    their confusion matrices (Efron and Tibshirani 1993, chapter 13). Raises ShapeError: other numbers of scenes, or
+    fewer than 2.
 
     Args:
         first, second: One matrix a scene, the same scenes in the same order.
         factor: ``second`` counts this many times.
         resamples: How many are drawn.
         seed: Of the draws.
-
-    Raises:
-        ShapeError: other numbers of scenes, or fewer than 2.
     """
     if len(first) != len(second) or len(first) < 2:
         raise ShapeError(

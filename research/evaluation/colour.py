@@ -18,16 +18,13 @@ def match_colours(truth: Float32, rendered: Float32) -> Float32:
     """The rendered picture with the gain and offset of each channel that bring it nearest to the true one.
 
     Exposure and white balance of the source images are not those of the truth, and nobody can render what no image
-    shows; a picture that is off by them alone is right.
+    shows; a picture that is off by them alone is right. Raises ShapeError: the shapes differ.
 
     Args:
         truth, rendered: (H, W, 3) float32 in [0, 1].
 
     Returns:
         (H, W, 3) float32 in [0, 1].
-
-    Raises:
-        ShapeError: the shapes differ.
     """
     _check(truth, rendered)
     matched = np.empty_like(rendered)
@@ -42,11 +39,10 @@ def match_colours(truth: Float32, rendered: Float32) -> Float32:
 def psnr(truth: Float32, rendered: Float32) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels; at most 100 (identical pictures).
 
+    Raises ShapeError: the shapes differ.
+
     Args:
         truth, rendered: (H, W, 3) float32 in [0, 1].
-
-    Raises:
-        ShapeError: the shapes differ.
     """
     _check(truth, rendered)
     error = float(np.mean((truth.astype(np.float64) - rendered.astype(np.float64)) ** 2))
@@ -56,13 +52,11 @@ def psnr(truth: Float32, rendered: Float32) -> float:
 def ssim(truth: Float32, rendered: Float32) -> float:
     """Structural similarity (Wang et al. 2004): Gaussian window of 11 pixels, sigma 1.5, mean over the colour channels.
 
-    Only windows that lie wholly in the picture count, so that no rule for its border plays a part.
+    Only windows that lie wholly in the picture count, so that no rule for its border plays a part. Raises ShapeError:
+    the shapes differ, or the picture is smaller than the window.
 
     Args:
         truth, rendered: (H, W, 3) float32 in [0, 1], at least 11 pixels a side.
-
-    Raises:
-        ShapeError: the shapes differ, or the picture is smaller than the window.
     """
     _check(truth, rendered)
     if min(truth.shape[:2]) < SSIM_WINDOW:

@@ -44,7 +44,8 @@ def matching_pixels(
 ) -> tuple[Indices, Indices]:
     """Pixels of view a that view b shows, too: each is carried over by its depth, to the nearest pixel of b.
 
-    A pixel counts where b's depth there is that of the carried point; what hides it in b has another.
+    A pixel counts where b's depth there is that of the carried point; what hides it in b has another. Raises
+    ShapeError: a depth image is not of the camera's size.
 
     Args:
         depth_a_m, depth_b_m: (H, W) float32 true z in metres, 0 = none.
@@ -54,9 +55,6 @@ def matching_pixels(
 
     Returns:
         Flat, row-major indices (N,) int64 into a and into b.
-
-    Raises:
-        ShapeError: a depth image is not of the camera's size.
     """
     k = intrinsics
     p = transform(invert_pose(T_world_b) @ T_world_a, unproject(depth_a_m, k)).reshape(-1, 3)

@@ -44,12 +44,11 @@ class DepthErrors:
 def depth_errors(truth_m: Float32, rendered_m: Float32, known: NDArray[np.bool_]) -> DepthErrors:
     """Compare two depth images where the truth has depth and the rendering knows something.
 
+    Raises ShapeError: the shapes differ.
+
     Args:
         truth_m, rendered_m: (H, W) float32 z in metres; 0 of the truth = no surface.
         known: (H, W) bool, where ``rendered_m`` means something.
-
-    Raises:
-        ShapeError: the shapes differ.
     """
     if not truth_m.shape == rendered_m.shape == known.shape:
         raise ShapeError(f"depth to compare: shapes {truth_m.shape}, {rendered_m.shape} and {known.shape} differ")

@@ -77,15 +77,13 @@ class FusedRoom:
 def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRecord:
     """Fuse a room's sequence and compare the map's labels with those of the nearest true surface.
 
+    Raises WeightsError: see ``Mapper.load``. MapError: the map came out empty.
+
     Args:
         seed: Of the room.
         weights: File that the pipeline runs on.
         digest: Of the weights, for the record.
         suite: Gives the number of frames, their spacing, whether they have depth, and the settings of the mapper.
-
-    Raises:
-        WeightsError: see ``Mapper.load``.
-        MapError: the map came out empty.
     """
     room = fuse_room(seed, weights, suite)
     return _compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)
@@ -96,9 +94,7 @@ def refine_room(
 ) -> list[MapRecord]:
     """As ``map_room``, then with the map refined by each of ``networks``, by the settings that its record goes under.
 
-    Raises:
-        WeightsError: see ``Mapper.load``; or networks of other classes.
-        MapError: the map came out empty.
+    Raises WeightsError: see ``Mapper.load``; or networks of other classes. MapError: the map came out empty.
     """
     room = fuse_room(seed, weights, suite)
     records = [_compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)]
@@ -114,8 +110,7 @@ def refine_room(
 def fuse_room(seed: int, weights: Path, suite: SuiteConfig, rendered: int = 1) -> FusedRoom:
     """Map a room; only every so many-th of its frames is ``rendered``, the others are fused without classes.
 
-    Raises:
-        WeightsError: see ``Mapper.load``.
+    Raises WeightsError: see ``Mapper.load``.
     """
     pipeline = Mapper.load(weights, msgspec.structs.replace(suite.mapper, depth=_depth(suite))).pipeline
     camera = camera_of_width(MAP_WIDTH)

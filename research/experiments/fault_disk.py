@@ -28,11 +28,7 @@ CAMERA = CameraIntrinsics(50.0, 50.0, 31.5, 23.5, 64, 48)
 
 
 def full_disks(rounds: int) -> Iterator[Outcome]:
-    """Record more than fits, with both rules for it.
-
-    Raises:
-        RuntimeError: no file system can be mounted here.
-    """
+    """Record more than fits, with both rules for it. Raises RuntimeError: no file system can be mounted here."""
     for count in range(rounds):
         for policy in ("stop", "delete-oldest"):
             with tempfile.TemporaryDirectory(prefix="disk-") as disk:

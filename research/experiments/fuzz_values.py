@@ -255,13 +255,12 @@ class FrameMaker:
 def run(frames: int, seed: int = 0, on_progress: Callable[[Report], None] | None = None) -> Report:
     """Send this many frames through a session.
 
+    Raises Exception: whatever a step raises that is not the refusal of a frame: a bug.
+
     Args:
         frames: How many.
         seed: Of all values.
         on_progress: Called every ``TRIM_EVERY`` frames.
-
-    Raises:
-        Exception: whatever a step raises that is not the refusal of a frame: a bug.
     """
     maker, report, began = FrameMaker(seed), Report(), time.monotonic()
     bundle = _bundle()

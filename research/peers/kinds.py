@@ -36,8 +36,7 @@ def build_field(
 ) -> LearnedField:
     """A field with random weights, of a kind or a preset, whose switches win over those of ``config``.
 
-    Raises:
-        ConfigError: no such name, or a config that does not fit it.
+    Raises ConfigError: no such name, or a config that does not fit it.
     """
     kind, switches = PRESETS.get(name, (name, {}))
     if kind not in field_kinds():

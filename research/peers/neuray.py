@@ -67,8 +67,7 @@ class NeuRay(LearnedField):
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode each view by itself: features, and the depth distribution of every pixel (from depth if measured).
 
-        Raises:
-            ShapeError: tensors that do not fit together.
+        Raises ShapeError: tensors that do not fit together.
         """
         check_views(views)
         views = sure_depth(views, computed=self.config.encoder.computed_depth)

@@ -66,8 +66,7 @@ class SemanticNeRF(LearnedField):
     def encode(self, views: SourceViews) -> EncodedViews:
         """The views' cameras and colours, without features: nothing of them is looked at.
 
-        Raises:
-            ShapeError: tensors that do not fit together.
+        Raises ShapeError: tensors that do not fit together.
         """
         check_views(views)
         return encoded_views(views, views.rgb[:, :0])

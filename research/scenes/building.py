@@ -55,7 +55,8 @@ def building_walk(
 ) -> Iterator[Visit]:
     """Visit ``rooms`` rooms in turn, then the first ``returns`` of them again; everything follows from the arguments.
 
-    Only the scene of the present visit is held. Stamps and numbers of the frames go on from visit to visit.
+    Only the scene of the present visit is held. Stamps and numbers of the frames go on from visit to visit. Raises
+    ConfigError: counts or a rate that make no walk.
 
     Args:
         rooms: N, on a square grid of cells.
@@ -64,9 +65,6 @@ def building_walk(
         returns: Visits at the end, to the rooms left longest ago; at most N.
         hz: Frames a second, for the stamps.
         room, path, noise: As for ``room_frames``.
-
-    Raises:
-        ConfigError: counts or a rate that make no walk.
     """
     if rooms < 1 or frames_a_room < 1 or not 0 <= returns <= rooms or not hz > 0:
         raise ConfigError(

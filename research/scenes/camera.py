@@ -45,11 +45,8 @@ def camera_path(scene: Scene, count: int, seed: int, config: CameraPathConfig = 
     """Poses T_world_camera (count, 4, 4) float64, OpenCV axes, deterministic in (scene, seed, config).
 
     The camera keeps ``config.clearance_m`` from everything, 0.15 m on a path with close-ups. Way-points are the best of
-    several tried views, by how much furniture and how many classes they show.
-
-    Raises:
-        ConfigError: count < 1, or settings that contradict each other.
-        SemanticMapperError: where the room has no free space for a camera.
+    several tried views, by how much furniture and how many classes they show. Raises ConfigError: count < 1, or
+    settings that contradict each other. SemanticMapperError: where the room has no free space for a camera.
     """
     if count < 1:
         raise ConfigError(f"camera_path: count must be at least 1, got {count}")

@@ -27,8 +27,7 @@ SMALL = CodecOptions(rgb="jpeg", jpeg_quality=85)
 def write_room_log(path: Path, room: int, count: int) -> None:
     """Film validation room number ``room`` with a noisy depth camera; a log that is there is replaced.
 
-    Raises:
-        LogError: it cannot be written.
+    Raises LogError: it cannot be written.
     """
     seed = VALIDATION_SEEDS[room]
     info = StreamInfo(

@@ -50,11 +50,7 @@ def cast_pixels(
 
 
 def expect_primitives(shape: Int64, center: Float64, half: Float64, rotation: Float64) -> None:
-    """Check the shapes of the arrays of primitives.
-
-    Raises:
-        ShapeError: one has another shape.
-    """
+    """Check the shapes of the arrays of primitives. Raises ShapeError: one has another shape."""
     count = expect_shape(shape, "P", "shape")["P"]
     expect_shape(center, f"{count} 3", "center")
     expect_shape(half, f"{count} 3", "half")

@@ -73,13 +73,12 @@ def shade_pixels(
 ) -> Float32:
     """Linear RGB (H, W, 3) float32 of the hits that ``fast_cast.cast_pixels`` found; misses are black.
 
+    Raises ShapeError: an array has another shape, or a primitive a material that does not exist.
+
     Args:
         depth, index: (H, W) of ``cast_pixels``.
         primitives, materials, lights: Of ``scene.kernel_arrays``.
         origin, camera_axes, fx, fy, cx, cy: As ``cast_pixels`` got them.
-
-    Raises:
-        ShapeError: an array has another shape, or a primitive a material that does not exist.
     """
     _check(depth, index, primitives, materials, lights)
     expect_shape(origin, "3", "origin")
@@ -103,10 +102,7 @@ def surface_normals(
 ) -> Float64:
     """Unit normals (H, W, 3) float64 in world axes of the hits that ``cast_pixels`` found; zeros where it found none.
 
-    Args: as ``shade_pixels``.
-
-    Raises:
-        ShapeError: an array has another shape.
+    Args: as ``shade_pixels``. Raises ShapeError: an array has another shape.
     """
     expect_shape(index, "{} {}".format(*expect_shape(depth, "H W", "depth").values()), "index")
     expect_primitives(*primitives[:4])

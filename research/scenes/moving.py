@@ -95,6 +95,7 @@ def make_moving_room(
     """The room of ``seed`` with things that move for ``count`` frames; everything follows from the arguments.
 
     What finds no free floor is left out, and so is the door of a room that has none. What is added casts no shadow.
+    Raises ConfigError: another number of people, or settings that contradict each other.
 
     Args:
         seed: Of the room, of the camera's way and of what moves.
@@ -102,9 +103,6 @@ def make_moving_room(
         people: Who walk to and fro where the camera sees them, 0 to 3. The first turns at once at either end of the
             way, others may stand there for a while.
         room, path: As for ``room_views``; ``room.people`` and arms are not for this.
-
-    Raises:
-        ConfigError: another number of people, or settings that contradict each other.
     """
     if not 0 <= people <= MOST_PEOPLE:
         raise ConfigError(f"moving room: people must be 0 to {MOST_PEOPLE}, got {people}")

@@ -64,6 +64,8 @@ def render_view(
 ) -> RenderedView:
     """Render one view.
 
+    Raises PoseError: where ``T_world_camera`` is not a rigid transform.
+
     Args:
         scene: From ``make_room`` or another suite.
         intrinsics: Pinhole; distortion coefficients are not modelled and must be empty.
@@ -71,9 +73,6 @@ def render_view(
         noise: Seed of the sensor noise on colour and depth; None for a perfect camera.
         noise_config: The sensors and the strength of their noise.
         shot: Exposure and motion of this frame of a sequence; None for a camera at rest, drawn from ``noise``.
-
-    Raises:
-        PoseError: where ``T_world_camera`` is not a rigid transform.
     """
     check_pose(T_world_camera, "render_view")
     depth, index = cast_view(scene, intrinsics, T_world_camera)

@@ -22,8 +22,7 @@ _ROOM_STREAM = 0  # number of the random stream; camera paths use others
 def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     """Build the room of ``seed``; the same (suite version, seed, config) always gives the same room.
 
-    Raises:
-        ConfigError: negative seed, or bounds of ``config`` that leave nothing to choose.
+    Raises ConfigError: negative seed, or bounds of ``config`` that leave nothing to choose.
     """
     _check(seed, config)
     rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))

@@ -75,8 +75,7 @@ class Storey:
 def make_storey(seed: int, area_m2: float = 110.0, clutter: float = 0.3) -> Storey:
     """A storey of about ``area_m2``: an even seed has rooms on both sides of a corridor, an odd one has none.
 
-    Raises:
-        ConfigError: negative seed, or an area too small for two rooms.
+    Raises ConfigError: negative seed, or an area too small for two rooms.
     """
     if seed < 0 or not area_m2 >= 20.0:
         raise ConfigError(f"make_storey: need seed >= 0 and area_m2 >= 20, got {seed} and {area_m2}")

@@ -189,11 +189,7 @@ def aerial_digest(config: AerialConfig) -> str:
 
 
 def check_aerial(config: AerialConfig) -> None:
-    """Refuse settings that no run can follow.
-
-    Raises:
-        ConfigError: which, and what to do.
-    """
+    """Refuse settings that no run can follow. Raises ConfigError: which, and what to do."""
     if config.labelled >= config.train_views:
         raise ConfigError(
             f"{config.train_views} training views do not hold {config.labelled} labelled ones besides others; "
@@ -206,14 +202,13 @@ def run_aerial(
 ) -> Iterator[tuple[str, Episode]]:
     """Make the records that are missing in ``store``; yields arm and episode before each is run.
 
+    Raises ConfigError: settings that no run can follow.
+
     Args:
         config: What to run.
         arms: By name.
         store: Records that are there are kept and not made again.
         stopped: Asked before each; once it says so (anything true), the run ends.
-
-    Raises:
-        ConfigError: settings that no run can follow.
     """
     check_aerial(config)
     settings = aerial_digest(config)

@@ -141,11 +141,7 @@ def own_image_suite(suite: SuiteConfig) -> SuiteConfig:
 
 
 def check_suite(suite: SuiteConfig) -> None:
-    """Refuse settings that no run can follow.
-
-    Raises:
-        ConfigError: which, and what to do.
-    """
+    """Refuse settings that no run can follow. Raises ConfigError: which, and what to do."""
     seeds = ROOMS_SUITE.seeds[suite.split]
     if not 0 <= suite.rooms <= len(seeds):
         raise ConfigError(f"rooms: split '{suite.split}' has {len(seeds)} rooms, {suite.rooms} are requested; 0 = all")

@@ -21,12 +21,10 @@ from semantic_mapper.fields.learned import LearnedField
 def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry]:
     """Load weights files onto the GPU where there is one, else the CPU; each is named by its file or its folder.
 
+    Raises WeightsError: a file that cannot be used, or one given twice. ConfigError: no such kind, or one given twice.
+
     Args:
         kinds: Names of ``fields.learned`` that take part with random weights and default settings, after the files.
-
-    Raises:
-        WeightsError: a file that cannot be used, or one given twice.
-        ConfigError: no such kind, or one given twice.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     paths = [find_checkpoint(path) for path in paths]

@@ -81,11 +81,7 @@ Arm = Callable[[KlevrConfig], ArmScores]
 
 
 def check_klevr(config: KlevrConfig) -> None:
-    """Refuse settings that no run can follow.
-
-    Raises:
-        ConfigError: which, and what to do.
-    """
+    """Refuse settings that no run can follow. Raises ConfigError: which, and what to do."""
     test_views = config.views - config.train_views
     if test_views < config.scored_views or config.train_views < max(config.scored_views, config.label_maps):
         raise ConfigError(
@@ -157,14 +153,13 @@ def run_klevr(
 ) -> Iterator[str]:
     """Make the records that are missing in ``store``, arm by arm; yields the name of each arm before it is run.
 
+    Raises ConfigError: settings that no run can follow.
+
     Args:
         config: What to run.
         arms: By name.
         store: Records that are there are kept and not made again.
         stopped: Asked before each arm; once it says so (anything true), the run ends.
-
-    Raises:
-        ConfigError: settings that no run can follow.
     """
     check_klevr(config)
     settings = klevr_digest(config)

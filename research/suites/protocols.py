@@ -86,12 +86,11 @@ def run_room(
 ) -> RoomResult | None:
     """One room by one field, as ``suite.protocol`` says; None where it was stopped while it fitted.
 
+    Raises ConfigError: a budget of nothing, or a room with too few frames.
+
     Args:
         on_fit: Called with the fraction of the fitting that is done.
         stopped: Asked before every step of the fitting; once it says so (anything true), the room is given up.
-
-    Raises:
-        ConfigError: a budget of nothing, or a room with too few frames.
     """
     if suite.protocol == "generalize":
         field = entry.field.eval()
@@ -133,8 +132,7 @@ def answer_from_keyframes(
 def choose_fitted(room: BenchmarkRoom, suite: SuiteConfig) -> Keyframes:
     """The frames that a field is fitted to: what shows most of the room, none of it near a query view.
 
-    Raises:
-        ConfigError: too few frames are left.
+    Raises ConfigError: too few frames are left.
     """
     guard = suite.scene.guard
     free = [n for n in range(len(room.frames)) if all(abs(n - q) > guard for q in room.queries)]

@@ -78,8 +78,7 @@ class BenchmarkRoom:
 def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
     """Render a room; everything follows from the seed and the settings.
 
-    Raises:
-        ConfigError: a sequence too short for its query views.
+    Raises ConfigError: a sequence too short for its query views.
     """
     asked = suite.sequence.camera
     camera = camera_of_width(suite.tier.width, asked.focal_per_width)
@@ -164,8 +163,7 @@ def _moved_close(scene: Scene, frame: PosedFrame, away_m: float) -> Float64:
 def query_pairs(suite: SuiteConfig) -> tuple[tuple[int, int], ...]:
     """Frame numbers of the query views: each pair in the middle of its fraction of the sequence.
 
-    Raises:
-        ConfigError: no pair, or pairs that overlap.
+    Raises ConfigError: no pair, or pairs that overlap.
     """
     sequence = suite.sequence
     fraction = sequence.frames / max(sequence.query_pairs, 1)

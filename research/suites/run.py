@@ -42,6 +42,8 @@ def run_suite(
 ) -> None:
     """Make the records that are missing in ``store``, and beside them a picture of each room's first query view.
 
+    Raises ConfigError: settings that no run can follow.
+
     Args:
         suite: What to run.
         entries: Which fields.
@@ -50,9 +52,6 @@ def run_suite(
         on_progress: Called with every step.
         stopped: Asked before each room, entry and step of a fitting; once it says so (anything true), the run
             ends. A room that is not done by then leaves no record.
-
-    Raises:
-        ConfigError: settings that no run can follow.
     """
     check_suite(suite)
     settings, seeds = settings_digest(suite, "views"), suite_seeds(suite)

@@ -20,11 +20,10 @@ RecordT = TypeVar("RecordT", RoomRecord, MapRecord, SceneRecord)
 class RecordStore:
     """Records of any number of runs in one file.
 
+    Raises ConfigError: the file holds something else than records of this version.
+
     Args:
         path: The file; made with the first record.
-
-    Raises:
-        ConfigError: the file holds something else than records of this version.
     """
 
     def __init__(self, path: Path) -> None:

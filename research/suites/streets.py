@@ -232,11 +232,7 @@ def streets_digest(config: StreetsConfig) -> str:
 
 
 def check_streets(config: StreetsConfig) -> None:
-    """Refuse settings that no run can follow.
-
-    Raises:
-        ConfigError: which, and what to do.
-    """
+    """Refuse settings that no run can follow. Raises ConfigError: which, and what to do."""
     if config.scored_every >= config.pairs:
         raise ConfigError(
             f"{config.pairs} pairs hold one scored image if every {config.scored_every}th is; lower scored_every"
@@ -248,14 +244,13 @@ def run_streets(
 ) -> Iterator[tuple[str, int]]:
     """Make the records that are missing in ``store``; yields arm and street before each is run.
 
+    Raises ConfigError: settings that no run can follow.
+
     Args:
         config: What to run.
         arms: By name.
         store: Records that are there are kept and not made again.
         stopped: Asked before each; once it says so (anything true), the run ends.
-
-    Raises:
-        ConfigError: settings that no run can follow.
     """
     check_streets(config)
     settings = streets_digest(config)

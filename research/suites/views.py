@@ -48,6 +48,7 @@ def choose_sources(
 
     Where too few do, the distance to each other is given up first, then those to the query. The choice looks at depth
     and poses alone, whatever the field is given, so that every field and every setting of depth gets the same views.
+    Raises ConfigError: fewer candidates than ``count``.
 
     Args:
         query_pose: (4, 4) T_world_camera.
@@ -55,9 +56,6 @@ def choose_sources(
         candidates: Frames of one size, the query not among them; each with its sensor depth.
         count: How many to choose.
         intrinsics: Of the query; None = that of the candidates.
-
-    Raises:
-        ConfigError: fewer candidates than ``count``.
     """
     if len(candidates) < count:
         raise ConfigError(f"{count} source views are requested, the room has {len(candidates)} frames to choose from")

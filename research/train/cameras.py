@@ -51,12 +51,11 @@ class Camera:
 def draw_camera(seed: int, width: int, step_m: float, config: CameraDraw) -> Camera:
     """The camera of the room of ``seed``; everything follows from the arguments.
 
+    Raises ConfigError: bounds that contradict each other, or no sensor.
+
     Args:
         width: Of the images, pixels.
         step_m: Way between two views.
-
-    Raises:
-        ConfigError: bounds that contradict each other, or no sensor.
     """
     if config.focal_min > config.focal_max or config.height_min_m + config.height_span_m > config.height_max_m:
         raise ConfigError("CameraDraw: need focal_min <= focal_max and height_min_m + height_span_m <= height_max_m")

@@ -18,8 +18,7 @@ LOCK_FILE = ".lock"
 def sole_use_of(folder: Path | None) -> Iterator[None]:
     """Meanwhile no other process that asks gets the folder. The lock goes with the process, however it ends.
 
-    Raises:
-        ConfigError: another process has it.
+    Raises ConfigError: another process has it.
     """
     if folder is None:
         yield

@@ -102,11 +102,7 @@ class LabelledScene:
 def labelled_scene(
     grid: SceneGrid, frames: Sequence[PosedFrame], label_set: LabelSet, config: GridNesfTraining
 ) -> LabelledScene:
-    """A scene to train on.
-
-    Raises:
-        FrameError: no frame has a label.
-    """
+    """A scene to train on. Raises FrameError: no frame has a label."""
     frames = [f for f in frames if f.label is not None]
     channel = np.concatenate([label_set.to_channels(f.label).ravel() for f in frames if f.label is not None] or [[]])
     pixels = np.flatnonzero(channel >= 0)

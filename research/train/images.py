@@ -92,8 +92,7 @@ def image_batch(
 def images_loss(model: LearnedField, batch: ImageBatch, config: ImageStepConfig) -> Loss:
     """Class loss of the images by themselves; gradients flow into the encoder and the classifier.
 
-    Raises:
-        ConfigError: a kind of field that says nothing of an image by itself.
+    Raises ConfigError: a kind of field that says nothing of an image by itself.
     """
     encoder = encoder_for_images(model)
     with encoder.batch_statistics():
@@ -110,8 +109,7 @@ def images_loss(model: LearnedField, batch: ImageBatch, config: ImageStepConfig)
 def encoder_for_images(model: LearnedField) -> ImageEncoder:
     """The image encoder of a field, where it can learn from single images.
 
-    Raises:
-        ConfigError: a kind of field that says nothing of an image by itself.
+    Raises ConfigError: a kind of field that says nothing of an image by itself.
     """
     encoder = model.image_encoder
     if encoder is None or not model.classifies_images:

@@ -50,7 +50,8 @@ def make_room_maps(
 ) -> list[Path]:
     """Map procedural rooms; returns the files of all of them.
 
-    Files that are in the folder are kept, unless they were made of something else: those are made again.
+    Files that are in the folder are kept, unless they were made of something else: those are made again. Raises
+    WeightsError: of ``weights``, or a file in the folder is damaged.
 
     Args:
         seeds: Of the rooms; the field that maps must not have been trained on them, or its votes are too sure.
@@ -59,9 +60,6 @@ def make_room_maps(
         frames: Of 320x240 a room.
         on_room: Called after each.
         rendered: Maps of each room: every so many-th frame is rendered, the others have no votes.
-
-    Raises:
-        WeightsError: of ``weights``, or a file in the folder is damaged.
     """
     field = _field_digest(weights)
     paths: list[Path] = []
@@ -228,15 +226,14 @@ def training_map(
 ) -> TrainingMap:
     """Cast the labelled pixels of frames into a map.
 
+    Raises MapError: up cannot be found.
+
     Args:
         voxel_map: In the frames' world, of at least one block.
         frames: With labels, ids of ``labels``; where one has depth, hits that it contradicts do not count.
         labels: Their classes; taken over by name.
         up: (3,) in the world; None = away from the floor.
         instances: (H, W) of each frame, the same number where the same object is, 0 = none; None = not known.
-
-    Raises:
-        MapError: up cannot be found.
     """
     things = np.isin(voxel_map.label_set.ids, voxel_map.label_set.thing_ids(STUFF_NAMES))
     every = np.full(3, KEY_LIMIT)

@@ -156,11 +156,7 @@ class TrainingMap:
 
     @classmethod
     def load(cls, path: Path) -> TrainingMap:
-        """What ``save`` wrote; large arrays stay in half precision.
-
-        Raises:
-            WeightsError: damaged, or something else.
-        """
+        """What ``save`` wrote; large arrays stay in half precision. Raises WeightsError: damaged, or something else."""
         with _stored(path) as stored:
             points = SurfacePoints(*(stored[name] for name in SurfacePoints._fields))
             points = points._replace(rgb=(points.rgb / np.float32(255)).astype(np.float16))
@@ -206,15 +202,14 @@ def train_nesf(
 ) -> NesfWeights:
     """Train; returns the weights that were best on the validation maps, with trust and temperature fitted to them.
 
+    Raises ConfigError: no maps, another config than that of the run to go on with, or a run in the folder.
+    WeightsError: no state to go on with, or training diverged.
+
     Args:
         label_set: Of the maps.
         folder: For the state; None writes nothing.
         resume: Go on with the state there.
         stopped: Asked once a step; when it says yes, the state is saved and the best weights so far are returned.
-
-    Raises:
-        ConfigError: no maps, another config than that of the run to go on with, or a run in the folder.
-        WeightsError: no state to go on with, or training diverged.
     """
     if not maps or not validation:
         raise ConfigError("training needs at least one map, and one more to validate on")

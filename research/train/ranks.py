@@ -47,8 +47,7 @@ class Ranks:
 def ranks_from_environment() -> Ranks:
     """As ``torchrun`` says in its environment variables; one rank without it.
 
-    Raises:
-        ConfigError: variables that are no numbers.
+    Raises ConfigError: variables that are no numbers.
     """
     try:
         rank, world, local = (int(os.environ.get(name, default)) for name, default in _VARIABLES.items())

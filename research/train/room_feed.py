@@ -40,8 +40,7 @@ FeedMaker = Callable[[Iterator[int], "RoomPoolConfig", int], RoomFeed]
 def open_feed(seeds: Iterator[int], config: RoomPoolConfig, workers: int) -> RoomFeed:
     """A feed of the rooms of ``seeds``; both kinds give the same rooms in the same order.
 
-    Raises:
-        ConfigError: a negative number of workers.
+    Raises ConfigError: a negative number of workers.
     """
     if workers < 0:
         raise ConfigError(f"the number of workers that render rooms must not be negative, got {workers}")
@@ -83,11 +82,7 @@ class WorkerFeed:
         self.waited_s = 0.0
 
     def next(self) -> PackedRoom | str:
-        """The next room; waits where it is not done yet.
-
-        Raises:
-            NodeError: a worker has died.
-        """
+        """The next room; waits where it is not done yet. Raises NodeError: a worker has died."""
         began = time.monotonic()
         try:
             self._ask()

@@ -169,11 +169,7 @@ def _views_on(packed: PackedRoom, device: torch.device) -> tuple[LabelledView, .
 
 
 def render_room(seed: int, config: RoomPoolConfig, device: torch.device = CPU) -> RoomViews:
-    """One room; everything follows from the seed.
-
-    Raises:
-        ConfigError: this room cannot be made.
-    """
+    """One room; everything follows from the seed. Raises ConfigError: this room cannot be made."""
     packed = pack_room(seed, config)
     if isinstance(packed, str):
         raise ConfigError(packed)
@@ -232,8 +228,7 @@ class RoomPool(AbstractContextManager["RoomPool"]):
     def draw(self, generator: torch.Generator) -> RoomViews:
         """A random room of the pool; new ones are taken in first where it is time.
 
-        Raises:
-            ConfigError: none of the pool's rooms could be made.
+        Raises ConfigError: none of the pool's rooms could be made.
         """
         while self._taken < self._wanted():
             self._take()

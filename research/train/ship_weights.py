@@ -65,8 +65,7 @@ def _of_others(origin: dict[str, Any]) -> bool:
 def check_chain(weights: Path, recipe: dict[str, Any]) -> None:
     """See to it that every run behind ``weights`` can be done again.
 
-    Raises:
-        WeightsError: a run of code that no commit holds, or one that started from weights of which nothing is known.
+    Raises WeightsError: a run of code that no commit holds, or one that started from weights of which nothing is known.
     """
     for run in chain(recipe):
         what, revision = _name(run), run.get("git_revision")
@@ -86,8 +85,7 @@ def check_chain(weights: Path, recipe: dict[str, Any]) -> None:
 def figures_of(weights: Path, table: Path) -> dict[str, Any]:
     """What a table of the benchmark says of this very file, whose digest goes with it as ``measured``.
 
-    Raises:
-        ConfigError: not a finished table of the whole split, or one of other weights.
+    Raises ConfigError: not a finished table of the whole split, or one of other weights.
     """
     try:
         found = json.loads(table.read_text(encoding="utf-8"))
@@ -107,8 +105,7 @@ def figures_of(weights: Path, table: Path) -> dict[str, Any]:
 def both_figures(weights: Path, tables: Sequence[Path]) -> list[dict[str, Any]]:
     """Figures with depth and without, in this order.
 
-    Raises:
-        ConfigError: other tables than one with and one without depth that agree in all else; see ``figures_of``.
+    Raises ConfigError: other tables than one with and one without depth that agree in all else; see ``figures_of``.
     """
     figures = sorted((figures_of(weights, table) for table in tables), key=lambda figure: not figure["depth"])
     alike = {tuple(figure[key] for key in SETTINGS if key != "depth") for figure in figures}
@@ -120,8 +117,7 @@ def both_figures(weights: Path, tables: Sequence[Path]) -> list[dict[str, Any]]:
 def convert(weights: Path, out: Path) -> None:
     """Write ``weights`` to ``out`` as they will be shipped, to be measured.
 
-    Raises:
-        WeightsError: unreadable, too large, or of a run that nobody can do again.
+    Raises WeightsError: unreadable, too large, or of a run that nobody can do again.
     """
     checkpoint = load_checkpoint(weights)
     check_chain(weights, checkpoint.recipe)
@@ -131,9 +127,8 @@ def convert(weights: Path, out: Path) -> None:
 def ship(half: Path, tables: Sequence[Path], out: Path, card: Path) -> None:
     """Write what ``convert`` made to ``out`` with the figures of ``tables`` in its recipe, and their table to ``card``.
 
-    Raises:
-        WeightsError: unreadable, of a run that nobody can do again, or not float16 yet.
-        ConfigError: see ``both_figures``.
+    Raises WeightsError: unreadable, of a run that nobody can do again, or not float16 yet. ConfigError: see
+    ``both_figures``.
     """
     checkpoint = load_checkpoint(half)
     check_chain(half, checkpoint.recipe)
@@ -147,10 +142,8 @@ def ship(half: Path, tables: Sequence[Path], out: Path, card: Path) -> None:
 def ship_on_base(half: Path, out: Path) -> None:
     """Write weights to ``out`` without the tensors that the default weights hold alike, naming those as their base.
 
-    Ship them anew whenever the default weights change.
-
-    Raises:
-        WeightsError: unreadable, or of a run that nobody can do again.
+    Ship them anew whenever the default weights change. Raises WeightsError: unreadable, or of a run that nobody can do
+    again.
     """
     check_chain(half, load_checkpoint(half).recipe)
     base = default_checkpoint_path()
@@ -172,8 +165,7 @@ def as_stored(tensor: torch.Tensor, name: str) -> torch.Tensor:
 def renew_card(card: Path, weights: Path) -> None:
     """Replace what lies between the two marks of ``card`` by ``metadata_block``.
 
-    Raises:
-        ConfigError: the marks are missing.
+    Raises ConfigError: the marks are missing.
     """
     text = card.read_text(encoding="utf-8")
     before, begin, rest = text.partition(BEGIN)

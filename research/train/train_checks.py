@@ -18,11 +18,7 @@ from semantic_mapper.types import SourceViews
 
 
 def check_settings(config: TrainConfig) -> None:
-    """Numbers that make no sense, whatever the kind of field.
-
-    Raises:
-        ConfigError: there are such.
-    """
+    """Numbers that make no sense, whatever the kind of field. Raises ConfigError: there are such."""
     if config.seconds <= 0 and config.steps <= 0:
         raise ConfigError("training needs a budget: set seconds, steps, or both")
     if config.rooms_per_step < 1 or config.log_steps < 1:
@@ -32,11 +28,7 @@ def check_settings(config: TrainConfig) -> None:
 
 
 def check_field(field: LearnedField, config: TrainConfig) -> None:
-    """A field that cannot learn from the steps that the config asks for.
-
-    Raises:
-        ConfigError: it is such a one.
-    """
+    """A field that cannot learn from the steps that the config asks for. Raises ConfigError: it is such a one."""
     if field.image_encoder is None:
         # What it renders does not depend on the source views: it would learn the mean of all rooms.
         raise ConfigError(
@@ -80,9 +72,7 @@ def _encodes_views_separately(field: LearnedField) -> bool:
 def check_nothing_is_overwritten(state: Path) -> None:
     """A new run where there is the state of another one, finished or not: it may have taken hours.
 
-    Raises:
-        ConfigError: there is one.
-        WeightsError: there is one that cannot be read.
+    Raises ConfigError: there is one. WeightsError: there is one that cannot be read.
     """
     if not state.is_file():
         return

@@ -100,8 +100,7 @@ def save_state(
 def unfinished_step(path: Path) -> int | None:
     """Step at which the run of a state stopped before its budget was used up; None where it was not stopped.
 
-    Raises:
-        WeightsError: missing, damaged or of another version.
+    Raises WeightsError: missing, damaged or of another version.
     """
     _, metadata = _read(path, only_metadata=True)
     return None if metadata.get("finished") == "True" else int(metadata["step"])
@@ -110,9 +109,8 @@ def unfinished_step(path: Path) -> int | None:
 def load_state(path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, config: dict[str, Any]) -> Progress:
     """Put model and optimiser where the run stopped.
 
-    Raises:
-        WeightsError: missing, damaged, of another version, or of another network.
-        ConfigError: the run had another config.
+    Raises WeightsError: missing, damaged, of another version, or of another network. ConfigError: the run had another
+    config.
     """
     tensors, metadata = _read(path)
     try:

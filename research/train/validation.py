@@ -49,11 +49,7 @@ class Scores:
 def validation_rooms(
     config: ValidationConfig, pool: RoomPoolConfig, ranks: Ranks, device: torch.device
 ) -> list[RoomViews]:
-    """This rank's fraction of the validation rooms.
-
-    Raises:
-        ConfigError: more rooms than there are, or none.
-    """
+    """This rank's fraction of the validation rooms. Raises ConfigError: more rooms than there are, or none."""
     if not 1 <= config.rooms <= len(VALIDATION_SEEDS) or config.queries < 1 or config.views < 1 or config.rays < 1:
         raise ConfigError(f"ValidationConfig: need 1 to {len(VALIDATION_SEEDS)} rooms, and queries, views and rays")
     pool = msgspec.structs.replace(pool, computed_depth=0.0)  # scores are those with measured depth and without any

@@ -57,10 +57,7 @@ class ConfusionMatrix:
         """Count one image, map or batch of uint8 class ids (...) of the label set; ``where`` names it in errors.
 
         Where the truth has the ignore id nothing is counted; predicted, that means "unknown" and counts as wrong.
-
-        Raises:
-            ShapeError: the shapes differ.
-            LabelError: an id is not in the label set.
+        Raises ShapeError: the shapes differ. LabelError: an id is not in the label set.
         """
         if truth.shape != predicted.shape:
             raise ShapeError(

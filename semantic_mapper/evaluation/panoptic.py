@@ -79,9 +79,7 @@ class PanopticCounts:
     def update(self, truth: PanopticImage, found: PanopticImage, where: str = "image") -> None:
         """Count one image.
 
-        Raises:
-            ShapeError: the four images differ in shape.
-            LabelError: an id that is not in the label set.
+        Raises ShapeError: the four images differ in shape. LabelError: an id that is not in the label set.
         """
         shapes = [np.shape(image) for image in (*truth, *found)]
         if len(set(shapes)) > 1:

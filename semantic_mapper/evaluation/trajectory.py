@@ -24,9 +24,7 @@ def align_rigid(a: Float64, b: Float64) -> Float64:
     """The rigid motion T_b_a (4, 4) that takes points a (N, 3) nearest to points b (N, 3) in least squares.
 
     Umeyama's closed form with the scale held at 1. Where the points lie on a line, one of the equally good rotations.
-
-    Raises:
-        ShapeError: other shapes, or fewer than 3 points.
+    Raises ShapeError: other shapes, or fewer than 3 points.
     """
     sizes = expect_shape(a, "N 3", "points to align")
     if expect_shape(b, "N 3", "points to align to") != sizes or sizes["N"] < 3:
@@ -43,10 +41,8 @@ def align_rigid(a: Float64, b: Float64) -> Float64:
 def align_similar(a: Float64, b: Float64) -> tuple[Float64, float]:
     """The similarity that takes points a (N, 3) nearest to points b (N, 3) in least squares: ``T_b_a @ (scale * a)``.
 
-    Umeyama's closed form; for paths whose scale is unknown.
-
-    Raises:
-        ShapeError: other shapes, fewer than 3 points, or points a that are all one.
+    Umeyama's closed form; for paths whose scale is unknown. Raises ShapeError: other shapes, fewer than 3 points, or
+    points a that are all one.
     """
     rigid = align_rigid(a, b)
     level_a, level_b = a - a.mean(axis=0), b - b.mean(axis=0)

@@ -39,15 +39,13 @@ def upright_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float
     """Rotation ``R_upright_world`` after which z is up and most walls run along x or y, the longer side along x.
 
     Floors, tables and ceilings make the histogram of heights sharp, walls those of x and y: the rotation is the one
-    that makes them sharpest. Deterministic; the identity where there are no points and no ``up``.
+    that makes them sharpest. Deterministic; the identity where there are no points and no ``up``. Raises ShapeError:
+    ``xyz`` is not (N, 3), or ``up`` has no direction.
 
     Args:
         xyz: (N, 3) world points in metres, N may be 0.
         up: (3,) rough direction in the world frame; ten degrees off is corrected, and so is any error up to 45 degrees
             where the truth is an axis of the world. ``None`` tries the six axes.
-
-    Raises:
-        ShapeError: ``xyz`` is not (N, 3), or ``up`` has no direction.
     """
     if up is not None and not np.linalg.norm(up) > 0:
         raise ShapeError(f"up: expected a direction (3,), got {up}")

@@ -275,17 +275,15 @@ class MapCorrector:
         """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
 
         The map in use stays as it is until ``advance`` has brought the rebuild to its end. A call during a rebuild
-        begins it again, with this correction upon the one under way: the outcome is that of two in a row.
+        begins it again, with this correction upon the one under way: the outcome is that of two in a row. Raises
+        MapError: no history is kept, a stamp is of no frame, or all given frames have left it. Nothing has changed.
+        PoseError: a pose is not a rigid transform.
 
         Args:
             poses: In the map's world as it is right from now on, at least one. Frames between them in time move as the
                 head of this file says. Frames that have left the history stay where they are.
             until_ns: Frames later than the last given one, up to this stamp, have come in the old world and move with
                 it. By default none have. ``ALWAYS``: odometry goes on in the old world, and frames to come move, too.
-
-        Raises:
-            MapError: no history is kept, a stamp is of no frame, or all given frames have left it. Nothing has changed.
-            PoseError: a pose is not a rigid transform.
         """
         with self.lock:
             if self._scratch is None:

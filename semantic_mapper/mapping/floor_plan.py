@@ -113,6 +113,8 @@ def occupancy_grid(
 ) -> OccupancyGrid:
     """Make the plan of a map's surface points; see the head of this file for what its values mean.
 
+    Raises MapError: impossible numbers, no points between -LOW and HIGH, or more than 100 million cells.
+
     Args:
         up: (3,) unit vector, up in the world.
         resolution_m: Side of a cell; below the map's voxel size, walls would have holes.
@@ -121,9 +123,6 @@ def occupancy_grid(
         cost_of: (256,) cost of each class id, 0 to 100, -1 where a class has none of its own; None makes no ``costs``.
             A cell costs as much as the dearest surface in it between -LOW and HIGH. Surface without a cost of its own
             costs 100 where it is above LOW, and nothing where it is floor.
-
-    Raises:
-        MapError: impossible numbers, no points between -LOW and HIGH, or more than 100 million cells.
     """
     low, high = height_m
     if not (0 < low < high and np.isfinite(high)):

@@ -69,10 +69,8 @@ class MappingPipeline:
     Deterministic: same frames, config, field and thread count give the same map, bit for bit. ``anchors`` are labelled
     keyframes that the field was finetuned on: source views from the first frame on. ``corrector`` moves the map with
     corrected poses, ``frame_depth`` gives frames their depth, ``picture_check`` says what was wrong with pictures,
-    ``pose_in_map`` where the last frame of a session was.
-
-    Raises:
-        WeightsError: the field renders other classes than the map holds.
+    ``pose_in_map`` where the last frame of a session was. Raises WeightsError: the field renders other classes than the
+    map holds.
     """
 
     def __init__(
@@ -441,13 +439,12 @@ class MappingPipeline:
 class FieldTrial:
     """A field that may take the place of a pipeline's, which goes on mapping meanwhile: looked at in small pieces.
 
+    Raises WeightsError: other classes than the map's, or more anchors than the pipeline keeps keyframes.
+
     Args:
         field: Encodes as the present one does, see ``fields.learned.encode_alike``.
         anchors: Labelled keyframes that it was finetuned on.
         frames: Mapped ones, in which it is compared with the map; none = it is not.
-
-    Raises:
-        WeightsError: other classes than the map's, or more anchors than the pipeline keeps keyframes.
     """
 
     def __init__(

@@ -130,8 +130,7 @@ class GraphTracker:
     def up_in(self, snapshot: MapSnapshot) -> Float64:
         """Unit vector up (3,) in the world, found by the floor of this map where it is not known yet.
 
-        Raises:
-            MapError: it is not known, and the map does not show it.
+        Raises MapError: it is not known, and the map does not show it.
         """
         with self._lock:
             if self._up is None:
@@ -141,8 +140,7 @@ class GraphTracker:
     def update(self, snapshot: MapSnapshot, things: Sequence[Instance] | None = None) -> SceneGraph:
         """The graph of the map as it is now, with ``things`` of it that another has found; by default this finds them.
 
-        Raises:
-            MapError: lengths of the map are not metres, or which way is up is not known (``up_in``).
+        Raises MapError: lengths of the map are not metres, or which way is up is not known (``up_in``).
         """
         require_metres(snapshot.scale_known, "graph")
         up = self.up_in(snapshot)

@@ -135,8 +135,7 @@ class InstanceTracker:
     def update(self, snapshot: MapSnapshot) -> tuple[Instance, ...]:
         """The instances of the map as it is now, by ascending id.
 
-        Raises:
-            MapError: lengths of the map are not metres.
+        Raises MapError: lengths of the map are not metres.
         """
         require_metres(snapshot.scale_known, "instances")
         wanted = np.zeros(256, np.bool_)

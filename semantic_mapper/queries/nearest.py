@@ -32,11 +32,8 @@ def nearest(
 ) -> NearestSurface | None:
     """The surface point of a class that is nearest to a point (3,), world metres; ``None`` where the map has none.
 
-    Places that are less sure of the class than ``min_confidence``, 0..1, do not count.
-
-    Raises:
-        LabelError: no such class; lists those there are.
-        MapError: a bad point or confidence.
+    Places that are less sure of the class than ``min_confidence``, 0..1, do not count. Raises LabelError: no such
+    class; lists those there are. MapError: a bad point or confidence.
     """
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
@@ -109,10 +106,7 @@ def at(snapshot: MapSnapshot, points: ArrayLike, radius_m: float | None = None) 
     """Class and confidence of the surface at points (N, 3), world metres, and whether they are free or occupied.
 
     The class is that of the surface voxel whose surface point is nearest, where that is at most ``radius_m`` away: by
-    default 2.5 voxels, at most 25.
-
-    Raises:
-        MapError: bad points, or a radius out of range.
+    default 2.5 voxels, at most 25. Raises MapError: bad points, or a radius out of range.
     """
     p, most = check_points(points, snapshot), MAX_RADIUS_VOXELS * snapshot.voxel_size_m
     radius = RADIUS_VOXELS if radius_m is None else check_positive(radius_m, "radius_m", most) / snapshot.voxel_size_m

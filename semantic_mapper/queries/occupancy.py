@@ -55,14 +55,12 @@ def distance_field(
 ) -> DistanceField:
     """Euclidean distance to the nearest occupied or moving voxel for every voxel with its centre in a box.
 
-    Only voxels in the box count as obstacles: give the box a margin of the distance that matters.
+    Only voxels in the box count as obstacles: give the box a margin of the distance that matters. Raises MapError: a
+    bad box, or no voxel or more than ``MAX_BOX_VOXELS`` in it.
 
     Args:
         lower, upper: (3,) corners, world metres.
         unknown_is_occupied: Whether what was never seen is an obstacle, too.
-
-    Raises:
-        MapError: a bad box, or no voxel or more than ``MAX_BOX_VOXELS`` in it.
     """
     low, high = check_box(lower, upper, snapshot)
     first = np.ceil(low - 1e-6).astype(np.int64)  # 1e-6 voxels: corners that were meant to be voxel centres

@@ -195,8 +195,7 @@ class InstanceArrays:
     def things(self) -> tuple[Instance, ...]:
         """The things again.
 
-        Raises:
-            CodecError: arrays that do not go together, or a class that the map does not have.
+        Raises CodecError: arrays that do not go together, or a class that the map does not have.
         """
         columns = (self.id, self.class_id, self.confidence, self.measured, self.gone_ns, self.voxel_count)
         arrays = (self.centroid, self.center, self.size, self.R_world_box)

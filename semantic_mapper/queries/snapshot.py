@@ -109,10 +109,8 @@ class MapSnapshot:
     def changes(self, since: int, limit: int = 0) -> BlockChanges:
         """As ``VoxelMap.changes``: what another mirror needs to follow this one.
 
-        Whole ``MapMirror.apply`` take the place of whole versions, so ``limit`` stops only between two of them.
-
-        Raises:
-            MapError: ``since`` is not a version of this map, or a negative ``limit``.
+        Whole ``MapMirror.apply`` take the place of whole versions, so ``limit`` stops only between two of them. Raises
+        MapError: ``since`` is not a version of this map, or a negative ``limit``.
         """
         if not 0 <= since <= self.version or limit < 0:
             raise MapError(
@@ -154,8 +152,7 @@ class MapMirror:
     def load(cls, path: Path) -> MapMirror:
         """Mirror of a saved map, as ``of`` makes it of the loaded one, without its class evidence in memory.
 
-        Raises:
-            MapError: no such file, not a map, of another format version, or damaged (and what is).
+        Raises MapError: no such file, not a map, of another format version, or damaged (and what is).
         """
         with open_map(path) as reader:
             config = reader.manifest.config
@@ -181,10 +178,8 @@ class MapMirror:
         """Take over changes and return the present state.
 
         After a new epoch, that is the last one of the old epoch until changes have come up to the map's newest version.
-
-        Raises:
-            MapError: changes that do not continue the mirror's version, or damaged ones. The mirror is as it was.
-            LabelError: a class id that is not in the label set. The mirror is as it was.
+        Raises MapError: changes that do not continue the mirror's version, or damaged ones. The mirror is as it was.
+        LabelError: a class id that is not in the label set. The mirror is as it was.
         """
         packed = _check(changes, self._snapshot.label_set)
         with self._lock:

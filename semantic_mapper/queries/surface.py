@@ -63,8 +63,7 @@ def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
 def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
     """Surface points in a box with corners (3,), world metres, one a surface voxel, in a fixed order.
 
-    Raises:
-        MapError: a bad box.
+    Raises MapError: a bad box.
     """
     low, high = check_box(lower, upper, snapshot)
     surface = surface_voxels(snapshot, rows_in_box(snapshot, low, high))
@@ -100,12 +99,11 @@ class RayHits:
 def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
     """The first surface that each ray meets from its front, at most ``max_m`` away (up to 100).
 
+    Raises MapError: bad arguments, or shapes that do not go together.
+
     Args:
         origins: (N, 3) or (3,) world metres.
         directions: (N, 3) or (3,), of any length; one origin or direction stands for all.
-
-    Raises:
-        MapError: bad arguments, or shapes that do not go together.
     """
     check_positive(max_m, "max_m", MAX_RANGE_M)
     origin = check_points(np.atleast_2d(as_numbers(origins, "origins")), snapshot, "origins")

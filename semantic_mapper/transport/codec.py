@@ -232,8 +232,7 @@ def pack_header(header: Mapping[str, Any], what: str) -> bytes:
 def unpack_header(packed: Buffer, what: str) -> dict[str, Any]:
     """msgpack -> plain fields without the protocol's version, not checked any further.
 
-    Raises:
-        CodecError: too long, not msgpack, nested too deeply, no map, or of another protocol version.
+    Raises CodecError: too long, not msgpack, nested too deeply, no map, or of another protocol version.
     """
     if len(packed) > MAX_HEADER_BYTES:
         raise CodecError(f"{what}: header of {len(packed)} bytes, at most {MAX_HEADER_BYTES} are accepted")
@@ -256,9 +255,8 @@ def check_header(
     """Plain fields -> a struct or dataclass. Values that are arrays already, or such objects, stay what they are;
     ``read`` makes a value of any other type that is not plain from what stands for it.
 
-    Raises:
-        CodecError: an unknown or missing field, a wrong type, a number out of bounds or not finite, or what
-            ``__post_init__`` refuses; names the field.
+    Raises CodecError: an unknown or missing field, a wrong type, a number out of bounds or not finite, or what
+    ``__post_init__`` refuses; names the field.
     """
     try:
         return msgspec.convert(header, kind, dec_hook=read)
@@ -269,10 +267,8 @@ def check_header(
 def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str = "source") -> list[bytes]:
     """Any message -> parts.
 
-    ``sender`` is the second word of the topic of a ``StreamInfo``; the other messages name theirs.
-
-    Raises:
-        CodecError: a value that cannot be sent: out of bounds, NaN, or of the wrong type.
+    ``sender`` is the second word of the topic of a ``StreamInfo``; the other messages name theirs. Raises CodecError: a
+    value that cannot be sent: out of bounds, NaN, or of the wrong type.
     """
     if isinstance(message, PosedFrame):
         return encode_frame(message, options)
@@ -298,9 +294,8 @@ def encode_frame(
     """Posed frame -> parts. Depth, its spread, labels, stamps and the float64 pose are exact; so is colour unless
     "jpeg". ``encoded_rgb`` is sent instead of packing ``frame.rgb`` again, so that an imported JPEG stays what it was.
 
-    Raises:
-        CodecError: the pose is not finite (whether it is a rotation the receiver judges), or no topic can hold the
-            camera's id.
+    Raises CodecError: the pose is not finite (whether it is a rotation the receiver judges), or no topic can hold the
+    camera's id.
     """
     rgb = encoded_rgb.data if encoded_rgb else encode_rgb(frame.rgb, options.rgb, options.jpeg_quality)
     packed: _Packed = {"rgb": (RgbSpec(encoded_rgb.encoding if encoded_rgb else options.rgb, len(rgb)), rgb)}

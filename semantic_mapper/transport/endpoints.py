@@ -30,8 +30,7 @@ def default_endpoint(name: str, namespace: str = "default") -> str:
     """``ipc://`` endpoint of a node ("camera", "mapper"), the same for all processes of one user; ``namespace`` keeps
     two systems on one machine apart.
 
-    Raises:
-        TransportError: a name that is no plain word, or no folder can be made for the sockets.
+    Raises TransportError: a name that is no plain word, or no folder can be made for the sockets.
     """
     for word in (name, namespace):
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,48}", word) or word.startswith("."):
@@ -120,17 +119,14 @@ class Closing:
 class ServerSocket(Closing):
     """A bound socket (``socket``), and its ``endpoint`` as ZeroMQ names it.
 
-    The file of an ``ipc://`` socket is this user's alone from the start (mode 0600).
+    The file of an ``ipc://`` socket is this user's alone from the start (mode 0600). Raises TransportError: the
+    endpoint is taken, cannot be bound, or could be reached from other machines and there are no keys.
 
     Args:
         kind: Of ZeroMQ's.
         endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one).
         keys: Encrypt, and let in only their peers; needed where other machines could connect.
         options: Of the socket.
-
-    Raises:
-        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines and there are
-            no keys.
     """
 
     def __init__(

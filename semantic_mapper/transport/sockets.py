@@ -91,6 +91,8 @@ def receive_bounded(
 class Publisher(Closing):
     """Binds an endpoint and sends encoded messages to all subscribers. Any thread may call any method.
 
+    Raises TransportError: see ``ServerSocket``.
+
     Args:
         endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one, see ``endpoint``).
         policy: Toward a subscriber that does not keep up. "drop" (live): it loses messages. "block" (replay,
@@ -98,9 +100,6 @@ class Publisher(Closing):
         hwm: Messages that may wait for each subscriber.
         keys: Encrypt, and let in only their peers; needed where other machines could connect.
         linger_ms: How long ``close`` waits for the last messages to be delivered.
-
-    Raises:
-        TransportError: see ``ServerSocket``.
     """
 
     def __init__(
@@ -133,8 +132,7 @@ class Publisher(Closing):
     def publish(self, parts: Parts, timeout_s: float = 30.0) -> None:
         """Send one encoded message. The parts must not be changed afterwards.
 
-        Raises:
-            TransportError: closed; or policy "block" and a subscriber did not make room within ``timeout_s``.
+        Raises TransportError: closed; or policy "block" and a subscriber did not make room within ``timeout_s``.
         """
         topic = bytes(parts[0])
         deadline = time.monotonic() + timeout_s
@@ -260,7 +258,8 @@ class _Subscriber(Closing):
 
     A thread of its own takes messages off the socket as they come and checks their headers; images are decoded by the
     caller of ``receive``. A bad message costs itself and nothing else: it is counted in ``rejected`` and passed over. A
-    publisher that was restarted hears of the subscriptions again.
+    publisher that was restarted hears of the subscriptions again. Raises TransportError: an unknown topic; or see
+    ``client_socket``.
 
     Args:
         endpoints: One publisher or several.
@@ -268,9 +267,6 @@ class _Subscriber(Closing):
         identity: Of publishers that have keys.
         hwm: Messages that wait in the socket's own queue; as many wait here before a lossless one makes the publisher
             wait.
-
-    Raises:
-        TransportError: an unknown topic; or see ``client_socket``.
     """
 
     def __init__(
@@ -542,16 +538,13 @@ class QuerySocket(Closing):
 
     Where no answer comes in time the socket is thrown away and the question sent again through a new one, so that a
     server that was restarted is found again. Questions change nothing, so to ask twice does no harm; a request that
-    does carries an id, and a server that has seen it only answers.
+    does carries an id, and a server that has seen it only answers. Raises TransportError: see ``client_socket``.
 
     Args:
         endpoint: Where the server listens.
         timeout_s: How long to wait for an answer each time.
         attempts: How often to ask.
         identity: Of a server that has keys.
-
-    Raises:
-        TransportError: see ``client_socket``.
     """
 
     def __init__(
@@ -568,8 +561,7 @@ class QuerySocket(Closing):
     def ask(self, parts: Sequence[Buffer]) -> list[bytes]:
         """The parts of the answer.
 
-        Raises:
-            TransportError: closed, nobody has answered, or the answer is beyond all limits.
+        Raises TransportError: closed, nobody has answered, or the answer is beyond all limits.
         """
         with self._lock:
             for _ in range(self._attempts):
