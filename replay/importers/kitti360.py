@@ -201,7 +201,7 @@ def find_drive(folder: Path) -> tuple[Path, str]:
         return folder, drives[0]
     raise ImportSourceError(
         f"{folder / 'data_2d_raw'}: holds {len(drives)} drives (2013_05_28_drive_0000_sync or the like); name the "
-        f"folder of one: {', '.join(drives) or 'there is none'}"
+        f"folder of one: {', '.join(drives) or 'no folder fits'}"
     )
 
 

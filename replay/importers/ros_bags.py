@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import re
-import shutil
 import struct
 import tempfile
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ import numpy as np
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from semantic_mapper.errors import (
     CodecError,
@@ -137,30 +137,46 @@ def _readable(src: Path) -> tuple[list[Path], tempfile.TemporaryDirectory[str] |
     if all(file.suffix not in _PACKED and _profile(file) for file in files):
         return files, None
     folder = tempfile.TemporaryDirectory(prefix="semantic-mapper-bag-")
-    return [_made_readable(file, Path(folder.name)) for file in files], folder
+    made: list[Path] = []
+    for file in files:
+        unpacked = _unpacked(file, Path(folder.name)) if file.suffix in _PACKED else file
+        made.append(unpacked if _profile(unpacked) else _with_profile(unpacked, Path(folder.name)))
+    return made, folder
 
 
-def _made_readable(file: Path, folder: Path) -> Path:
-    """A copy that is unpacked and has the profile that rosbags asks for; the file itself where it is both."""
-    if file.suffix not in _PACKED and _profile(file):
-        return file
+def _unpacked(file: Path, folder: Path) -> Path:
     path = folder / file.stem
     try:
-        with file.open("rb") as source, path.open("wb") as out:
-            if file.suffix in _PACKED:
-                zstandard.ZstdDecompressor().copy_stream(source, out)
-            else:
-                shutil.copyfileobj(source, out)
+        with file.open("rb") as packed, path.open("wb") as out:
+            zstandard.ZstdDecompressor().copy_stream(packed, out)
     except (OSError, zstandard.ZstdError) as error:
         raise ImportSourceError(f"{file}: cannot be unpacked: {error}; copy it again") from error
-    if not _profile(path):  # the name of the library that wrote it gives up 4 letters, so that all else stays in place
-        library = int.from_bytes(_head(path)[21:25], "little")
-        if library < 4:
-            raise ImportSourceError(f"{file}: has no profile; write it again with `mcap filter`")
-        with path.open("r+b") as made:
-            made.seek(17)
-            made.write(struct.pack("<I4sI", 4, b"ros2", library - 4))
     return path.rename(path.with_suffix(".mcap" if _head(path).startswith(_MCAP_MAGIC) else ".db3"))
+
+
+def _with_profile(file: Path, folder: Path) -> Path:
+    """The messages of a bag, written again with the profile that rosbags asks for."""
+    path = folder / f"{file.stem}-ros2.mcap"
+    channels: dict[int, int] = {}
+    try:
+        with file.open("rb") as source, path.open("wb") as out:
+            writer = Writer(out)
+            writer.start(profile="ros2")
+            for schema, channel, message in make_reader(source).iter_messages():
+                if channel.id not in channels and schema is not None:
+                    of = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    metadata = {"offered_qos_profiles": "", **channel.metadata}
+                    channels[channel.id] = writer.register_channel(
+                        channel.topic, channel.message_encoding, of, metadata
+                    )
+                if channel.id in channels:
+                    writer.add_message(
+                        channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+                    )
+            writer.finish()
+    except (OSError, McapError, ValueError) as error:
+        raise ImportSourceError(f"{file}: cannot be read: {error}; `mcap recover` repairs what was cut off") from error
+    return path
 
 
 @dataclass(frozen=True, slots=True)
