@@ -6,15 +6,13 @@ attention Eq. 6 to 10, ``blend_views`` Eq. 11 and 12, ``render_samples`` Eq. 13.
 The geometry-aware network: per source view and pixel, a mixture of two logistic distributions over depth says where
 that view ray ends: the nearer component sits on the measured depth (or on a prediction from the image where there is
 none), the farther one behind it. From it follow, for a query sample that lands on this pixel at depth z, the
-probability that the view ray hits something within the sample's interval, and the visibility of the sample from that
-view.
+probability that the view ray ends within the sample's interval (hit), and that it is free before it (visibility).
 
 ``tokens = "samples"`` is the paper's order: attention among all samples, then blending of the views, then
 compositing. ``tokens = "surface"`` composites first, each view by itself, so that attention and blending work on one
-token a view; the tokens go through the semantic MLP before they are blended, and what is learned beyond that starts
-without effect. So with trained image features, and nothing else trained, it is a vote of its views, weighted by
-what they see. Beyond the paper, its density also depends on whether the views' colours agree, and depth that it
-predicts from an image is proportional to the focal length.
+token a view. The tokens go through the semantic MLP before they are blended, and what is learned beyond that starts
+without effect: with trained image features alone it is a vote of its views, weighted by what they see. Its density
+also depends on whether the views' colours agree, and depth predicted from an image is proportional to the focal length.
 
 In both orders attention adds to the features (M + f(M) in Eq. 9 and 10, which trains faster), and views count by how
 much they see of a sample.
@@ -25,6 +23,7 @@ from __future__ import annotations
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -95,9 +94,8 @@ class GeometryInit(nn.Module):
         spread: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Mixture parameters (m, 5, h, w) of features (m, C, h, w) and depths (m, h, w), 0 = none.
-        ``focal``: (m,) focal length in image widths, which a predicted depth is proportional to: a thing looks the same
-        through a lens of twice the focal length at twice the distance. None = ``COMMON_FOCAL``. ``spread``: (m, h, w)
-        of the given depth where it was computed from pictures, as a fraction of it; 0 = measured."""
+        ``focal``: (m,) in image widths; None = ``COMMON_FOCAL``. ``spread``: (m, h, w) of depth that was computed from
+        pictures, as a fraction of it; 0 = measured."""
         measured = depth_m > 0
         inverse = torch.where(measured, 1 / depth_m.clamp_min(NEAR_M), torch.zeros_like(depth_m))
         raw = self.net(torch.cat((feature, inverse[:, None], measured[:, None].to(feature.dtype)), dim=1))
@@ -131,9 +129,8 @@ def hit_and_visibility(
 class DensityNet(nn.Module):
     """Density of each sample from ``dim`` values a view, with one attention layer along the ray.
 
-    A first estimate comes from the views' hit probabilities: of the views that can see the sample, the fraction in
-    which the view ray ends there is the sample's opacity. The network corrects it by a gain and adds density of its
-    own.
+    Of the views that can see a sample, the fraction whose ray ends there is its opacity, which the network corrects by
+    a gain; it adds density of its own.
     """
 
     def __init__(self, dim: int) -> None:
@@ -178,9 +175,8 @@ class ContextualSpace:
     feature: torch.Tensor  # (m, R, N, C)
     rgb: torch.Tensor  # (m, R, N, 3)
     cues: torch.Tensor  # (m, R, N, CUES); of tokens at the surface SURFACE_CUES
-    # (m, R, N) in [0, 1]
-    hit: torch.Tensor
-    visibility: torch.Tensor
+    hit: torch.Tensor  # (m, R, N) in [0, 1]
+    visibility: torch.Tensor  # (m, R, N) in [0, 1]
     valid: torch.Tensor  # (m, R, N) bool
     delta: torch.Tensor  # (R, N) interval lengths, metres
     channel: torch.Tensor  # (m, R, N) int64 known label at the sample, -1 = none
@@ -188,18 +184,7 @@ class ContextualSpace:
 
 def contextual_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
     """Reproject samples z (R, N) of whole rays into all views and gather M (S-Ray Eq. 3 to 5)."""
-    delta = interval_lengths(z, rays.direction.norm(dim=-1))
-    return _gather_space(rays, z, sources, delta)
-
-
-def background_space(rays: RayBatch, sources: EncodedViews) -> ContextualSpace:
-    """What the views hold in the direction of each ray, infinitely far away: M with N = 1.
-
-    The sky, or what lies beyond the sensor's range: it has no depth, but every view that looks that way has an opinion.
-    """
-    far = rays.origin.new_full((len(rays.origin), 1), BACKGROUND_M)
-    space = _gather_space(rays, far, sources, torch.zeros_like(far))
-    return replace(space, channel=torch.full_like(space.channel, -1))
+    return _gather_space(rays, z, sources, interval_lengths(z, rays.direction.norm(dim=-1)))
 
 
 def _gather_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews, delta: torch.Tensor) -> ContextualSpace:
@@ -216,11 +201,12 @@ def surface_space(
 ) -> ContextualSpace:
     """M with one token a view (N = 1): its samples composited, what lies infinitely far behind them included.
 
-    The query's own view sees all of its ray, wherever that ends: its samples land on one pixel. So it outweighs the
-    others where no depth is known and their visibilities are guesses. What the compositing weights (R, N) leave of 1
-    belongs to the background.
+    What the compositing weights (R, N) leave of 1 belongs to the background: the sky, or what lies beyond the sensor's
+    range, of which every view that looks that way has an opinion. The query's own view sees all of its ray, wherever
+    that ends: so it outweighs the others where no depth is known and their visibilities are guesses.
     """
-    far = background_space(rays, sources)
+    behind = rays.origin.new_full((len(rays.origin), 1), BACKGROUND_M)
+    far = _gather_space(rays, behind, sources, torch.zeros_like(behind))
     rest = (1 - weights.sum(1, keepdim=True)).clamp_min(0)
     weight = torch.cat((weights, rest), dim=1)
 
@@ -250,16 +236,8 @@ def surface_space(
         visibility=visible[..., None],
         valid=(seen.sum(2) > 0)[..., None],
         delta=far.delta,
-        channel=far.channel,
+        channel=torch.full_like(far.channel, -1),
     )
-
-
-def masked_attention(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor, key_valid: torch.Tensor) -> torch.Tensor:
-    """Eq. 7 of q, k, v (B, H, S, d_k), in which invalid keys (B, S) get no weight; zeros where no key is valid."""
-    score = (q @ k.transpose(-1, -2)) / math.sqrt(q.shape[-1])  # (B, H, S, S)
-    score = score.masked_fill(~key_valid[:, None, None, :], -1e9)
-    weight = torch.softmax(score, dim=-1) * key_valid[:, None, None, :]
-    return weight @ v
 
 
 class MultiHeadAttention(nn.Module):
@@ -272,11 +250,13 @@ class MultiHeadAttention(nn.Module):
         self.out = nn.Linear(dim, dim, bias=False)
 
     def forward(self, x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-        """Attend over the S tokens of each row: (B, S, C), (B, S) bool -> (B, S, C)."""
+        """Eq. 7 over the S tokens of each row: (B, S, C), (B, S) bool -> (B, S, C); zeros where none is valid."""
         rows, tokens, dim = x.shape
         qkv = self.qkv(x).view(rows, tokens, 3, self.heads, dim // self.heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)  # (B, H, S, d_k) each
-        attended = masked_attention(q, k, v, valid)
+        score = (q @ k.transpose(-1, -2)) / math.sqrt(q.shape[-1])  # (B, H, S, S)
+        score = score.masked_fill(~valid[:, None, None, :], -1e9)
+        attended = (torch.softmax(score, dim=-1) * valid[:, None, None, :]) @ v
         return self.out(attended.transpose(1, 2).reshape(rows, tokens, dim))
 
 
@@ -316,13 +296,6 @@ class ViewWeightNet(nn.Module):
         super().__init__()
         self.net = nn.Sequential(nn.Linear(feature_dim + extra, 16), nn.ReLU(), nn.Linear(16, 2))
 
-    def start_alike(self) -> None:
-        """Let all views have the same scores until training says otherwise."""
-        last = self.net[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-
     def forward(self, feature: torch.Tensor, extra: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(m, R, N, C), (m, R, N, E) -> semantic and colour score, (m, R, N) each."""
         semantic, colour = self.net(torch.cat((feature, extra), dim=-1)).unbind(-1)
@@ -338,23 +311,24 @@ class SRay(LearnedField):
 
     def __init__(self, config: SRayConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
-        _check(config)
-        dim = config.feature_dim
+        dim, heads = config.feature_dim, config.heads
+        if dim % 4 or dim % heads:
+            raise ConfigError(f"feature_dim must be a multiple of 4 and of heads ({heads}), got {dim}")
         self.config: SRayConfig = config
         self.at_surface = config.tokens == "surface"
         self.encoder = ImageEncoder(config.encoder, dim)
         self.geometry_init = GeometryInit(dim)
         self.density = DensityNet(dim + 3 if self.at_surface else dim)
-        self.radial = MultiHeadAttention(dim, config.heads)
-        self.cross = MultiHeadAttention(dim, config.heads)
+        self.radial = MultiHeadAttention(dim, heads)
+        self.cross = MultiHeadAttention(dim, heads)
         self.weights = ViewWeightNet(dim, SURFACE_CUES if self.at_surface else CUES)
         self.semantic = nn.Sequential(nn.Linear(dim, 2 * dim), nn.ReLU(), nn.Linear(2 * dim, dim))
         self.classifier = nn.Linear(dim, len(label_set))
         self.label_logit = nn.Parameter(torch.tensor(LABEL_LOGIT))
         if self.at_surface:
-            self.weights.start_alike()
-            nn.init.zeros_(self.radial.out.weight)
-            nn.init.zeros_(self.cross.out.weight)
+            for last in (self.weights.net[2], self.radial.out, self.cross.out):
+                for parameter in last.parameters():
+                    nn.init.zeros_(parameter)
             # Of the own view's blending weight: 1 = one vote among others, large = the own image alone; for rays with
             # measured depth and for those without, whose views may look at different things. Not learned by
             # gradients: on the pixels that it was trained on, the own image is always right.
@@ -371,9 +345,7 @@ class SRay(LearnedField):
         size = (feature.shape[-2], feature.shape[-1])
         geometry = self.geometry_init(feature, depth_at(views, *size), focal, spread_at(views, *size))
         encoded = encoded_views(views, feature, geometry)
-        if views.channel is None:
-            return encoded
-        return replace(encoded, channel=views.channel.to(torch.int16))
+        return encoded if views.channel is None else replace(encoded, channel=views.channel.to(torch.int16))
 
     def find_density(self, space: ContextualSpace) -> torch.Tensor:
         """sigma (R, N) in 1 / m, from what the views hold at the samples: where features (of tokens at the surface also
@@ -421,48 +393,32 @@ class SRay(LearnedField):
         clear = space.valid & (space.visibility >= HIDDEN)
         return replace(space, valid=torch.where(clear.any(0), clear, space.valid))
 
-    def attend(self, space: ContextualSpace) -> torch.Tensor:
-        """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
+    def attend(
+        self, space: ContextualSpace, layer: MultiHeadAttention, attention: Callable[..., torch.Tensor]
+    ) -> ContextualSpace:
+        """M with what attention adds to its features (Eq. 6 to 10)."""
         x = space.feature.transpose(0, 1)  # (R, m, N, C)
-        valid = space.valid.transpose(0, 1)
-        if self.config.intra_view_attention:
-            x = x + radial_attention(self._normalised(x), valid, self.radial)
-        if self.config.cross_view_attention and not self.at_surface:
-            x = x + cross_view_attention(x, valid, self.cross)
-        return x.transpose(0, 1)
-
-    def attend_at_surface(self, space: ContextualSpace) -> torch.Tensor:
-        """Eq. 10 among one token a view: (m, R, 1, C)."""
-        if not self.config.cross_view_attention:
-            return space.feature
-        x = space.feature.transpose(0, 1)
-        x = x + cross_view_attention(self._normalised(x), space.valid.transpose(0, 1), self.cross)
-        return x.transpose(0, 1)
+        x = x + attention(self._normalised(x), space.valid.transpose(0, 1), layer)
+        return replace(space, feature=x.transpose(0, 1))
 
     def blend_views(
-        self,
-        refined: torch.Tensor,
-        space: ContextualSpace,
-        content: torch.Tensor | None = None,
-        own_factor: torch.Tensor | None = None,
+        self, space: ContextualSpace, content: torch.Tensor, own_factor: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3).
+        """Semantic ray s (Eq. 11, 12) of ``content`` (m, R, N, C), and colour of each sample: (R, N, C), (R, N, 3).
 
         The weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see the sample alike.
-        ``content``: (m, R, N, C) what is blended, where that is not what the weights are made of. ``own_factor``: (R,)
-        times which the own view's weight counts; None = once.
+        ``own_factor``: (R,) times which the own view's weight counts.
         """
-        semantic_score, colour_score = self.weights(self._normalised(refined), space.cues)
+        semantic_score, colour_score = self.weights(self._normalised(space.feature), space.cues)
         colour_weight = softmax_weights(colour_score, space.valid)
-        semantic_weight = constrained_weights(semantic_score, space.valid, TAU) * (space.visibility + LEAST_VISIBILITY)
-        if own_factor is not None:
-            is_own = space.cues[..., CUES] > 0
-            semantic_weight = semantic_weight * torch.where(is_own, own_factor[:, None], 1)
-        semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
+        seen = space.visibility + LEAST_VISIBILITY
+        semantic_weight = constrained_weights(semantic_score, space.valid, TAU) * seen
         if self.at_surface:
-            colour_weight = colour_weight * (space.visibility + LEAST_VISIBILITY)
+            semantic_weight = semantic_weight * torch.where(space.cues[..., CUES] > 0, own_factor[:, None], 1)
+            colour_weight = colour_weight * seen
             colour_weight = colour_weight / colour_weight.sum(0).clamp_min(1e-12)
-        s = torch.einsum("mrn,mrnc->rnc", semantic_weight, refined if content is None else content)
+        semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
+        s = torch.einsum("mrn,mrnc->rnc", semantic_weight, content)
         return s, torch.einsum("mrn,mrnc->rnc", colour_weight, space.rgb)
 
     def _normalised(self, x: torch.Tensor) -> torch.Tensor:
@@ -479,42 +435,33 @@ class SRay(LearnedField):
     ) -> tuple[FieldRender, torch.Tensor]:
         """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N).
 
-        The density of a sample does not depend on the attention. With ``sample_weight_threshold`` samples of less than
-        their ray's weight take no part in it, and the others' semantics and colour stand for theirs.
+        With ``sample_weight_threshold`` samples of less than that fraction of their ray's weight take no part in the
+        attention, and the others' semantics and colour stand for theirs.
         """
         space = contextual_space(rays, z, sources)
-        sigma = self.find_density(space)
-        weights = compositing_weights(sigma, space.delta)
+        weights = kept = compositing_weights(self.find_density(space), space.delta)
         opacity = weights.sum(dim=1)
-        known = space.valid.flatten(2).any(2).any(0)
-        kept = weights
         seen = space if self.at_surface else self.mask_occluded(space)
         if sample_weight_threshold > 0:
             heavy = weights >= sample_weight_threshold * opacity[:, None]
             seen = replace(seen, valid=seen.valid & heavy)
             kept = weights * seen.valid.any(0)
             kept = kept * (opacity / kept.sum(1).clamp_min(1e-12))[:, None]
-        refined = self.attend(seen)
+        if self.config.intra_view_attention:
+            seen = self.attend(seen, self.radial, radial_attention)
         if self.at_surface:
-            seen = replace(seen, feature=refined)
             seen = self.mask_occluded(surface_space(seen, kept, rays, sources))
-            token = self.attend_at_surface(seen)
-            content, own_factor = token + self.semantic(token), self.own_view_factors(rays)
-            s, colour = (blended[:, 0] for blended in self.blend_views(token, seen, content, own_factor))
-            logits = self.classifier(s)
+        if self.config.cross_view_attention:
+            seen = self.attend(seen, self.cross, cross_view_attention)
+        content = seen.feature + self.semantic(seen.feature) if self.at_surface else seen.feature
+        s, colour = self.blend_views(seen, content, self.own_view_factors(rays))
+        if self.at_surface:
+            logits, colour = self.classifier(s[:, 0]), colour[:, 0]
         else:
-            s, colour = self.blend_views(refined, seen)
             # The classifier is linear, so logits of blended features equal blended logits: classify once a ray.
             rendered = composite(kept, s + self.semantic(s))
             colour = composite(kept, colour)
             logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
         logits = logits + self.label_logit * composite(weights, self.propagate_labels(space))
-        depth = composite_depth(weights, z)
+        known, depth = space.valid.flatten(2).any(2).any(0), composite_depth(weights, z)
         return field_render(logits=logits, depth_m=depth, opacity=opacity, rgb=colour, known=known), weights
-
-
-def _check(config: SRayConfig) -> None:
-    if config.feature_dim <= 0 or config.feature_dim % 4 or config.feature_dim % config.heads:
-        raise ConfigError(
-            f"feature_dim must be a multiple of 4 and of heads ({config.heads}), got {config.feature_dim}"
-        )

@@ -25,6 +25,7 @@ from semantic_mapper.fields.sray import (
     OWN_DENSITY_OFFSET,
     OWN_RADIUS_M,
     TAU,
+    MultiHeadAttention,
     SRay,
 )
 from semantic_mapper.fields.volume import field_render, sample_guided
@@ -42,7 +43,7 @@ class StreamingSRay:
         self.model = model
         self.sampling = sampling or SamplingConfig()
         self._weights = _pack_weights(model)
-        self._settings = _settings(model)
+        self._settings = _Settings(model.config.heads, model.at_surface, COLOUR_SCALE if model.at_surface else 0.0)
 
     @property
     def label_set(self) -> LabelSet:
@@ -119,16 +120,16 @@ class _SourceMaps(NamedTuple):
 class _Settings(NamedTuple):
     heads: int
     at_surface: bool  # one token a view for the attention across views and for blending
-    log_ratio: float  # ln(1 / tau) of Eq. 12
-    sample_weight_threshold: float  # samples of a smaller fraction of their ray's weight take no part in the attention
-    hidden_below: float
-    least_visibility: float
-    label_uncertainty: float
-    own_density_offset: float
     colour_scale: float  # of the colours whose moments the density depends on; 0 = on none
-    min_depth_m: float
-    background_m: float
-    own_radius_m: float
+    sample_weight_threshold: float = 0.0  # samples of a smaller fraction of their ray's weight are not attended to
+    log_ratio: float = math.log(1 / TAU)  # of Eq. 12
+    hidden_below: float = HIDDEN
+    least_visibility: float = LEAST_VISIBILITY
+    label_uncertainty: float = LABEL_UNCERTAINTY
+    own_density_offset: float = OWN_DENSITY_OFFSET
+    min_depth_m: float = MIN_DEPTH_M
+    background_m: float = BACKGROUND_M
+    own_radius_m: float = OWN_RADIUS_M
 
 
 class _Layer(NamedTuple):
@@ -172,24 +173,6 @@ def render_sray(
     ...
 
 
-def _settings(model: SRay) -> _Settings:
-    config = model.config
-    return _Settings(
-        heads=config.heads,
-        at_surface=model.at_surface,
-        log_ratio=math.log(1 / TAU),
-        sample_weight_threshold=0.0,
-        hidden_below=HIDDEN,
-        least_visibility=LEAST_VISIBILITY,
-        label_uncertainty=LABEL_UNCERTAINTY,
-        own_density_offset=OWN_DENSITY_OFFSET,
-        colour_scale=COLOUR_SCALE if model.at_surface else 0.0,
-        min_depth_m=MIN_DEPTH_M,
-        background_m=BACKGROUND_M,
-        own_radius_m=OWN_RADIUS_M,
-    )
-
-
 def _source_maps(sources: EncodedViews, channels: int) -> _SourceMaps:
     """The maps as the kernel takes them: without a copy where they are channels-last.
     Raises ShapeError: maps that do not fit together, or not the model."""
@@ -217,12 +200,8 @@ def _pack_weights(model: SRay) -> _Weights:
     off = _Attention(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32))
     config, density = model.config, model.density
     return _Weights(
-        radial=_Attention(_transposed(model.radial.qkv), _transposed(model.radial.out))
-        if config.intra_view_attention
-        else off,
-        cross=_Attention(_transposed(model.cross.qkv), _transposed(model.cross.out))
-        if config.cross_view_attention
-        else off,
+        radial=_attention(model.radial) if config.intra_view_attention else off,
+        cross=_attention(model.cross) if config.cross_view_attention else off,
         view_hidden=_layer(model.weights.net[0]),
         view_scores=_two_outputs(model.weights.net[2]),
         density_hidden=_layer(density.token[0]),
@@ -242,6 +221,10 @@ def _array(tensor: torch.Tensor) -> Float32:
 def _transposed(layer: nn.Module) -> Float32:
     assert isinstance(layer, nn.Linear)
     return np.ascontiguousarray(layer.weight.detach().float().cpu().numpy().T)
+
+
+def _attention(layer: MultiHeadAttention) -> _Attention:
+    return _Attention(_transposed(layer.qkv), _transposed(layer.out))
 
 
 def _layer(layer: nn.Module) -> _Layer:

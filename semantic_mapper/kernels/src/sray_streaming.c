@@ -43,13 +43,13 @@ typedef struct {
 typedef struct {
     int64_t heads;
     int64_t at_surface;        /* one token a view for the attention across views and for blending */
+    double colour_scale;       /* of the colours whose moments the density depends on; 0 = on none */
+    double sample_weight_threshold; /* samples of a smaller fraction of their ray's weight are not attended to */
     double log_ratio;          /* ln(1 / tau) of Eq. 12 */
-    double sample_weight_threshold;       /* samples of a smaller fraction of their ray's weight take no part in the attention */
     double hidden_below;       /* visibility below which a view is left out where another one sees the sample */
     double least_visibility;   /* added to each visibility that is a weight */
-    double label_uncertainty;        /* hit probability at which a label that a view carries over counts by half */
+    double label_uncertainty;  /* hit probability at which a label that a view carries over counts by half */
     double own_density_offset; /* of the density that the network adds */
-    double colour_scale;       /* of the colours whose moments the density depends on; 0 = on none */
     double min_depth;          /* metres before a source camera */
     double background;         /* metres to what a ray meets that meets nothing */
     double own_radius;         /* metres from the ray's origin within which a camera is the query's own */
