@@ -72,9 +72,7 @@ class NodeContext:
         return path.read_text(encoding="utf-8") if path is not None and path.exists() else ""
 
 
-def run_node(
-    kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], str | None], job: NodeJob | None = None
-) -> NoReturn:
+def run_node(kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], str | None]) -> NoReturn:
     """Run a node to its end and exit: 0 done (also on a stop request), 1 failed with one line that says why,
     ``EXIT_LOSS`` done, but a part of what it was to keep is lost, with one line that says what.
 
@@ -84,20 +82,25 @@ def run_node(
     Args:
         kind: Of its options.
         work: Does it all; looks at ``stop`` often. Returns what is lost, in words, if anything.
-        job: What it is to do; None = what its one argument says.
     """
     prepare_process()
     code = 1
     try:
-        if job is None and len(sys.argv) != 2:
+        if len(sys.argv) != 2:
             example = '{"name": "camera", "options": {"log": "kitchen.mcap"}}'
             raise ConfigError(f"a node takes one argument, JSON: {example}")
-        job = job or read_job(sys.argv[1])
+        job = read_job(sys.argv[1])
         structlog.contextvars.bind_contextvars(node=job.name)
         heartbeat = HeartbeatWriter(job.heartbeat_fd)
         heartbeat.start()
         options = convert_config(job.options, kind, f"node '{job.name}'")
-        with StopRequest(patient=True, signals=_requests(job, kind)) as stop:
+        signals = (STOP_SIGNAL, signal.SIGINT, signal.SIGTERM)
+        if job.restartable and kind is CameraOptions:
+            # Its last words would be that the stream has ended, and its readers would end, too: it drops out instead.
+            signals = (STOP_SIGNAL,)
+            for signum in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(signum, signal.SIG_DFL)
+        with StopRequest(patient=True, signals=signals) as stop:
             folder = Path(job.folder) if job.folder else None
             launched = (job.restarts, folder, job.restartable)
             losses = work(NodeContext(job.name, job.endpoints, job.subscribers, stop, heartbeat, *launched), options)
@@ -114,16 +117,6 @@ def run_node(
             raise
         _log.error(FAILURE_EVENT, error=message)
     sys.exit(code)
-
-
-def _requests(job: NodeJob, kind: type[NodeOptions]) -> tuple[signal.Signals, ...]:
-    """Signals that ask a node to end in order."""
-    if job.restartable and kind is CameraOptions:
-        # Its last words would be that the stream has ended, and its readers would end with it: it drops out instead.
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(signum, signal.SIG_DFL)
-        return (STOP_SIGNAL,)
-    return (STOP_SIGNAL, signal.SIGINT, signal.SIGTERM)
 
 
 def read_job(argument: str) -> NodeJob:

@@ -7,15 +7,14 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NoReturn
 
 import structlog
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.camera.listeners import START_S, drain, wait_for_listeners
 from semantic_mapper.nodes.console import frame_progress
-from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import CameraOptions, NodeJob
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import CameraOptions
 from semantic_mapper.replay.log.player import ACK_TOPICS, PlayOptions, play
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.codec import Envelope
@@ -115,8 +114,3 @@ def _pass_on_stop(context: NodeContext, stopped: threading.Event) -> None:
     while not stopped.wait(0.05):
         if context.stop:
             stopped.set()
-
-
-def main(job: NodeJob | None = None) -> NoReturn:
-    """Run the node of this process to its end, then exit."""
-    run_node(CameraOptions, run_camera, job)

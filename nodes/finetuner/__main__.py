@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from typing import NoReturn
 
 from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import FinetunerOptions, NodeJob
+from semantic_mapper.nodes.options import FinetunerOptions
 
 
 def run(context: NodeContext, options: FinetunerOptions) -> None:
@@ -17,14 +16,9 @@ def run(context: NodeContext, options: FinetunerOptions) -> None:
 
     from semantic_mapper.nodes.finetuner import finetuner  # loads torch, in the threads that were set
 
-    torch.set_num_threads(options.threads)  # a forked process has read the variable before
+    torch.set_num_threads(options.threads)
     finetuner.run_finetuner(context, options)
 
 
-def main(job: NodeJob | None = None) -> NoReturn:
-    """Run the node of this process to its end, then exit."""
-    run_node(FinetunerOptions, run, job)
-
-
 if __name__ == "__main__":
-    main()
+    run_node(FinetunerOptions, run)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 import numpy as np
 import structlog
@@ -20,8 +20,8 @@ from semantic_mapper.errors import CodecError, MapError, NodeError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.nodes.map_feed import MapFollower, describe_map, thinned
-from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import FoxgloveOptions, NodeJob
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import FoxgloveOptions
 from semantic_mapper.nodes.publishing import PartStatus, StatusReport
 from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker
@@ -53,6 +53,7 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
     """
     from semantic_mapper.nodes.foxglove.server import FoxgloveServer  # an extra, which may be missing
 
+    os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))  # threads inherit it
     endpoints = [context.endpoint(name) for name in options.inputs()]
     identity = ServerIdentity(load_keys(Path(options.keys).expanduser())) if options.keys else None
     with ExitStack() as stack:
@@ -177,9 +178,3 @@ class _MapSender:
             return False
         self._shown[subject] = requests, snapshot.serials
         return True
-
-
-def main(job: NodeJob | None = None) -> NoReturn:
-    """Run the node of this process to its end, then exit."""
-    os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))  # threads inherit it
-    run_node(FoxgloveOptions, run_foxglove, job)

@@ -7,8 +7,6 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import psutil
@@ -17,7 +15,7 @@ from msgspec.structs import replace
 
 from semantic_mapper.errors import CodecError, NodeError, TransportError
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
-from semantic_mapper.nodes.launcher.processes import PROCESS_TABLE, ManagedProcess
+from semantic_mapper.nodes.launcher.processes import STOP_S, ManagedProcess
 from semantic_mapper.nodes.launcher.running import leave_launch_note
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.process_folder import OwnFolder, sweep
@@ -37,9 +35,8 @@ _log = structlog.get_logger(__name__)
 class Notifier:
     """Tells systemd the state of the service (sd_notify). What cannot be sent is logged once.
 
-    Args:
-        address: Path of the socket, "@name" for an abstract one; empty = none.
-        watchdog_s: How often systemd wants a sign of life, at least; 0 = never.
+    ``address`` is the path of the socket, "@name" for an abstract one, empty for none; ``watchdog_s`` how often systemd
+    wants a sign of life, at least, 0 for never.
     """
 
     def __init__(self, address: str, watchdog_s: float = 0.0) -> None:
@@ -96,9 +93,8 @@ class Notifier:
 class Launcher:
     """The processes of one launch; a context manager that leaves none behind.
 
-    Sockets are in a folder of their own that only this user can enter; two launches never meet.
-
-    ``notifier`` receives the state of the launch, in addition to the status topic.
+    Sockets are in a folder of their own that only this user can enter; two launches never meet. ``notifier`` receives
+    the state of the launch, in addition to the status topic.
     """
 
     def __init__(self, launch: Launch, notifier: Notifier | None = None) -> None:
@@ -112,16 +108,19 @@ class Launcher:
         sweep()
         folder = OwnFolder()
         self._stack.callback(folder.close)  # last of all
+        endpoints = {name: f"ipc://{folder.path}/{name}" for name in self._launch.sockets()}
+        _log.info("launching", nodes=len(self._launch.nodes), sockets=str(folder.path))
         try:
-            self._start(folder.path)
+            leave_launch_note(self._launch, folder.path)
+            self._status = LaunchStatus(self._stack, endpoints, self._launch)
+            for node in self._launch.nodes:
+                self._processes.append(ManagedProcess(node, self._launch, endpoints, str(folder.path)))
         except BaseException:
             self._clean_up()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._clean_up()
 
     def run(self, stop: StopRequest) -> None:
@@ -138,19 +137,11 @@ class Launcher:
         self._look_after_all(last=True)  # a camera that has failed since the last look
         if stop:
             _log.info("stopping", by=stop.name)
-        for kind in PROCESS_TABLE:
+        for kind in STOP_S:
             self._end(kind, stop)
         self._status.report(self._processes, "ended", now=True)
         if failures := self._failures() + [p.loss for p in self._processes if p.loss and not p.failure]:
             raise NodeError("; then ".join(failures))
-
-    def _start(self, folder: Path) -> None:
-        _log.info("launching", nodes=len(self._launch.nodes), sockets=str(folder))
-        leave_launch_note(self._launch, folder)
-        endpoints = {name: f"ipc://{folder}/{name}" for name in self._launch.sockets()}
-        self._status = LaunchStatus(self._stack, endpoints, self._launch)
-        for node in self._launch.nodes:
-            self._processes.append(ManagedProcess(node, self._launch, endpoints, str(folder)))
 
     def _failures(self) -> list[str]:
         """Of nodes that are not started any more: the first one may explain the others."""
@@ -179,7 +170,7 @@ class Launcher:
 
         Only one that makes no more progress is killed: on a starved machine, results take their time.
         """
-        limit_s = PROCESS_TABLE[kind].stop_s
+        limit_s = STOP_S[kind]
         processes = [p for p in self._processes if p.kind == kind]
         began = time.monotonic()
         while True:
@@ -189,9 +180,9 @@ class Launcher:
             progress = [p.makes_progress(limit_s) for p in processes]  # of all: limits begin now
             if not any(progress):
                 break
-            self._notifier.stopping(sum(PROCESS_TABLE[k].stop_s for k in {p.kind for p in self._processes}))
+            self._notifier.stopping(sum(STOP_S[k] for k in {p.kind for p in self._processes}))
             late = time.monotonic() - began > END_HEARD_S and any(p.restarts for p in self._processes)
-            hears_no_end = bool(stop or self._failures()) or not PROCESS_TABLE[kind].ends_with_stream
+            hears_no_end = bool(stop or self._failures()) or kind == "finetuner"
             for process in processes:
                 if hears_no_end or (late and process.state != "stopping"):
                     process.request_stop()
@@ -235,24 +226,18 @@ class LaunchStatus:
             if isinstance(message, Status):
                 self._own[message.node] = message
         statuses = [node_status(managed, self._own.get(managed.name)) for managed in processes]
-        for status in (*statuses, self._of_launch(processes, statuses, state)):
+        degraded = tuple(f"node '{s.node}' is not well" for s in statuses if s.degraded)
+        counters = {"pid": os.getpid(), "nodes": len(processes), "restarts": sum(m.restarts for m in processes)}
+        shown: NodeState = "degraded" if degraded and state == "running" else state
+        ages_s = {"start": time.monotonic() - self._began}
+        counters |= process_stats(os.getpid())
+        statuses.append(Status(STATUS_SOCKET, shown, time.monotonic_ns(), counters, ages_s, degraded))
+        for status in statuses:
             short = tuple(sentence[:MAX_SENTENCE] for sentence in status.degraded[:MAX_SENTENCES])
             try:
                 self._publisher.publish(encode(replace(status, degraded=short)))
             except (CodecError, TransportError) as error:  # no reason to end a launch
                 _log.warning("status_not_sent", node=status.node, reason=str(error))
-
-    def _of_launch(self, processes: Sequence[ManagedProcess], statuses: Sequence[Status], state: NodeState) -> Status:
-        degraded = tuple(f"node '{s.node}' is not well" for s in statuses if s.degraded)
-        counters = {"pid": os.getpid(), "nodes": len(processes), "restarts": sum(m.restarts for m in processes)}
-        return Status(
-            node=STATUS_SOCKET,
-            state="degraded" if degraded and state == "running" else state,
-            stamp_ns=time.monotonic_ns(),
-            counters=counters | process_stats(os.getpid()),
-            ages_s={"start": time.monotonic() - self._began},
-            degraded=degraded,
-        )
 
 
 def node_status(managed: ManagedProcess, own: Status | None) -> Status:

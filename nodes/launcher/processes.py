@@ -10,7 +10,6 @@ import threading
 import time
 from collections import deque
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 import msgspec
 import structlog
@@ -19,12 +18,10 @@ from semantic_mapper.nodes.launcher.launch_file import Launch, NodeEntry
 from semantic_mapper.nodes.launcher.liveness import BUSY_SILENCE_S, HeartbeatMonitor, ProgressLimit, cpu_seconds
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.process import EXIT_LOSS, FAILURE_EVENT, JOB_PREFIX, LOSS_EVENT, STOP_SIGNAL
-from semantic_mapper.plain_text import visible, without_secrets
+from semantic_mapper.plain_text import counted, visible, without_secrets
 from semantic_mapper.transport.messages import NodeState
 
-# How long a node may make no progress when it is to end: one that makes progress, be it slowly, may take as long as it
-# needs. The long one is for those that write a map or weights.
-STOP_S, FINISH_S = 15.0, 300.0
+FINISH_S = 300.0  # of nodes that write a map or weights
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
 SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")  # for the launcher alone, not for its nodes
@@ -36,54 +33,16 @@ BACKOFF_S, BACKOFF_MAX_S, WINDOW_S = 0.1, 10.0, 60.0
 _log = structlog.get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessKind:
-    """How a kind of node is stopped."""
-
-    ends_with_stream: bool  # ends by itself when the stream does; otherwise it is requested to
-    stop_s: float  # how long it may make no progress when it is to end
-
-
-# In the order in which they are stopped: sources first, so that the others get the end of the stream.
-PROCESS_TABLE: dict[str, ProcessKind] = {
-    "camera": ProcessKind(ends_with_stream=True, stop_s=STOP_S),
-    "finetuner": ProcessKind(ends_with_stream=False, stop_s=FINISH_S),
-    "foxglove": ProcessKind(ends_with_stream=True, stop_s=STOP_S),
-    "recorder": ProcessKind(ends_with_stream=True, stop_s=STOP_S),
-    "mapper": ProcessKind(ends_with_stream=True, stop_s=FINISH_S),
-}
-
-
-class RestartBackoff:
-    """The failures of one node: how long to wait before the next start. Times are monotonic seconds."""
-
-    def __init__(self) -> None:
-        self._failures: deque[float] = deque()
-        self.count = 0
-
-    def delay_s(self, now: float) -> float:
-        """Note a failure: seconds to wait before the next start."""
-        before = self.recent(now)
-        self._failures.append(now)
-        self.count += 1
-        return min(BACKOFF_MAX_S, BACKOFF_S * 2.0**before)
-
-    def recent(self, now: float) -> int:
-        """Restarts within the window."""
-        while self._failures and self._failures[0] <= now - WINDOW_S:
-            self._failures.popleft()
-        return len(self._failures)
+# How long each kind of node may make no progress when it is to end; one that makes progress, be it slowly, may take as
+# long as it needs. In the order in which they are stopped: sources first, so that the others get the end of the stream.
+STOP_S = {"camera": 15.0, "finetuner": FINISH_S, "foxglove": 15.0, "recorder": 15.0, "mapper": FINISH_S}
 
 
 class NodeProcess:
     """A running node, in an interpreter of its own. Its stderr is passed on line by line, marked with its name.
 
-    Raises OSError, RuntimeError: no process, thread, file or memory is to be had; nothing is left behind.
-
-    Args:
-        kind: A row of the process table.
-        job: What it is to do (``heartbeat_fd`` is filled in here).
-        heartbeat_s: Of the launch file.
+    ``job`` is what it is to do (``heartbeat_fd`` is filled in here). Raises OSError, RuntimeError: no process, thread,
+    file or memory is to be had; nothing is left behind.
     """
 
     def __init__(self, kind: str, job: NodeJob, heartbeat_s: float = BUSY_SILENCE_S) -> None:
@@ -117,11 +76,6 @@ class NodeProcess:
         if code in (None, 0, EXIT_LOSS):
             return False
         return not self.stop_requested or (code != -STOP_SIGNAL and not self.was_terminated)
-
-    @property
-    def has_lost(self) -> bool:
-        """Whether it ended in order, but says that a part of what it was to keep is lost."""
-        return self.exit_code() == EXIT_LOSS
 
     @property
     def was_terminated(self) -> bool:
@@ -219,16 +173,12 @@ class ManagedProcess:
             folder=folder,
             restartable=self._restarts,
         )
-        self._backoff = RestartBackoff()
+        self.restarts = 0
+        self._failures: list[float] = []  # monotonic seconds, those in the window
         self._due = 0.0  # of the next start, while there is no process
         self._last_end = self._last_reason = ""
         self._finishing = self._hopeless = False
         self._start()
-
-    @property
-    def restarts(self) -> int:
-        """How often it was restarted."""
-        return self._backoff.count
 
     @property
     def runs(self) -> bool:
@@ -251,25 +201,23 @@ class ManagedProcess:
     @property
     def loss(self) -> str:
         """What a node that has ended in order has lost, with its last words; empty = nothing that it knows of."""
-        return self.process.describe_end() if self.process is not None and self.process.has_lost else ""
+        has_lost = self.process is not None and self.process.exit_code() == EXIT_LOSS
+        return self.process.describe_end() if self.process is not None and has_lost else ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What happened to it recently."""
         if self.failure or self.loss:
             return (self.failure or self.loss,)
-        recent = self._backoff.recent(time.monotonic())
+        recent = self._recent_failures()
         if not recent:
             return ()
-        times = "once" if recent == 1 else f"{recent} times"
+        times = counted(recent, "time")
         return (f"restarted {times} in the last {WINDOW_S:g} s; the last time: {self._last_reason}",)
 
     def look_after(self, *, last: bool) -> None:
-        """Start it if it is time to; find out whether it has failed or hangs.
-
-        Args:
-            last: The launch ends: what fails now is not started any more.
-        """
+        """Start it if it is time to; find out whether it has failed or hangs. Where the launch ends (``last``), what
+        fails now is not started any more."""
         if self.process is None:
             if last and not self.failure:
                 self._give_up(f"{self._last_end}; it had not been restarted yet when the launch ended")
@@ -284,11 +232,8 @@ class ManagedProcess:
             self._on_failure(self.process, "", last=last)
 
     def makes_progress(self, limit_s: float) -> bool:
-        """Whether it comes nearer to its end; to be called often while that is awaited.
-
-        Args:
-            limit_s: Seconds without progress. Once it writes its results, turns are progress, too.
-        """
+        """Whether it comes nearer to its end, within ``limit_s`` without progress; to be called often while that is
+        awaited. Once it writes its results, turns are progress, too."""
         if self.process is None:
             return self.runs
         if self._end_limit is None:
@@ -332,16 +277,19 @@ class ManagedProcess:
             self.process.close()
             self.process = None
 
+    def _recent_failures(self) -> int:
+        self._failures = [failed for failed in self._failures if failed > time.monotonic() - WINDOW_S]
+        return len(self._failures)
+
     def _start(self) -> None:
-        count = self.restarts
         try:
-            process = self._start_process(count)
+            process = self._start_process(self.restarts)
         except (OSError, RuntimeError) as error:  # no process, memory or file is to be had: that may pass
             _log.error("node_not_started", node=self.name, reason=str(error))
             reason = f"could not be started: {error}"
             self._restart_or_give_up(f"node '{self.name}' ({self.kind}) {reason}", reason, restart=self._restarts)
             return
-        _log.info("node_started", node=self.name, kind=self.kind, pid=process.pid, restarts=count)
+        _log.info("node_started", node=self.name, kind=self.kind, pid=process.pid, restarts=self.restarts)
 
     def _start_process(self, restarts: int) -> NodeProcess:
         # A restarted node waits for no subscribers: the others are there, and frames do not wait.
@@ -373,7 +321,9 @@ class ManagedProcess:
         if not restart:
             self._give_up(text)
             return
-        delay = self._backoff.delay_s(time.monotonic())
+        delay = min(BACKOFF_MAX_S, BACKOFF_S * 2.0 ** self._recent_failures())
+        self._failures.append(time.monotonic())
+        self.restarts += 1
         self._last_end, self._last_reason = text, reason
         self._due = time.monotonic() + delay
         _log.warning("node_restarts", node=self.name, in_s=delay, restarts=self.restarts)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NoReturn
-
 from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import MapperOptions, NodeJob
+from semantic_mapper.nodes.options import MapperOptions
 
 
 def run(context: NodeContext, options: MapperOptions) -> None:
@@ -15,10 +13,5 @@ def run(context: NodeContext, options: MapperOptions) -> None:
     run_mapper(context, options)
 
 
-def main(job: NodeJob | None = None) -> NoReturn:
-    """Run the node of this process to its end, then exit."""
-    run_node(MapperOptions, run, job)
-
-
 if __name__ == "__main__":
-    main()
+    run_node(MapperOptions, run)

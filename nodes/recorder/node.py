@@ -8,15 +8,14 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import NoReturn
 
 import msgspec
 import structlog
 
 from semantic_mapper.errors import CodecError, LogError, TransportError
 from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
-from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import NodeJob, RecorderOptions
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.publishing import PartStatus, StatusReport
 from semantic_mapper.nodes.streams import MissingFrames, Streams
 from semantic_mapper.plain_text import counted
@@ -258,8 +257,3 @@ class Recorder:
         except CodecError as error:  # the reader of the log judges it
             _log.warning("frame_kept_as_sent", seq=envelope.seq, error=str(error))
             return parts
-
-
-def main(job: NodeJob | None = None) -> NoReturn:
-    """Run the node of this process to its end, then exit."""
-    run_node(RecorderOptions, run_recorder, job)

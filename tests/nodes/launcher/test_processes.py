@@ -14,12 +14,13 @@ from pathlib import Path
 from resource import RLIMIT_NOFILE, getrlimit, setrlimit
 
 import pytest
+import structlog.testing
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.launcher import processes
 from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.nodes.launcher.liveness import ProgressLimit
-from semantic_mapper.nodes.launcher.processes import ManagedProcess, NodeProcess, RestartBackoff
+from semantic_mapper.nodes.launcher.processes import ManagedProcess, NodeProcess
 from semantic_mapper.nodes.node import read_job
 from semantic_mapper.nodes.options import NodeJob
 from tests.nodes.support import eventually
@@ -34,13 +35,6 @@ kind = "camera"
 log = "{log}"
 mode = "realtime"
 """
-
-
-def test_pauses_double_up_to_their_limit_with_the_failures_within_the_window() -> None:
-    restarts = RestartBackoff()
-    assert [restarts.delay_s(float(t)) for t in range(8)] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10.0]
-    assert restarts.count == 8 and restarts.recent(60.5) == 7
-    assert restarts.delay_s(66.5) == 0.2, "what is older than the window counts no more"
 
 
 @contextmanager
@@ -88,6 +82,18 @@ def test_a_node_that_cannot_be_started_is_tried_again_while_the_launch_runs(
     assert eye.process is not None and eye.process.exit_code() is None
     eye.close()
     assert open_files() == before
+
+
+def test_pauses_double_up_to_their_limit(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "BACKOFF_S", 0.001)
+    monkeypatch.setattr(processes, "BACKOFF_MAX_S", 0.008)
+    start = starter(tmp_path, log)
+    with files(0), structlog.testing.capture_logs() as logs:
+        eye = start()
+        while eye.restarts < 6:
+            eye.look_after(last=False)
+    pauses = [entry["in_s"] for entry in logs if entry["event"] == "node_restarts"]
+    assert pauses == [0.001, 0.002, 0.004, 0.008, 0.008, 0.008]
 
 
 def test_a_node_is_given_up_with_the_reason_where_it_must_not_restart(log: Path, tmp_path: Path) -> None:
