@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
-import numpy as np
 import typer
 
 from semantic_mapper.config import AtLeastOne, AtLeastZero, load_config
@@ -18,7 +17,6 @@ from semantic_mapper.nodes.cli.calibrate import board_settings
 from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
-from semantic_mapper.plots import new_figure, rendered
 from semantic_mapper.replay.importers import (
     FORMATS,
     ImportOptions,
@@ -29,13 +27,11 @@ from semantic_mapper.replay.importers import (
 )
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.log.format import recover
-from semantic_mapper.replay.page import Section, picture, table_of, write_page
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
 from semantic_mapper.replay.sfm.scale import ScaleHint, parse_distance
 
-STRETCHES = 30  # of the film that are left out, in its report
 _STAGES = {
     "look": "look through the film",
     "features": "find features",
@@ -114,9 +110,8 @@ def import_(
     """Make a log of a recording of another program, of a film, or of a damaged log.
 
     Frames that cannot be used are left out, with the reason. --rotate is for cameras mounted on their side. Poses of a
-    film or a folder of pictures are found, with a report (LOG with .html); its lengths are metres by GPS of the
-    pictures or by one of --scale, --distance, --square-mm, --camera-height. Of a damaged log every intact message is
-    kept. See docs/recordings.md.
+    film or a folder of pictures are found; its lengths are metres by GPS of the pictures or by one of --scale,
+    --distance, --square-mm, --camera-height. Of a damaged log every intact message is kept. See docs/recordings.md.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
@@ -222,10 +217,7 @@ def _recover(output: Output, source: Path, log: Path) -> None:
 
 
 def _import_film(output: Output, source: Path, log: Path, options: FilmOptions, *, overwrite: bool) -> None:
-    """Import a film with progress, write its report next to the log, and say what became of it."""
-    page = log.with_suffix(".html")
-    if page.exists() and not overwrite:
-        raise ConfigError(f"{page}: exists already; choose another name, or --overwrite it")
+    """Import a film with progress, and say what became of it."""
     with frame_progress("import", None) as bar:
         stage = ""
 
@@ -237,36 +229,18 @@ def _import_film(output: Output, source: Path, log: Path, options: FilmOptions, 
             bar.set(done, _STAGES.get(what, what))
 
         report = import_film(source, log, options, show, overwrite=overwrite)
-    write_film_report(report, page)
     output.print(
         f"{log}: {counted(report.frames, 'frame')} of {report.looked_at}, {report.bytes / 1e6:.1f} MB, from a film"
     )
-    for name, value in _figures(report).items():
+    for name, value in film_figures(report).items():
         output.print(f"  {name}: {value}")
     for notice in report.notices:
         output.print(f"  note: {notice}")
-    output.print(f"  {page}  (report on the film)")
+    output.lines([f"  left out: {p.start_s:.2f} to {p.end_s:.2f} s: {p.reason}" for p in report.left_out])
 
 
-def write_film_report(report: FilmReport, path: Path) -> None:
-    """Write the page on a film: path from above, frames, what is left out."""
-    spans = [(f"{p.start_s:.2f}", f"{p.end_s:.2f}", str(p.frames), p.reason) for p in report.left_out[:STRETCHES]]
-    counts = [(reason, str(count)) for reason, count in report.left_out_counts.items()]
-    frames = [picture(rgb, f"{seconds:.2f} s; rectified", photo=True) for seconds, rgb in report.pictures]
-    sections = [
-        Section(notes=report.notices, tables=[table_of(("", ""), list(_figures(report).items()))]),
-        Section("Path from above", pictures=[picture(_draw_plan(report), "The camera's way, and points of the scene")]),
-        Section("Frames", pictures=frames),
-        Section("Frames that are left out", tables=[table_of(("reason", "frames"), counts)]),
-        Section(
-            f"Where in the film, the first {STRETCHES} stretches",
-            tables=[table_of(("from, s", "to, s", "frames", "reason"), spans)],
-        ),
-    ]
-    write_page(path, f"Film {report.film.name}: how the camera moved", sections)
-
-
-def _figures(report: FilmReport) -> Mapping[str, str]:
+def film_figures(report: FilmReport) -> Mapping[str, str]:
+    """What became of a film, for people, by name."""
     unit = length_unit(bool(report.scale))
     found = {
         "scale": report.scale or "unknown: lengths are not metres",
@@ -281,20 +255,3 @@ def _figures(report: FilmReport) -> Mapping[str, str]:
     if report.height_m is not None:
         found["camera over the floor"] = f"{report.height_m:.2f} {unit}"
     return found
-
-
-@rendered
-def _draw_plan(report: FilmReport) -> Any:
-    """The path and the points from above, as a picture (H, W, 3)."""
-    unit = "metres" if report.scale else "units"
-    figure = new_figure(900, 760, layout="constrained")
-    axes = figure.add_subplot(aspect="equal", adjustable="datalim", xlabel=unit, ylabel=unit)
-    xyz, way = report.xyz, report.T_world_camera[:, :3, 3]
-    if len(xyz):
-        low, high = np.percentile(xyz, (2, 98), axis=0)
-        near = ((xyz >= low) & (xyz <= high)).all(axis=1)
-        axes.plot(xyz[near, 0], xyz[near, 1], ".", markersize=1.5, alpha=0.5, label="points")
-    axes.plot(way[:, 0], way[:, 1], "-", label="camera")
-    axes.plot(way[:1, 0], way[:1, 1], "o", markersize=9, label="begins here")
-    axes.legend(loc="best")
-    return figure

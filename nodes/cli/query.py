@@ -33,9 +33,9 @@ from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.launcher.running import map_endpoint
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import write_picture
-from semantic_mapper.queries.graph import GraphTracker, SceneGraph, draw_graph
-from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.nearest import NearestSurface, PointAnswers, at, nearest
+from semantic_mapper.queries.graph import GraphTracker, draw_graph
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 from semantic_mapper.replay.log.sequence import open_log
@@ -100,10 +100,9 @@ def query(
         located = [session["T_map_world"] is not None for session in found["sessions"]]
         code = 0 if located and all(located) else EXIT_FAILED
     else:
-        with (
-            MapClient(endpoint, identity=remote.identity()) if endpoint else nullcontext(SavedMap(source)) as answering
-        ):
-            found = {"map": source, **answer(answering, question, name, point, up, min_confidence, gone, picture)}
+        client = MapClient(endpoint, identity=remote.identity()) if endpoint else nullcontext(open_saved(source))
+        with client as asked:
+            found = {"map": source, **answer(asked, question, name, point, up, min_confidence, gone, picture)}
         output.print(answer_table(found))
     if out is not None:
         write_json(out, found)
@@ -112,47 +111,13 @@ def query(
     return code
 
 
-class SavedMap:
-    """A map file, which answers as a ``MapClient`` does."""
-
-    def __init__(self, source: str) -> None:
-        self._mirror = MapMirror.load(map_path(Path(source)))
-        self._snapshot = self._mirror.snapshot()
-
-    def info(self) -> MapSnapshot:
-        """The map."""
-        return self._snapshot
-
-    def mirror(self) -> MapMirror:
-        """The map."""
-        return self._mirror
-
-    def at(self, points: list[tuple[float, ...]]) -> PointAnswers:
-        """As of ``MapClient``."""
-        return at(self._snapshot, points)
-
-    def nearest(self, class_name: str, point: tuple[float, ...], min_confidence: float) -> NearestSurface | None:
-        """As of ``MapClient``."""
-        return nearest(self._snapshot, class_name, point, min_confidence)
-
-    def instances(self, up: tuple[float, ...], *, gone: bool = False) -> list[Instance]:
-        """As of ``MapClient``; nothing is gone from a file."""
-        return list(InstanceTracker(up=up).update(self._snapshot))
-
-    def graph(self, up: Up | None = None) -> SceneGraph:
-        """As of ``MapClient``."""
-        return GraphTracker(up).update(self._snapshot)
-
-    def up(self) -> tuple[float, ...]:
-        """Away from the floor, as in the graph; z of the world where no floor shows it."""
-        try:
-            return tuple(GraphTracker().up_in(self._snapshot).tolist())
-        except MapError:
-            return map_answers.UP
+def open_saved(source: str) -> MapSnapshot:
+    """A map file, or that of a folder of results."""
+    return MapMirror.load(map_path(Path(source))).snapshot()
 
 
 def answer(
-    answering: MapClient | SavedMap,
+    asked: MapClient | MapSnapshot,
     question: Question,
     class_name: str = "",
     point: tuple[float, ...] = (),
@@ -161,24 +126,39 @@ def answer(
     gone: bool = False,
     picture: Path | None = None,
 ) -> dict[str, Any]:
-    """The answer to a question, as plain data; the arguments are those of ``query``."""
+    """The answer of a running mapper or of a saved map, as plain data; the arguments are those of ``query``."""
     match question:
         case "info":
-            return map_answers.describe_map(answering.mirror().snapshot())
+            return map_answers.describe_map(asked if isinstance(asked, MapSnapshot) else asked.mirror().snapshot())
         case "at":
-            return map_answers.answer_at(answering.info().label_set, point, answering.at([point]))
+            is_saved = isinstance(asked, MapSnapshot)
+            labels = (asked if is_saved else asked.info()).label_set
+            found = at(asked, [point]) if is_saved else asked.at([point])
+            return map_answers.answer_at(labels, point, found)
         case "nearest":
-            return map_answers.answer_nearest(class_name, point, answering.nearest(class_name, point, min_confidence))
+            what = (class_name, point, min_confidence)
+            hit = nearest(asked, *what) if isinstance(asked, MapSnapshot) else asked.nearest(*what)
+            return map_answers.answer_nearest(class_name, point, hit)
         case "instances":
-            axis = up or (answering.up() if isinstance(answering, SavedMap) else map_answers.UP)
-            return map_answers.answer_instances(axis, answering.instances(axis, gone=gone))
+            axis = up or (_up_in(asked) if isinstance(asked, MapSnapshot) else map_answers.UP)
+            if isinstance(asked, MapSnapshot):
+                return map_answers.answer_instances(axis, InstanceTracker(up=axis).update(asked))
+            return map_answers.answer_instances(axis, asked.instances(axis, gone=gone))
         case _:  # the graph
-            graph = answering.graph(up)
+            graph = GraphTracker(up).update(asked) if isinstance(asked, MapSnapshot) else asked.graph(up)
             if picture is not None:
                 if not graph.floors:
                     raise MapError(f"there is nothing to draw: {map_answers.NO_FLOOR}")
                 write_picture(picture, draw_graph("rooms, doors and objects", graph))
             return map_answers.answer_graph(graph)
+
+
+def _up_in(saved: MapSnapshot) -> tuple[float, ...]:
+    """Away from the floor, as in the graph; z of the world where no floor shows it."""
+    try:
+        return tuple(GraphTracker().up_in(saved).tolist())
+    except MapError:
+        return map_answers.UP
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:

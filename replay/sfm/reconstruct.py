@@ -60,7 +60,6 @@ MAX_FRAMES = 3000  # in a log; longer ways get longer steps
 FOLLOWED = 2.5 * STEP  # motion since the last registered frame within which a frame is followed
 MAX_POINT_ERROR_PX = 2.0  # points that are less exact are no guide
 EDGE_FRAMES = 60  # about as many are searched for upright edges
-MAX_POINTS = 20_000  # that the report shows
 PACKING = CodecOptions(rgb="jpeg", jpeg_quality=95)  # a film has lost more already
 
 CAMERA_ID = "camera"  # in the log
@@ -106,9 +105,7 @@ class FilmReport:
     scale: str  # how the scale was found; empty = unknown
     height_m: float | None  # median height of the camera over the floor; None where no floor is found
     T_world_camera: Float64  # (N, 4, 4) of the N frames in the log
-    xyz: Float64  # (M, 3) points, some of them
     notices: tuple[str, ...]  # sentences on what had to be assumed
-    pictures: tuple[tuple[float, UInt8], ...]  # RGB of a few frames of the log, with their times in seconds
     info: StreamInfo  # what stands in the log's head
     bytes: int  # size of the log
 
@@ -410,13 +407,10 @@ class _Import:
         info = StreamInfo(f"film {film.path.resolve().name}", cameras, frame_hz=film.hz, metadata=metadata)
         poses: list[Float64] = []
         reasons: list[tuple[str, float]] = []  # why each frame is left out, empty where it is not; and its time
-        pictures: list[tuple[float, UInt8]] = []
         focal_px = scene.seen.fx * film.full_width / film.width
-        shown = set(np.linspace(0, len(look.index) - 1, 14).astype(int)[1:-1].tolist())
         with atomic_log(dst, info, options=PACKING, overwrite=overwrite) as writer:
             for row, (frame, pose, reason) in enumerate(self._posed(set(picked), scene)):
                 self._progress("write", row + 1, len(look.index))
-                seconds = frame.stamp_ns / 1e9
                 if pose is not None:
                     rgb = rectify(frame.bgr)
                     at = frame.stamp_ns, frame.index, CAMERA_ID
@@ -426,15 +420,12 @@ class _Import:
                         reason = str(error)
                     else:
                         poses.append(pose)
-                        if shown and row >= min(shown):
-                            shown = {s for s in shown if s > row}
-                            pictures.append((seconds, rgb))
-                reasons.append((reason, seconds))
+                reasons.append((reason, frame.stamp_ns / 1e9))
             counts = dict(Counter(reason for reason, _ in reasons if reason))
             note = FilmNote(len(look.index), counts, len(picked), len(scene.frames), error_px, focal_px)
             writer.attach(note.attachment())
         self._notices += [f"{file.name} {reason}; it is left out" for file, reason in film.odd_pictures.items()]
-        xyz = np.unique(np.concatenate([frame.xyz for frame in scene.frames.values()]), axis=0)
+        points = np.unique(np.concatenate([frame.xyz for frame in scene.frames.values()]), axis=0)
         runs = [(reason, [s for _, s in run]) for reason, run in groupby(reasons, key=lambda item: item[0])]
         return FilmReport(
             film=film.path,
@@ -443,16 +434,14 @@ class _Import:
             registered=len(scene.frames),
             left_out=tuple(LeftOut(reason, s[0], s[-1], len(s)) for reason, s in runs if reason),
             error_px=error_px,
-            points=len(xyz),
+            points=len(points),
             focal_px=focal_px,
             focal_source=self._lens.source,
             distortion=(self._lens.measured or scene.seen).distortion,
             scale=scene.scale,
             height_m=scene.height_m,
             T_world_camera=np.stack(poses),
-            xyz=xyz[np.random.default_rng(0).permutation(len(xyz))[:MAX_POINTS]],
             notices=tuple(self._notices),
-            pictures=tuple(pictures),
             info=info,
             bytes=dst.stat().st_size,
         )

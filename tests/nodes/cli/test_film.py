@@ -1,4 +1,4 @@
-"""Films on the command line: options, what counts as a film, the report."""
+"""Films on the command line: options, what counts as a film, what is reported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.importing import SourceOptions, is_film, write_film_report
+from semantic_mapper.nodes.cli.importing import SourceOptions, film_figures, is_film
 from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from tests.nodes.support import run, run_process
@@ -59,24 +59,20 @@ def report(**changes: object) -> FilmReport:
         "scale": "",
         "height_m": None,
         "T_world_camera": poses,
-        "xyz": np.random.default_rng(0).normal(size=(50, 3)),
         "notices": ("the scale is unknown",),
-        "pictures": ((0.5, np.zeros((8, 8, 3), np.uint8)),),
         "info": StreamInfo("film walk.mp4", metadata={SCALE_KEY: SCALE_UNKNOWN}),
         "bytes": 1000,
     }
     return FilmReport(**{**values, **changes})  # type: ignore[arg-type]
 
 
-def test_the_report_says_what_was_left_out_and_that_lengths_are_no_metres(tmp_path: Path) -> None:
+def test_figures_say_what_was_left_out_and_that_lengths_are_no_metres() -> None:
     assert report().left_out_counts == {"blurred": 4, "moved too little": 3} and report().path_m == 2.5
-    write_film_report(report(), tmp_path / "film.html")
-    page = (tmp_path / "film.html").read_text()
+    shown = " ".join(film_figures(report()).values())
     for text in ("4 blurred, 3 moved too little", "3 of 4 frames", "2.50 units (scale unknown)", "812.5 px", "0.61 px"):
-        assert text in page
-    write_film_report(report(scale="given", height_m=1.4), tmp_path / "film.html")
-    page = (tmp_path / "film.html").read_text()
-    assert "2.50 m" in page and "1.40 m" in page
+        assert text in shown
+    shown = " ".join(film_figures(report(scale="given", height_m=1.4)).values())
+    assert "2.50 m" in shown and "1.40 m" in shown
 
 
 def test_options_of_films_are_refused_for_recordings(tmp_path: Path) -> None:

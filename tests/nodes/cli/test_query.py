@@ -11,7 +11,7 @@ import pytest
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.query import SavedMap, answer
+from semantic_mapper.nodes.cli.query import answer, open_saved
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import eventually, run, run_here
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
@@ -40,7 +40,7 @@ def test_info(map_file: Path) -> None:
 
 
 def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
-    folder, file = SavedMap(str(map_file.parent)), SavedMap(str(map_file))
+    folder, file = open_saved(str(map_file.parent)), open_saved(str(map_file))
     assert answer(folder, "info") == answer(file, "info")
     code, said = run_here("info", map_file.parent)
     assert code == 0 and "blocks" in said
@@ -86,7 +86,7 @@ def test_instances_of_a_saved_map_stand_as_its_floor_says(tmp_path: Path) -> Non
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # z becomes x
     VoxelMap(plain.config, plain.label_set).merged(plain, T).save(tmp_path / "map.npz")
-    found = answer(SavedMap(str(tmp_path)), "instances")
+    found = answer(open_saved(str(tmp_path)), "instances")
     np.testing.assert_allclose(found["up"], (1, 0, 0), atol=0.02)
     assert {thing["class"] for thing in found["instances"] if thing["voxels"] > 200} == {"table", "cup"}
 
@@ -111,7 +111,7 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
             ("instances", "", ()),
         ):
             with MapClient(service.endpoint) as client:
-                assert answer(client, question, name, point) == answer(SavedMap(str(map_file)), question, name, point)
+                assert answer(client, question, name, point) == answer(open_saved(str(map_file)), question, name, point)
         done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--out", folder / "live.json")
         assert done.returncode == 0 and "cup" in done.stdout, done.stderr
         assert json.loads((folder / "live.json").read_text())["map"] == service.endpoint
