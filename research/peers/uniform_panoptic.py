@@ -27,12 +27,11 @@ class UniformPanoptic(Panoptic):
 
     def _samples_at(self, rays: RayBatch, z: torch.Tensor) -> RaySamples:
         """Samples at given depths, each as long as it is to the next one."""
-        in_grid = self.grid.rays(rays)
-        points = in_grid.points(z)
+        points = self.grid.points(rays, z)
         top = points.new_tensor([n - 1 for n in self.config.grid.shape])
         inside = ((points >= 0) & (points <= top)).all(-1)
         raw = gather(self.grid.values, points)[..., 0]
-        length = interval_lengths(z, in_grid.direction.norm(dim=1))
+        length = interval_lengths(z, (rays.direction / self.grid.config.voxel_m).norm(dim=1))
         depth = SceneGrid.optical_depth(raw) * length * inside * self.fitted
         before = torch.cumsum(depth, 1) - depth
         weight = torch.exp(-before) * -torch.expm1(-depth)

@@ -88,11 +88,10 @@ class GridLogits:
 
     def logits(self, rays: FrameRays, pixels: NDArray[np.int64], near_m: float) -> torch.Tensor:
         """(R, L) of pixels; differentiable by logits and density."""
-        placed = self.grid.rays(rays.rays(pixels, near_m))
-        march = self.grid.march(placed)
+        march = self.grid.march(rays.rays(pixels, near_m))
         kept = march.weight > 1e-3
         ray, _ = kept.nonzero(as_tuple=True)
-        here = self._at(placed.points(march.z)[kept])
+        here = self._at(march.points[kept])
         total = torch.zeros(len(pixels), here.shape[1])
         return total.index_add(0, ray, here * march.weight[kept][:, None])
 
@@ -178,9 +177,8 @@ def _look(field: GridLogits, rays: FrameRays, pixels: NDArray[np.int64], channel
 
 def _colour_loss(grid: SceneGrid, rays: FrameRays, pixels: NDArray[np.int64]) -> torch.Tensor:
     batch = rays.rays(pixels, FIT_NEAR_M)
-    placed = grid.rays(batch)
-    march = grid.march(placed)
+    march = grid.march(batch)
     with torch.no_grad():
         sky = grid.sky_colour(batch.direction)
-    seen = (march.weight[..., None] * grid.colour(placed.points(march.z))).sum(1) + march.light[:, None] * sky
+    seen = (march.weight[..., None] * grid.colour(march.points)).sum(1) + march.light[:, None] * sky
     return functional.mse_loss(seen, torch.from_numpy(rays.rgb[pixels] / np.float32(255)))

@@ -133,7 +133,7 @@ def marched(grid: SceneGrid, rays: FrameRays, pixels: NDArray[np.int64], near_m:
     """The samples on rays that matter, ray by ray."""
     with torch.no_grad():
         batch = rays.rays(pixels, near_m)
-        march = grid.march(grid.rays(batch))
+        march = grid.march(batch)
         ray, column = (march.weight > MIN_WEIGHT).nonzero(as_tuple=True)
         z = march.z[ray, column]
         return Samples(batch.origin[ray] + z[:, None] * batch.direction[ray], march.weight[ray, column], ray)

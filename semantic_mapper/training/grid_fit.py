@@ -41,7 +41,6 @@ from semantic_mapper.fields.scene.march import (
     adam_grid,
     add_total_variation,
     fuse_grid_depth,
-    most_samples,
     photometric_rays,
     scatter_grid,
 )
@@ -158,10 +157,9 @@ def render_frame(grid: SceneGrid, rays: FrameRays, frame: int, near_m: float) ->
     """Colour (H, W, 3) in [0, 1] and z (H, W) in metres of a frame, 0 where less than half of the light is stopped."""
     with torch.no_grad():
         batch = rays.rays(rays.pixels_of(frame), near_m)
-        in_grid = grid.rays(batch)
-        marched = grid.march(in_grid)
+        marched = grid.march(batch)
         weight = marched.weight / marched.weight.sum(1, keepdim=True).clamp_min(1e-6)
-        colour = (weight[..., None] * grid.colour(in_grid.points(marched.z))).sum(1) * (1 - marched.light)[:, None]
+        colour = (weight[..., None] * grid.colour(marched.points)).sum(1) * (1 - marched.light)[:, None]
         colour += marched.light[:, None] * grid.sky_colour(batch.direction)
         depth = (weight * marched.z).sum(1) * (marched.light < 0.5)
     size = rays.image_size(frame)
@@ -218,7 +216,7 @@ class _Fitter:
         """Buffers for the grid as it is now."""
         self.adam = GridAdam(self.grid, self.rays, self.config.near_m)
         self.gradient = np.zeros_like(self.adam.values)
-        self.samples = SampleLists.empty(self.config.rays, most_samples(self.gradient.shape), 4)
+        self.samples = SampleLists.empty(self.config.rays, self.gradient.shape, 4)
 
     def learn(self, fraction: float) -> float:
         """One step of Adam on a batch of rays at a fraction of the budget; returns their mean squared error."""
@@ -260,7 +258,7 @@ class _Fitter:
         inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         colour = self.rays.rgb[pixels].astype(np.float32) / np.float32(255)
         results = RayResults(*(np.empty((len(pixels), 3), np.float32) for _ in range(3)))
-        rays = self.grid.rays(batch, jitter).arrays()
+        rays = self.grid.ray_arrays(batch, jitter)
         targets = TargetArrays(colour, inverse, gain, behind)
         photometric_rays(len(pixels), self.grid.arrays(), rays, targets, self.loss, self.samples, results)
         scatter_grid(len(self.gradient), self.samples, self.gradient)

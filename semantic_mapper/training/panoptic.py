@@ -396,8 +396,8 @@ def _fill_core(grid: SceneGrid) -> None:
 def _paint(grid: SceneGrid, rays: FrameRays, gains: Float32) -> None:
     """Colours of the measured points in the grid, averaged over some voxels; grey away from them."""
     pixels = np.flatnonzero((rays.depth_m > 0) & (rays.depth_m < FAR_M))
-    in_grid = grid.rays(rays.rays(pixels, 0.0))
-    vertex = in_grid.points(torch.from_numpy(rays.depth_m[pixels])[:, None])[:, 0].round().long()
+    depth = torch.from_numpy(rays.depth_m[pixels])[:, None]
+    vertex = grid.points(rays.rays(pixels, 0.0), depth)[:, 0].round().long()
     inside = ((vertex >= 0) & (vertex < torch.tensor(grid.config.shape))).all(1)
     colour = torch.from_numpy(rays.rgb[pixels] / np.float32(255) / gains[rays.frame_of(pixels)])
     found = torch.zeros(*grid.config.shape, 4)

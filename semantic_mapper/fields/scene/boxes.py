@@ -187,7 +187,7 @@ class MovingBoxes(nn.Module):
         """Samples with those of the boxes at the rays' time among them, in order, each dimmed by what is before it."""
         for met in self.met(samples.rays):
             grid = self.grid(met.number)
-            marched = grid.march(grid.rays(met.rays), kept)
+            marched = grid.march(met.rays, kept)
             weight = marched.weight * met.found.inside(marched.z).any(-1)
             samples = _merged(samples, met, marched.z, weight)
         return samples
@@ -202,8 +202,7 @@ class MovingBoxes(nn.Module):
             if pose is None or not here.any():
                 continue
             rays, grid = _in_axes_of(pose, samples.rays), self.grid(number)
-            points = grid.rays(rays).points(samples.z)
-            colour = torch.where(here[..., None], grid.colour(points), colour)
+            colour = torch.where(here[..., None], grid.colour(grid.points(rays, samples.z)), colour)
         return colour
 
     def holding(self, rays: RayBatch, z: torch.Tensor) -> torch.Tensor:

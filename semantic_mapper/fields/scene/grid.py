@@ -9,7 +9,7 @@ from __future__ import annotations
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import msgspec
@@ -21,18 +21,7 @@ from semantic_mapper.config import GridConfig, GridFieldConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.scene.march import (
-    BIAS,
-    CELL,
-    KEPT,
-    STEP,
-    GridArrays,
-    GridRays,
-    March,
-    array_of,
-    gather,
-    march,
-)
+from semantic_mapper.fields.scene.march import BIAS, CELL, KEPT, GridArrays, RayArrays, array_of, gather, march
 from semantic_mapper.fields.volume import composite_depth, field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -47,6 +36,48 @@ COLOUR_WIDTH = 64
 FEATURE_START = 0.1  # standard deviation
 LEAST_SLOPE = 1e-6  # of a ray along an axis
 OPAQUE = 0.5  # opacity from which on a ray has met something
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RaySamples:
+    """K samples on each of R rays; kinds say of what class they are."""
+
+    rays: RayBatch  # the rays in the world
+    points: torch.Tensor  # (R, K, 3) voxel coordinates
+    z: torch.Tensor  # (R, K) metres
+    weight: torch.Tensor  # (R, K) compositing weights, differentiable by the grid's density
+    light: torch.Tensor  # (R,) what gets through the grid to the sky
+    # (R, K) int64 number of the box that moves whose sample it is, -1 = of the scene; None = all are
+    mover: torch.Tensor | None = None
+
+    @property
+    def opacity(self) -> torch.Tensor:
+        """(R,) what the grid stops."""
+        return 1 - self.light
+
+    @property
+    def depth_m(self) -> torch.Tensor:
+        """(R,) mean z of what rays meet."""
+        return (self.weight * self.z).sum(1) / self.weight.sum(1).clamp_min(1e-6)
+
+    def at(self, index: torch.Tensor) -> RaySamples:
+        """The samples at positions (R, N) of each ray."""
+        points = self.points.gather(1, index[..., None].expand(-1, -1, 3))
+        mover = None if self.mover is None else self.mover.gather(1, index)
+        z, weight = self.z.gather(1, index), self.weight.gather(1, index)
+        return RaySamples(self.rays, points, z, weight, self.light, mover)
+
+
+def ray_fraction(samples: RaySamples) -> torch.Tensor:
+    """What samples (R, K) count, as if none had been left out."""
+    return samples.weight * (samples.opacity / samples.weight.sum(1).clamp_min(1e-6))[:, None]
+
+
+def heaviest(samples: RaySamples, count: int) -> RaySamples:
+    """The ``count`` samples of greatest weight of each ray, in their order."""
+    if samples.z.shape[1] <= count:
+        return samples
+    return samples.at(samples.weight.topk(count, dim=1).indices.sort(dim=1).values)
 
 
 class SceneGrid(nn.Module):
@@ -70,15 +101,23 @@ class SceneGrid(nn.Module):
 
     def arrays(self) -> GridArrays:
         """For kernels, in the same memory."""
-        return GridArrays(array_of(self.values), array_of(self.occupied), STEP, BIAS)
+        return GridArrays(array_of(self.values), array_of(self.occupied))
 
-    def rays(self, rays: RayBatch, jitter: torch.Tensor | None = None) -> GridRays:
-        """Rays (R,) of the world in voxels.
+    def ray_arrays(self, rays: RayBatch, jitter: torch.Tensor | None = None) -> RayArrays:
+        """Rays (R,) of the world for kernels.
         ``jitter``: (R,) place of samples in their intervals, 0 to 1; None = the middle."""
-        origin = (rays.origin - rays.origin.new_tensor(self.config.origin_m)) / self.config.voxel_m
         middle = torch.full_like(rays.near_m, 0.5) if jitter is None else jitter
-        direction = rays.direction / self.config.voxel_m
-        return GridRays(origin, direction, rays.near_m, torch.full_like(rays.far_m, math.inf), middle)
+        far = torch.full_like(rays.far_m, math.inf)
+        return RayArrays(*map(array_of, (*self._in_voxels(rays), rays.near_m, far, middle)))
+
+    def points(self, rays: RayBatch, z: torch.Tensor) -> torch.Tensor:
+        """Voxel coordinates (R, K, 3) at z (R, K) of rays of the world."""
+        origin, direction = self._in_voxels(rays)
+        return origin[:, None] + z[..., None] * direction[:, None]
+
+    def _in_voxels(self, rays: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        origin = (rays.origin - rays.origin.new_tensor(self.config.origin_m)) / self.config.voxel_m
+        return origin, rays.direction / self.config.voxel_m
 
     def span(self, rays: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
         """z (R,) at which rays enter the box, or begin in it, and at which they leave it; less where they miss it."""
@@ -88,9 +127,10 @@ class SceneGrid(nn.Module):
         ends = (low - rays.origin) / step, (high - rays.origin) / step
         return torch.maximum(torch.minimum(*ends).amax(1), rays.near_m), torch.maximum(*ends).amin(1)
 
-    def march(self, rays: GridRays, kept: int = KEPT) -> March:
+    def march(self, rays: RayBatch, kept: int = KEPT, jitter: torch.Tensor | None = None) -> RaySamples:
         """The samples of greatest weight of each ray, as far as the grid reaches."""
-        return march(self.values, self.occupied, rays, kept)
+        z, weight, light = march(self.values, self.occupied, self.ray_arrays(rays, jitter), kept)
+        return RaySamples(rays, self.points(rays, z), z, weight, light)
 
     def colour(self, points: torch.Tensor) -> torch.Tensor:
         """Colours (..., 3) in [0, 1] at voxel coordinates (..., 3)."""
@@ -247,48 +287,6 @@ class Trunk(nn.Module):
         return torch.sigmoid(self.head(torch.cat((r, towards[:, None].expand(*r.shape[:2], -1)), -1)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RaySamples:
-    """What a kind says the classes of: K samples on each of R rays."""
-
-    rays: RayBatch  # the rays in the world
-    points: torch.Tensor  # (R, K, 3) voxel coordinates
-    z: torch.Tensor  # (R, K) metres
-    weight: torch.Tensor  # (R, K) compositing weights, differentiable by the grid's density
-    light: torch.Tensor  # (R,) what gets through the grid to the sky
-    # (R, K) int64 number of the box that moves whose sample it is, -1 = of the scene; None = all are
-    mover: torch.Tensor | None = None
-
-    @property
-    def opacity(self) -> torch.Tensor:
-        """(R,) what the grid stops."""
-        return 1 - self.light
-
-    @property
-    def depth_m(self) -> torch.Tensor:
-        """(R,) mean z of what rays meet."""
-        return (self.weight * self.z).sum(1) / self.weight.sum(1).clamp_min(1e-6)
-
-    def at(self, index: torch.Tensor) -> RaySamples:
-        """The samples at positions (R, N) of each ray."""
-        points = self.points.gather(1, index[..., None].expand(-1, -1, 3))
-        mover = None if self.mover is None else self.mover.gather(1, index)
-        z, weight = self.z.gather(1, index), self.weight.gather(1, index)
-        return RaySamples(self.rays, points, z, weight, self.light, mover)
-
-
-def ray_fraction(samples: RaySamples) -> torch.Tensor:
-    """What samples (R, K) count, as if none had been left out."""
-    return samples.weight * (samples.opacity / samples.weight.sum(1).clamp_min(1e-6))[:, None]
-
-
-def heaviest(samples: RaySamples, count: int) -> RaySamples:
-    """The ``count`` samples of greatest weight of each ray, in their order."""
-    if samples.z.shape[1] <= count:
-        return samples
-    return samples.at(samples.weight.topk(count, dim=1).indices.sort(dim=1).values)
-
-
 class GridField(LearnedField):
     """Geometry and colour of one scene, without classes.
 
@@ -341,11 +339,10 @@ class GridField(LearnedField):
 
     def march(self, rays: RayBatch, kept: int = KEPT, jitter: torch.Tensor | None = None) -> RaySamples:
         """The samples of greatest weight of each ray."""
-        in_grid = self.grid.rays(rays, jitter)
-        marched = self.grid.march(in_grid, kept)
-        if not self.fitted:
-            marched = March(marched.z, torch.zeros_like(marched.weight), torch.ones_like(marched.light))
-        return RaySamples(rays, in_grid.points(marched.z), marched.z, marched.weight, marched.light)
+        found = self.grid.march(rays, kept, jitter)
+        if self.fitted:
+            return found
+        return replace(found, weight=torch.zeros_like(found.weight), light=torch.ones_like(found.light))
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays; differentiable by what asks for gradients."""
